@@ -1,4 +1,18 @@
 //! Ethernet frames that carry EtherCAT datagrams, processed in place.
+//!
+//! ```
+//! use ecaxis_sim::frame::{Command, FrameBuilder, Kind, kind, next};
+//!
+//! let frame = FrameBuilder::default()
+//!     .datagram(5, 0x1001, 0x0120, &[2, 0])
+//!     .logical(12, 0x0001_0000, &[0; 4])
+//!     .build();
+//! assert_eq!(kind(&frame), Kind::EtherCat);
+//! let write = next(&frame, None).unwrap();
+//! assert_eq!((write.command, write.adp(&frame)), (Command::Fpwr, 0x1001));
+//! let exchange = next(&frame, Some(&write)).unwrap();
+//! assert_eq!(exchange.logical(&frame), 0x0001_0000);
+//! ```
 
 use std::ops::Range;
 
@@ -13,20 +27,35 @@ const WKC: usize = 2;
 /// Datagram commands (ETG.1000.4).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Command {
+    /// No operation.
     Nop,
+    /// Auto increment read.
     Aprd,
+    /// Auto increment write.
     Apwr,
+    /// Auto increment read write.
     Aprw,
+    /// Configured address read.
     Fprd,
+    /// Configured address write.
     Fpwr,
+    /// Configured address read write.
     Fprw,
+    /// Broadcast read.
     Brd,
+    /// Broadcast write.
     Bwr,
+    /// Broadcast read write.
     Brw,
+    /// Logical memory read.
     Lrd,
+    /// Logical memory write.
     Lwr,
+    /// Logical memory read write.
     Lrw,
+    /// Auto increment read multiple write.
     Armw,
+    /// Configured address read multiple write.
     Frmw,
     /// A command that SubDevices pass on unprocessed.
     Unknown(u8),
@@ -34,7 +63,7 @@ pub enum Command {
 
 impl Command {
     #[must_use]
-    pub fn from_code(code: u8) -> Self {
+    pub(crate) fn from_code(code: u8) -> Self {
         match code {
             0 => Self::Nop,
             1 => Self::Aprd,
@@ -59,7 +88,9 @@ impl Command {
 /// One datagram inside a frame, stored as offsets. The frame remains the only copy of the data.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Datagram {
+    /// The command.
     pub command: Command,
+    /// The offsets of the data in the frame.
     pub data: Range<usize>,
     header: usize,
 }
@@ -71,7 +102,7 @@ impl Datagram {
         read_u16(frame, self.header + 2).unwrap_or(0)
     }
 
-    pub fn set_adp(&self, frame: &mut [u8], adp: u16) {
+    pub(crate) fn set_adp(&self, frame: &mut [u8], adp: u16) {
         write_u16(frame, self.header + 2, adp);
     }
 
@@ -87,25 +118,26 @@ impl Datagram {
         u32::from(self.adp(frame)) | u32::from(self.ado(frame)) << 16
     }
 
+    /// Returns the working counter.
     #[must_use]
     pub fn wkc(&self, frame: &[u8]) -> u16 {
         read_u16(frame, self.data.end).unwrap_or(0)
     }
 
-    pub fn add_wkc(&self, frame: &mut [u8], n: u16) {
+    pub(crate) fn add_wkc(&self, frame: &mut [u8], n: u16) {
         let wkc = self.wkc(frame).wrapping_add(n);
         write_u16(frame, self.data.end, wkc);
     }
 
     /// ORs `irq` into the ECAT event request, as every SubDevice does.
-    pub fn or_irq(&self, frame: &mut [u8], irq: u16) {
+    pub(crate) fn or_irq(&self, frame: &mut [u8], irq: u16) {
         let old = read_u16(frame, self.header + 8).unwrap_or(0);
         write_u16(frame, self.header + 8, old | irq);
     }
 
     /// True for commands that address exactly one station address.
     #[must_use]
-    pub fn is_to_station(&self) -> bool {
+    pub(crate) fn is_to_station(&self) -> bool {
         matches!(self.command, Command::Fprd | Command::Fpwr | Command::Fprw)
     }
 
@@ -150,6 +182,7 @@ fn parse_one(frame: &[u8], at: usize, end: usize) -> Option<Datagram> {
 
 /// The classification of a frame by a SubDevice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Kind {
     /// A well-formed EtherCAT frame of type 1.
     EtherCat,
@@ -159,6 +192,7 @@ pub enum Kind {
     Foreign,
 }
 
+/// Classifies a frame that starts with the Ethernet header.
 #[must_use]
 pub fn kind(frame: &[u8]) -> Kind {
     if frame.get(12..14) != Some(&ETHERTYPE.to_be_bytes()) {
@@ -180,7 +214,7 @@ pub fn kind(frame: &[u8]) -> Kind {
 
 /// Sets the circulating bit (bit 14 of the length) in every datagram. Returns false if the first
 /// datagram already has the bit.
-pub fn circulate(frame: &mut [u8]) -> bool {
+pub(crate) fn circulate(frame: &mut [u8]) -> bool {
     const CIRCULATING: u16 = 0x4000;
     let mut datagram = next(frame, None);
     while let Some(d) = datagram {
@@ -207,7 +241,7 @@ pub fn next(frame: &[u8], previous: Option<&Datagram>) -> Option<Datagram> {
 
 /// Returns the ns that the frame occupies a 100 Mbit/s wire, with preamble, padding, FCS and gap.
 #[must_use]
-pub fn wire_time(len: usize) -> u64 {
+pub(crate) fn wire_time(len: usize) -> u64 {
     (u64::try_from(len).unwrap_or(0).max(60) + 24) * 80
 }
 
@@ -227,7 +261,7 @@ impl Default for FrameBuilder {
 impl FrameBuilder {
     /// Starts a frame with this source address.
     #[must_use]
-    pub fn from_source(source: [u8; 6]) -> Self {
+    pub(crate) fn from_source(source: [u8; 6]) -> Self {
         let mut frame = vec![0xff; 6];
         frame.extend_from_slice(&source);
         frame.extend_from_slice(&ETHERTYPE.to_be_bytes());
@@ -265,6 +299,7 @@ impl FrameBuilder {
         )
     }
 
+    /// Returns the frame without padding and FCS.
     #[must_use]
     pub fn build(mut self) -> Vec<u8> {
         let len = self.frame.len() - ETHERNET_HEADER - ETHERCAT_HEADER;

@@ -1,30 +1,31 @@
-//! A simulated EtherCAT segment: SubDevices built from ESI files, with cables and drifting clocks.
+#![doc = include_str!("../README.md")]
 //!
-//! The simulation is deterministic under virtual time. It shares no protocol code with any
-//! MainDevice, so a misread standard cannot pass on both sides.
+//! # Modules
 //!
 //! From the wire inwards:
 //!
 //! * [`network`]: ports, cables, delays and frame loss; [`Segment`] takes the frames
 //! * [`frame`]: the datagram codec
-//! * [`esc`]: the SubDevice controller: registers, FMMUs, SyncManagers, EEPROM, distributed clocks
-//! * [`device`]: the controller and its application: state machine, mailbox, process data
-//! * [`coe`]: object dictionary, SDO server, SDO Information
-//! * [`foe`]: the files of a device
-//! * [`firmware`]: program memory and boot loader
+//! * [`chip`]: the types of EtherCAT SubDevice controllers
 //! * [`drive`]: a CiA 402 drive down to the motor shaft
 //! * [`gateway`]: a CANopen gateway and the network behind it
 //! * [`faults`]: scripted faults
 //! * [`serve`]: the segment on a real network interface, for any MainDevice
+//!
+//! [`SimDevice`] connects the controller (`esc`) with the application: state machine, mailbox and
+//! process data (`device`), object dictionary and SDO server (`coe`), files (`foe`), program memory
+//! and boot loader (`firmware`).
+
+#![deny(missing_docs)]
 
 mod bits;
-pub mod coe;
-pub mod device;
+mod coe;
+mod device;
 pub mod drive;
-pub mod esc;
+mod esc;
 pub mod faults;
-pub mod firmware;
-pub mod foe;
+mod firmware;
+mod foe;
 pub mod frame;
 pub mod gateway;
 pub mod network;
@@ -34,7 +35,7 @@ pub mod serve;
 pub use device::{DeviceOptions, MailboxOptions, SimDevice, SimError};
 pub use drive::{PlantParams, Track};
 pub use esc::al::AlState;
-pub use esc::chip::EscInfo;
+pub use esc::chip::{self, EscInfo};
 pub use esc::ports::Medium;
 pub use faults::{FaultReport, FaultScript, ScriptError};
 pub use firmware::{FirmwareHeader, FirmwareOptions};

@@ -113,7 +113,7 @@ fn eeprom_is_owned_by_the_maindevice_or_the_device() {
     let mut bus = drive_like();
     let claim = |bus: &mut Bus, claim| {
         let device = bus.segment.device_mut(0).unwrap();
-        device.esc_mut().claim_eeprom(claim)
+        device.claim_eeprom(claim)
     };
     assert!(!claim(&mut bus, true), "not offered");
     bus.write(S, 0x500, &[1]);

@@ -19,8 +19,8 @@ fn brd() -> Vec<u8> {
 
 /// Returns RX errors of each port, then forwarded errors, then those of the processing unit.
 fn errors(bus: &Bus, device: usize) -> Vec<u8> {
-    let esc = bus.segment.device(device).unwrap().esc();
-    esc.bytes(0x300, 13).to_vec()
+    let device = bus.segment.device(device).unwrap();
+    device.registers(0x300, 13).to_vec()
 }
 
 /// Returns the counters of [`errors`] from those that are not zero.
@@ -50,7 +50,7 @@ fn corrupted_frame_is_counted_by_the_detecting_device_and_those_behind_it() {
     );
     assert_eq!(errors(&bus, 2), counters(&[(8, 1), (12, 1)]));
     // Only the device before the error has applied the frame.
-    let written = |n| bus.segment.device(n).unwrap().esc().bytes(0x102, 1)[0];
+    let written = |n| bus.segment.device(n).unwrap().registers(0x102, 1)[0];
     assert_eq!([0, 1, 2].map(written), [5, 7, 7]);
     assert!(bus.frame(brd()).is_some(), "the next one is whole");
     bus.write(0x1002, 0x300, &[0]);
@@ -68,7 +68,7 @@ fn error_on_the_return_path_affects_no_device() {
     assert_eq!(errors(&bus, 2), counters(&[]));
     assert_eq!(errors(&bus, 1), counters(&[(2, 1), (3, 1)]));
     assert_eq!(errors(&bus, 0), counters(&[(9, 1)]));
-    let written = |n| bus.segment.device(n).unwrap().esc().bytes(0x102, 1)[0];
+    let written = |n| bus.segment.device(n).unwrap().registers(0x102, 1)[0];
     assert_eq!([0, 1, 2].map(written), [5, 5, 5]);
 }
 
@@ -159,14 +159,7 @@ fn replaced_device_is_restored() {
     assert_eq!(number(2), 0x999_u32.to_le_bytes());
     assert_eq!(number(4), 77_u32.to_le_bytes());
     // The neighbours lost the link for a moment.
-    let lost = |n: usize| {
-        bus.segment
-            .device(n)
-            .unwrap()
-            .esc()
-            .bytes(0x310, 4)
-            .to_vec()
-    };
+    let lost = |n: usize| bus.segment.device(n).unwrap().registers(0x310, 4).to_vec();
     assert_eq!(lost(0), [0, 1, 0, 0]);
     assert_eq!(lost(2), [1, 0, 0, 0]);
     assert_eq!(lost(1), [0; 4]);

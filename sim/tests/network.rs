@@ -43,7 +43,7 @@ fn count(bus: &mut Bus) -> Option<u16> {
 /// Returns register contents from the device's side, reachable or not.
 fn register(bus: &Bus, device: usize, at: u16, len: u16) -> Vec<u8> {
     let device = bus.segment.device(device).unwrap();
-    device.esc().bytes(at, len).to_vec()
+    device.registers(at, len).to_vec()
 }
 
 /// Returns loop and communication of each port, 0x0111.
@@ -392,7 +392,7 @@ fn whole_ring_carries_frames_from_port_to_port() {
     let (transit, wkc, _) = send(&mut segment, Nic::Secondary, 0);
     assert_eq!((back_at(transit), wkc), (Some(Nic::Primary), 0));
     // Only the ports that do not exist are closed.
-    let last = segment.device(3).unwrap().esc().bytes(0x111, 1);
+    let last = segment.device(3).unwrap().registers(0x111, 1);
     assert_eq!(last, [0x5a]);
 }
 

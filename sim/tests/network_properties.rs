@@ -85,7 +85,8 @@ fn connected(segment: &Segment, plugged: &[[bool; 4]], powered: &[bool]) -> Vec<
     let mut reached = vec![false; n];
     let mut supplied = powered.to_vec();
     for device in 0..n {
-        let ebus = segment.device(device).unwrap().esc().media()[0] == ecaxis_sim::Medium::Ebus;
+        // Port 0 of the port descriptor: 2 is E-bus.
+        let ebus = segment.device(device).unwrap().registers(7, 1)[0] & 3 == 2;
         if let (true, Some(up)) = (ebus, segment.topology().uplink(device)) {
             supplied[device] &= supplied[up.device];
         }

@@ -72,7 +72,7 @@ fn three_frames_with_res_reset_the_controller() {
     for (byte, progress) in [(b'R', 1), (b'E', 2)] {
         bus.write(S, 0x40, &[byte]);
         assert_eq!(
-            bus.segment.device(0).unwrap().esc().bytes(0x40, 1),
+            bus.segment.device(0).unwrap().registers(0x40, 1),
             [progress]
         );
     }

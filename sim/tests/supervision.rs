@@ -178,9 +178,8 @@ fn sync_losses_have_their_al_status_code_and_emergency() {
             let mut bus = in_op(0);
             enable(&mut bus, mode);
             if loss == Loss::Outputs {
-                let store = bus.segment.device_mut(0).unwrap().store_mut();
-                let slot = store.slot(0x10f1, 2).unwrap();
-                store.set(slot, 4);
+                let device = bus.segment.device_mut(0).unwrap();
+                assert!(device.set_input(0x10f1, 2, 4));
             }
             match loss {
                 Loss::Outputs => run(&mut bus, &[false; 2]),

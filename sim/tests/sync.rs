@@ -269,11 +269,7 @@ fn latch_unit_of_the_device_sets_pdi_events() {
         (0, 2),
         "the MainDevice's reading does not count"
     );
-    bus.segment
-        .device_mut(0)
-        .unwrap()
-        .esc_mut()
-        .acknowledge_latch(0);
+    bus.segment.device_mut(0).unwrap().acknowledge_latch(0);
     assert_eq!(events(&mut bus), (0, 0));
 }
 

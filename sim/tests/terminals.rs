@@ -46,10 +46,10 @@ fn operate(bus: &mut Bus, names: &[&str]) {
 }
 
 fn outputs(bus: &Bus, position: usize) -> Vec<i64> {
-    let store = bus.segment.device(position).unwrap().store();
+    let device = bus.segment.device(position).unwrap();
     (0..8)
-        .map_while(|channel| store.slot(0x7000 + channel * 0x10, 1))
-        .map(|slot| store.get(slot))
+        .map_while(|channel| device.object(0x7000 + channel * 0x10, 1))
+        .map(|value| i64::from(value[0]))
         .collect()
 }
 

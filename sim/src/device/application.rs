@@ -168,6 +168,7 @@ fn of(process: &[ProcessData], direction: Direction) -> impl Iterator<Item = &Ma
 }
 
 impl SimDevice {
+    /// Returns the drive; `None` for a device of another kind.
     #[must_use]
     pub fn drive(&self) -> Option<&Drive> {
         match &self.application {
@@ -176,6 +177,7 @@ impl SimDevice {
         }
     }
 
+    /// Returns the drive to change it; `None` for a device of another kind.
     pub fn drive_mut(&mut self) -> Option<&mut Drive> {
         self.show();
         match &mut self.application {
@@ -184,6 +186,7 @@ impl SimDevice {
         }
     }
 
+    /// Returns the CANopen gateway; `None` for a device of another kind.
     #[must_use]
     pub fn gateway(&self) -> Option<&Gateway> {
         match &self.application {
@@ -192,6 +195,7 @@ impl SimDevice {
         }
     }
 
+    /// Returns the CANopen gateway to change it; `None` for a device of another kind.
     pub fn gateway_mut(&mut self) -> Option<&mut Gateway> {
         match &mut self.application {
             Application::Gateway(gateway) => Some(gateway),

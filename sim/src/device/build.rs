@@ -30,14 +30,19 @@ const STATUSWORD: u16 = 0x6041;
 /// The properties of one particular device that the ESI does not contain.
 #[derive(Debug, Clone)]
 pub struct DeviceOptions {
+    /// The serial number, 0x1018:04 and EEPROM word 14.
     pub serial: u32,
+    /// The station alias, EEPROM word 4; 0: none.
     pub alias: u16,
+    /// The drift of the local clock in ppm; positive: the clock is fast.
     pub clock_drift_ppm: f64,
     /// The local time at power-on.
     pub clock_offset_ns: u64,
     /// The noise on the time stamps of frames, ± ns, drawn from a seed.
     pub clock_jitter_ns: u32,
+    /// The seed of `clock_jitter_ns`.
     pub jitter_seed: u64,
+    /// Motor, load and travel of a drive.
     pub plant: PlantParams,
     /// The delay from one port to the next in ns. `None`: 500 for a port with a PHY, 150 for an
     /// E-bus port.
@@ -55,9 +60,10 @@ pub struct DeviceOptions {
     /// The chip. `None`: the smallest chip that fits the device. Process RAM grows if SyncManagers
     /// need more.
     pub esc: Option<EscInfo>,
+    /// Mailbox properties.
     pub mailbox: MailboxOptions,
     /// The boot loader for firmware in Bootstrap and, if the ESI contains 0x1F51, through that
-    /// object ([`crate::firmware`]).
+    /// object.
     pub firmware: Option<FirmwareOptions>,
     /// The options of a CANopen gateway and its nodes. A gateway without options has no nodes.
     pub gateway: Option<GatewayOptions>,
@@ -86,21 +92,31 @@ impl Default for DeviceOptions {
     }
 }
 
+/// The device cannot be simulated.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum SimError {
+    /// A SyncManager of the ESI or EEPROM image exceeds the process RAM.
     #[error(
         "device `{device}`: SyncManager {sm} (0x{start:04x}, {len} bytes) does not lie in process RAM"
     )]
     SyncManagerOutside {
+        /// The type name of the device.
         device: String,
+        /// The number of the SyncManager.
         sm: usize,
+        /// The physical start address.
         start: u16,
+        /// The length in bytes.
         len: u16,
     },
+    /// [`DeviceOptions::gateway`] is set for the device with this type name, which is no gateway.
     #[error("device `{0}` is not a CANopen gateway, so it has no nodes")]
     NoGateway(String),
+    /// The settings of the gateway are invalid.
     #[error(transparent)]
     Gateway(#[from] GatewayError),
+    /// The EEPROM image is invalid.
     #[error("EEPROM image: {0}")]
     Image(#[from] SiiError),
 }

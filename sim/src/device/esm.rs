@@ -222,7 +222,7 @@ impl SimDevice {
 
     /// Returns the process data bytes of a SyncManager under the current assignment and mapping.
     #[must_use]
-    pub fn pdo_len(&self, sm: usize) -> usize {
+    pub(crate) fn pdo_len(&self, sm: usize) -> usize {
         let mut map = Vec::new();
         self.pdo
             .layout(&self.store, u8::try_from(sm).unwrap_or(0), &mut map)

@@ -24,6 +24,8 @@ mod program;
 mod supervision;
 mod time;
 
+use ecaxis_esi::model::Access;
+
 use crate::Nanos;
 use crate::coe::object_dictionary::ObjectStore;
 use crate::coe::pdo::PdoRules;
@@ -122,6 +124,7 @@ pub(crate) struct FrameEffects {
     pub(crate) dl_control: bool,
 }
 
+/// A simulated SubDevice: the controller and its application.
 #[derive(Debug, Clone)]
 pub struct SimDevice {
     name: String,
@@ -178,6 +181,7 @@ impl SimDevice {
         &self.name
     }
 
+    /// Returns the state of the EtherCAT state machine.
     #[must_use]
     pub fn al_state(&self) -> AlState {
         self.al.state
@@ -189,19 +193,33 @@ impl SimDevice {
         self.al.code
     }
 
+    /// Returns the configured station address, 0x0010.
     #[must_use]
     pub fn station_address(&self) -> u16 {
         self.esc.station_address()
     }
 
-    #[must_use]
-    pub fn esc(&self) -> &Esc {
+    pub(crate) fn esc(&self) -> &Esc {
         &self.esc
     }
 
-    /// Returns the controller with the access rights of the device side.
-    pub fn esc_mut(&mut self) -> &mut Esc {
-        &mut self.esc
+    /// Returns `len` bytes of registers or RAM from the device's side, without effects of a read.
+    /// Empty if the range exceeds the address space.
+    #[must_use]
+    pub fn registers(&self, start: u16, len: u16) -> &[u8] {
+        self.esc.bytes(start, len)
+    }
+
+    /// Takes or releases the EEPROM for the device (0x0501). The device gets only an EEPROM that
+    /// the MainDevice offers (0x0500). Returns true if the device owns it afterwards.
+    pub fn claim_eeprom(&mut self, claim: bool) -> bool {
+        self.esc.claim_eeprom(claim)
+    }
+
+    /// Acknowledges the events of LATCH0 (0) or LATCH1 (1), as the device does after it read the
+    /// times. Applies only to units that the device controls (0x0980).
+    pub fn acknowledge_latch(&mut self, n: usize) {
+        self.esc.acknowledge_latch(n);
     }
 
     /// Returns the value of an object as an upload would, without access checks.
@@ -216,16 +234,10 @@ impl SimDevice {
         Some(crate::coe::read_item(&store, slot))
     }
 
-    /// Returns the objects. Objects that show the state of a drive may be up to one frame old;
-    /// [`SimDevice::object`] returns current values.
-    #[must_use]
-    pub fn store(&self) -> &ObjectStore {
-        &self.store
-    }
-
-    pub fn store_mut(&mut self) -> &mut ObjectStore {
-        self.show();
-        &mut self.store
+    /// Adds an object to the dictionary. An existing object keeps its length, access and value.
+    pub fn add_object(&mut self, index: u16, sub: u8, access: Access, value: &[u8]) {
+        let bits = u32::try_from(value.len() * 8).unwrap_or(u32::MAX);
+        self.store.ensure(index, sub, "", bits, access, value);
     }
 
     /// Returns the contents of the EEPROM.
@@ -303,6 +315,7 @@ impl SimDevice {
         self.powered = false;
     }
 
+    /// True if the device is switched on.
     #[must_use]
     pub fn has_power(&self) -> bool {
         self.powered

@@ -5,12 +5,17 @@ use super::travel::{Edge, Span, Track};
 
 /// Bits of 0x60FD (CiA 402-2, "digital inputs"). Bits from 16 on are vendor-specific.
 pub mod input {
+    /// Negative limit switch.
     pub const NEGATIVE_LIMIT: u8 = 0;
+    /// Positive limit switch.
     pub const POSITIVE_LIMIT: u8 = 1;
+    /// Home switch.
     pub const HOME: u8 = 2;
     /// The first general-purpose input.
     pub const GENERAL: u8 = 16;
+    /// The input of touch probe 1.
     pub const TOUCH_PROBE_1: u8 = 24;
+    /// The input of touch probe 2.
     pub const TOUCH_PROBE_2: u8 = 25;
 }
 

@@ -8,9 +8,25 @@
 //! * `control`: position and velocity loops at 0.4 ms, current loop at 0.04 ms, gains
 //! * `plant`: motor, load, friction, encoder
 //!
-//! The device calls [`Drive::sync`] when process data takes effect and [`Drive::control`] every 0.4
+//! The device calls `Drive::sync` when process data takes effect and `Drive::control` every 0.4
 //! ms of its own time. Neither allocates. This crate defines its own state and mask values, so that
 //! a misread standard cannot cancel out between MainDevice and simulator.
+//!
+//! ```
+//! use ecaxis_sim::{DeviceOptions, PlantParams, Track};
+//!
+//! // A linear axis with limit switches; it starts on the negative one.
+//! let track = Track {
+//!     negative_limit: Some(0),
+//!     positive_limit: Some(100_000),
+//!     ..Track::default()
+//! };
+//! let options = DeviceOptions {
+//!     plant: PlantParams { track, ..PlantParams::default() },
+//!     ..DeviceOptions::default()
+//! };
+//! assert_eq!(options.plant.initial_position, 0);
+//! ```
 
 mod control;
 mod fault;
@@ -27,7 +43,7 @@ mod tests;
 mod touch_probe;
 mod travel;
 
-pub use fault::{DeviceError, Emergency};
+pub(crate) use fault::{DeviceError, Emergency};
 pub use io::input;
 pub use plant::PlantParams;
 pub use state::State;
@@ -46,7 +62,7 @@ use crate::Nanos;
 use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 
 /// The period of the position and velocity loops, in ns.
-pub const CONTROL_PERIOD_NS: Nanos = 400_000;
+pub(crate) const CONTROL_PERIOD_NS: Nanos = 400_000;
 /// [`CONTROL_PERIOD_NS`] in seconds.
 const CONTROL_STEP: f64 = 400e-6;
 
@@ -59,6 +75,7 @@ const TUNING_ROUNDS: u32 = 5;
 /// may keep it moving.
 const SETTLE_CYCLES: u32 = 250;
 
+/// A simulated drive: CiA 402 state machine, control loops, motor and load.
 #[derive(Debug, Clone)]
 pub struct Drive {
     objects: Objects,
@@ -100,7 +117,7 @@ pub struct Drive {
 }
 
 impl Drive {
-    pub fn new(store: &mut ObjectStore, plant: PlantParams) -> Self {
+    pub(crate) fn new(store: &mut ObjectStore, plant: PlantParams) -> Self {
         let objects = Objects::bind(store, &plant);
         let parameters = objects.parameters(store, &plant);
         let tuning = objects.tuning(store);
@@ -151,13 +168,13 @@ impl Drive {
 
     /// Sets the objects that the output process data carries. Call it after every change of the
     /// mapping. A mapped limit of zero acts; an unmapped limit of zero means "no limit".
-    pub fn set_mapped(&mut self, mapped: &[EntryHandle]) {
+    pub(crate) fn set_mapped(&mut self, mapped: &[EntryHandle]) {
         self.objects.set_mapped(mapped);
         (self.parameters_edits, self.tuning_edits) = (None, None);
     }
 
     /// Applies the set-points on SYNC0, or on a SyncManager event without distributed clocks.
-    pub fn sync(&mut self, store: &ObjectStore) {
+    pub(crate) fn sync(&mut self, store: &ObjectStore) {
         let o = &self.objects;
         let word = store.get(o.controlword).to_le_bytes();
         let controlword = u16::from_le_bytes([word[0], word[1]]);
@@ -191,7 +208,7 @@ impl Drive {
 
     /// Runs one control cycle, every 0.4 ms of device time. Set-points and Controlword act only in
     /// Op.
-    pub fn control(&mut self, store: &mut ObjectStore, in_op: bool) {
+    pub(crate) fn control(&mut self, store: &mut ObjectStore, in_op: bool) {
         self.begin_control(store);
         self.controller.turn(&mut self.plant);
         self.end_control(store, in_op);
@@ -276,7 +293,7 @@ impl Drive {
     }
 
     /// Returns the next emergency to send, oldest first.
-    pub fn take_emergency(&mut self) -> Option<Emergency> {
+    pub(crate) fn take_emergency(&mut self) -> Option<Emergency> {
         self.faults.take_emergency()
     }
 
@@ -307,7 +324,7 @@ impl Drive {
 
     /// Returns 0x60FE as driven at the terminals.
     #[must_use]
-    pub fn outputs(&self, store: &ObjectStore) -> u32 {
+    pub(crate) fn outputs(&self, store: &ObjectStore) -> u32 {
         self.objects.io.outputs(store)
     }
 
@@ -326,6 +343,7 @@ impl Drive {
         self.plant.set_blocked(blocked);
     }
 
+    /// Returns the state of the CiA 402 state machine.
     #[must_use]
     pub fn state(&self) -> State {
         self.power.state()

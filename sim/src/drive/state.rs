@@ -6,13 +6,21 @@ use super::fault::Reaction;
 /// CiA 402 power drive system states.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum State {
+    /// Not ready to switch on.
     NotReadyToSwitchOn,
+    /// Switch on disabled.
     SwitchOnDisabled,
+    /// Ready to switch on.
     ReadyToSwitchOn,
+    /// Switched on.
     SwitchedOn,
+    /// Operation enabled: the motor follows its set-points.
     OperationEnabled,
+    /// Quick stop active.
     QuickStopActive,
+    /// Fault reaction active.
     FaultReactionActive,
+    /// Fault.
     Fault,
 }
 

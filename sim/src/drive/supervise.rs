@@ -9,7 +9,7 @@ const LIMIT_SWITCHES: u32 = 1 << input::NEGATIVE_LIMIT | 1 << input::POSITIVE_LI
 
 impl Drive {
     /// Handles a communication error. Only an enabled axis reacts.
-    pub fn error(&mut self, error: DeviceError) {
+    pub(crate) fn error(&mut self, error: DeviceError) {
         if !self.enabled() {
             return;
         }

@@ -9,6 +9,7 @@ pub struct Track {
     pub negative_limit: Option<i32>,
     /// On at this count and everywhere above.
     pub positive_limit: Option<i32>,
+    /// The count range in which the home switch is on.
     pub home: Option<(i32, i32)>,
     /// Count ranges in which the inputs of touch probes 1 and 2 are on.
     pub probes: [Option<(i32, i32)>; 2],

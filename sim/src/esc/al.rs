@@ -3,17 +3,24 @@
 
 use std::fmt;
 
+/// A state of the EtherCAT state machine; the values are those of AL control and AL status.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub enum AlState {
+    /// Init: no mailbox, no process data.
     #[default]
     Init = 1,
+    /// Pre-Operational: mailbox only.
     PreOp = 2,
+    /// Bootstrap: mailbox for firmware only.
     Boot = 3,
+    /// Safe-Operational: inputs are valid, outputs are not applied.
     SafeOp = 4,
+    /// Operational.
     Op = 8,
 }
 
 impl AlState {
+    /// Converts the state bits 0–3 of AL control or AL status; `None` for other values.
     #[must_use]
     pub fn from_code(code: u8) -> Option<Self> {
         Some(match code {
@@ -26,6 +33,7 @@ impl AlState {
         })
     }
 
+    /// Returns the value in AL control and AL status.
     #[must_use]
     pub fn code(self) -> u8 {
         self as u8

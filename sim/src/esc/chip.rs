@@ -1,11 +1,18 @@
 //! The chip of an ESC: the information registers 0x0000–0x0009 and derived properties.
 //!
-//! Neither an ESI nor an EEPROM image names the chip. [`EscInfo::fitting`] selects the smallest
+//! Neither an ESI nor an EEPROM image names the chip. The simulator selects the smallest
 //! common chip with the required features and nothing more. A MainDevice that relies on further
 //! features therefore fails in the simulation first.
+//!
+//! ```
+//! use ecaxis_sim::{DeviceOptions, chip::EscInfo};
+//!
+//! let options = DeviceOptions { esc: Some(EscInfo::LAN9252), ..DeviceOptions::default() };
+//! assert_eq!(options.esc.unwrap().sync_managers, 4);
+//! ```
 
 /// Bits of the feature register 0x0008.
-pub mod feature {
+pub(crate) mod feature {
     /// Distributed clocks: receive times, and system time if the device enables it.
     pub const DC: u16 = 0x0004;
     /// Distributed clocks have 64 bits.
@@ -13,7 +20,7 @@ pub mod feature {
     /// The chip does not process LRW.
     pub const NO_LRW: u16 = 0x0200;
     /// Auto-activation and plausibility check of SYNC0 (0x0981 bits 3 to 7, 0x0984).
-    pub const ENHANCED_SYNC: u16 = 0x0100;
+    pub(crate) const ENHANCED_SYNC: u16 = 0x0100;
 }
 
 /// Bits of the EEPROM status 0x0502 that depend on the chip or its EEPROM.
@@ -43,7 +50,7 @@ pub struct EscInfo {
     /// Port descriptor 0x0007, two bits per port: 0 none, 1 not configured, 2 EBUS, 3 MII. `None`:
     /// from ESI or EEPROM image.
     pub ports: Option<u8>,
-    /// Feature register 0x0008, see [`feature`].
+    /// Feature register 0x0008.
     pub features: u16,
     /// Chip bits of 0x0502, see [`eeprom`].
     pub eeprom: u16,
@@ -54,6 +61,7 @@ pub struct EscInfo {
 }
 
 impl EscInfo {
+    /// Beckhoff ET1100.
     pub const ET1100: Self = Self {
         kind: 0x11,
         revision: 0,
@@ -95,7 +103,7 @@ impl EscInfo {
 
     /// EtherCAT IP core 3.0.10 in an FPGA. It has the number of units that the device needs, and no
     /// E-bus.
-    pub const IP_CORE: Self = Self {
+    pub(crate) const IP_CORE: Self = Self {
         kind: 0x04,
         revision: 3,
         build: 0x000a,
@@ -109,7 +117,7 @@ impl EscInfo {
     /// Returns the smallest chip that fits the device, with an EEPROM of `eeprom_bytes`. EEPROM
     /// reads are fast, so many devices start up in a short time.
     #[must_use]
-    pub fn fitting(needs: &ChipRequirements, eeprom_bytes: usize) -> Self {
+    pub(crate) fn fitting(needs: &ChipRequirements, eeprom_bytes: usize) -> Self {
         let port = |n: u8| needs.ports >> (2 * n) & 3;
         let ports = (0..4).filter(|n| port(*n) != 0).count();
         let ebus = (0..4).any(|n| port(n) == 2);
@@ -160,7 +168,7 @@ impl EscInfo {
     }
 
     #[must_use]
-    pub fn has(&self, feature: u16) -> bool {
+    pub(crate) fn has(&self, feature: u16) -> bool {
         self.features & feature == feature
     }
 }
@@ -169,7 +177,7 @@ const QUICK_EEPROM_NS: u64 = 50_000;
 
 /// The requirements of a device on its chip.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ChipRequirements {
+pub(crate) struct ChipRequirements {
     /// Port descriptor, two bits per port as in 0x0007.
     pub ports: u8,
     pub fmmus: u8,

@@ -11,15 +11,15 @@
 //! * `ports`: links and loops
 //! * `device_side`: the controller on the side of the device
 
-pub mod al;
+pub(crate) mod al;
 pub mod chip;
-pub mod dc;
-pub mod eeprom;
-pub mod fmmu;
-pub mod ports;
-pub mod registers;
-pub mod sm;
-pub mod watchdog;
+pub(crate) mod dc;
+pub(crate) mod eeprom;
+pub(crate) mod fmmu;
+pub(crate) mod ports;
+pub(crate) mod registers;
+pub(crate) mod sm;
+pub(crate) mod watchdog;
 
 mod access;
 mod datagram;
@@ -63,7 +63,7 @@ pub(crate) mod event {
 
 /// The events that accesses of the MainDevice raise for the application, taken after every frame.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct PdiEvents {
+pub(crate) struct PdiEvents {
     pub al_control: Option<u16>,
     /// Bit per SyncManager that the MainDevice filled to its last byte.
     pub sm_written: u8,
@@ -85,7 +85,7 @@ const MAX_RAM_KIB: u8 = 60;
 
 /// The fixed properties of an ESC.
 #[derive(Debug, Clone, Copy)]
-pub struct EscConfig {
+pub(crate) struct EscConfig {
     pub info: EscInfo,
     /// Two bits per port: 0 none, 1 not configured, 2 EBUS, 3 MII. Applies if `info` leaves the
     /// ports open.
@@ -101,7 +101,7 @@ pub struct EscConfig {
 }
 
 #[derive(Debug, Clone)]
-pub struct Esc {
+pub(crate) struct Esc {
     config: EscConfig,
     mem: Vec<u8>,
     map: RegisterMap,

@@ -23,6 +23,7 @@ pub enum Medium {
     /// The port is missing or not configured.
     #[default]
     None,
+    /// E-bus (LVDS).
     Ebus,
     /// Ethernet through a PHY.
     Mii,

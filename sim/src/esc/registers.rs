@@ -7,7 +7,6 @@ use super::dc::Width;
 
 /// End of the registers. Digital outputs (0x0F00), user RAM (0x0F80) and process RAM follow.
 pub const ADDRESS_SPACE: usize = 0x0f00;
-pub const DIGITAL_OUTPUTS: usize = 0x0f00;
 pub const USER_RAM: usize = 0x0f80;
 pub const PROCESS_RAM: usize = 0x1000;
 

@@ -44,6 +44,21 @@
 //! * `load` (`device`, `torque`): a torque (N·m) pulls the shaft towards negative positions
 //! * `blocked` (`device`): the shaft does not turn
 //! * `emergency` (`device`, `code`): the device sends an emergency message and has no error
+//!
+//! ```
+//! use ecaxis_sim::{FaultScript, Medium, Topology};
+//!
+//! let script = FaultScript::parse(
+//!     "[[fault]]
+//!     at = '10ms'
+//!     device = 3
+//!     kind = 'power-off'",
+//! )?;
+//! let one = Topology::by_order(&[[Medium::Mii, Medium::Mii, Medium::None, Medium::None]]).unwrap();
+//! let error = script.check(&one).unwrap_err();
+//! assert_eq!(error.to_string(), "line 4: there is no device 3; the bus has 1, counted from 0");
+//! # Ok::<(), ecaxis_sim::ScriptError>(())
+//! ```
 
 mod frames;
 mod inject;
@@ -55,7 +70,8 @@ use crate::Nanos;
 use crate::device::{Identification, SimDevice};
 use crate::random::Random;
 pub(crate) use frames::BitFlip;
-pub use script::{Fault, FaultKind, FaultScript, FrameSelection, NewIdentity, ScriptError};
+pub(crate) use script::{Fault, FaultKind, FrameSelection};
+pub use script::{FaultScript, ScriptError};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
@@ -78,12 +94,15 @@ struct ActiveFault {
 
 /// The progress of a fault of the script.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct FaultReport {
     /// The line in the script.
     pub line: u32,
     /// The kind as written in the script.
     pub name: &'static str,
+    /// True once the fault has started.
     pub began: bool,
+    /// True once the fault is over.
     pub ended: bool,
     /// The number of affected frames; `None` for faults that do not affect single frames.
     pub frames: Option<u64>,

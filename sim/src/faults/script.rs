@@ -9,10 +9,14 @@ use crate::drive::State;
 use crate::esc::al::AlState;
 use crate::network::topology::Topology;
 
+/// Faults with their times, parsed from TOML.
 #[derive(Debug, Clone, Default, PartialEq)]
+#[non_exhaustive]
 pub struct FaultScript {
+    /// The seed of random faults, in place of
+    /// [`SegmentOptions::seed`](crate::SegmentOptions::seed).
     pub seed: Option<u64>,
-    pub faults: Vec<Fault>,
+    pub(crate) faults: Vec<Fault>,
 }
 
 impl FaultScript {
@@ -25,7 +29,7 @@ impl FaultScript {
 }
 
 #[derive(Debug, Clone, PartialEq)]
-pub struct Fault {
+pub(crate) struct Fault {
     pub at: Nanos,
     /// The duration in ns; `None`: permanent.
     pub duration: Option<Nanos>,
@@ -40,7 +44,7 @@ pub struct Fault {
 
 /// The frames that a fault affects while it lasts.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum FrameSelection {
+pub(crate) enum FrameSelection {
     /// The next frames, up to this number.
     Next(u32),
     /// Each frame with this probability.
@@ -49,7 +53,7 @@ pub enum FrameSelection {
 
 /// The identity of a new device; `None`: unchanged.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct NewIdentity {
+pub(crate) struct NewIdentity {
     pub vendor: Option<u32>,
     pub product: Option<u32>,
     pub revision: Option<u32>,
@@ -58,7 +62,7 @@ pub struct NewIdentity {
 }
 
 #[derive(Debug, Clone, PartialEq)]
-pub enum FaultKind {
+pub(crate) enum FaultKind {
     /// Frames are lost on the way out or on the way back.
     FrameLoss {
         hits: FrameSelection,
@@ -162,24 +166,43 @@ impl Fault {
     }
 }
 
+/// The fault script cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum ScriptError {
+    /// The text is not TOML of the expected structure; contains the parser's message.
     #[error("{0}")]
     Toml(String),
+    /// A fault has an unknown kind, or a key is missing, superfluous or out of range.
     #[error("line {line}: fault of kind `{kind}`: {problem}")]
     Fault {
+        /// The line in the script, from 1.
         line: usize,
+        /// The kind as written.
         kind: String,
+        /// The problem as text.
         problem: String,
     },
+    /// The script names a device that the segment does not have.
     #[error("line {line}: there is no device {device}; the bus has {devices}, counted from 0")]
     NoSuchDevice {
+        /// The line in the script, from 1.
         line: u32,
+        /// The device, counted from 0.
         device: usize,
+        /// The number of devices.
         devices: usize,
     },
+    /// The script names a port without a cable.
     #[error("line {line}: nothing is connected to port {port} of device {device}")]
-    NoCable { line: u32, device: usize, port: u8 },
+    NoCable {
+        /// The line in the script, from 1.
+        line: u32,
+        /// The device, counted from 0.
+        device: usize,
+        /// The port, 0 to 3.
+        port: u8,
+    },
 }
 
 #[derive(Debug, Deserialize)]
@@ -216,6 +239,7 @@ pub(super) struct RawFault {
 }
 
 impl FaultScript {
+    /// Parses a script. Fails at the first error; [`Self::check`] then compares it with a segment.
     pub fn parse(text: &str) -> Result<Self, ScriptError> {
         let raw: RawScript =
             toml::from_str(text).map_err(|error| ScriptError::Toml(error.to_string()))?;

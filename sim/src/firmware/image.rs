@@ -18,7 +18,9 @@ const CRC_AT: usize = 28;
 /// The header of a firmware file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FirmwareHeader {
+    /// The vendor ID of the target device.
     pub vendor: u32,
+    /// The product code of the target device.
     pub product: u32,
     /// The revision of the device with this program.
     pub revision: u32,

@@ -21,7 +21,7 @@ mod image;
 
 pub(crate) use boot::{BootLoader, Next, PROGRAM_IDENTIFICATION, boot_objects};
 pub(crate) use flash::Flash;
-pub use image::{FirmwareHeader, HEADER};
+pub use image::FirmwareHeader;
 
 use crate::Nanos;
 
@@ -34,6 +34,7 @@ pub struct FirmwareOptions {
     pub erase_ns: Nanos,
     /// The bytes per programming step; the next field is its duration.
     pub page: usize,
+    /// The duration of a programming step in ns.
     pub page_ns: Nanos,
     /// The time from a reset until the processor services its controller again, in ns.
     pub restart_ns: Nanos,

@@ -10,6 +10,7 @@ pub struct FileStore {
 }
 
 impl FileStore {
+    /// Returns the contents of a file.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<&[u8]> {
         self.files.get(name).map(Vec::as_slice)
@@ -22,11 +23,13 @@ impl FileStore {
             .map(|(name, data)| (name.as_str(), data.as_slice()))
     }
 
+    /// True without files.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.files.is_empty()
     }
 
+    /// Returns the number of files.
     #[must_use]
     pub fn len(&self) -> usize {
         self.files.len()

@@ -7,7 +7,7 @@
 //! Bootstrap as firmware ([`crate::firmware`]). Without a boot loader, a firmware update is stored
 //! like any other file and changes nothing else. [`crate::SimDevice::take_written_file`] reports
 //! such a file. The simulation may then change 0x1018 and 0x100A through
-//! [`crate::SimDevice::store_mut`].
+//! [`crate::SimDevice::set_input`].
 
 mod files;
 mod server;
@@ -15,6 +15,7 @@ mod server;
 pub use files::FileStore;
 pub(crate) use server::{FoeRequest, FoeServer, Target};
 
+/// The file access of a device.
 #[derive(Debug, Clone)]
 pub struct FoeOptions {
     /// Maximum bytes of all files together, names included.

@@ -10,7 +10,9 @@ const ERROR_BITS: u64 = 6 + 6 + 8 + 3;
 /// A frame with up to eight bytes, or a remote request for one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CanFrame {
+    /// The 11-bit identifier.
     pub id: u16,
+    /// True for a remote request.
     pub remote: bool,
     len: u8,
     data: [u8; 8],
@@ -42,6 +44,7 @@ impl CanFrame {
         }
     }
 
+    /// Returns the data.
     #[must_use]
     pub fn data(&self) -> &[u8] {
         self.data.get(..usize::from(self.len)).unwrap_or_default()

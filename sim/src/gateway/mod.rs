@@ -15,6 +15,19 @@
 //! The secondary network runs in true time between the points at which the gateway forwards data.
 //! The bus has no bit errors, so no controller goes bus-off. The bus has no LSS slave. A gateway
 //! that is not the NMT master finds no other master.
+//!
+//! ```
+//! use ecaxis_sim::DeviceOptions;
+//! use ecaxis_sim::gateway::{Epos, GatewayOptions, NodeOptions};
+//!
+//! let gateway = GatewayOptions {
+//!     bit_rate: 500_000,
+//!     nodes: vec![NodeOptions::new(1, Epos::E24_5)],
+//!     ..GatewayOptions::default()
+//! };
+//! let options = DeviceOptions { gateway: Some(gateway), ..DeviceOptions::default() };
+//! assert!(options.gateway.is_some());
+//! ```
 
 mod anybus;
 mod can;
@@ -33,10 +46,10 @@ mod sdo;
 
 use std::collections::VecDeque;
 
+pub use crate::coe::Abort;
 pub use can::CanFrame;
-pub use control::ReportedState;
 pub use master::SdoResult;
-pub use nmt::{NmtCommand, NmtState};
+pub use nmt::NmtState;
 pub use node::{Epos, Node};
 pub use options::{BIT_RATES, GatewayError, GatewayOptions, NodeOptions, PdoLink, Supervision};
 
@@ -45,7 +58,6 @@ pub use anybus::is_gateway;
 use ecaxis_esi::model::Device;
 
 use crate::Nanos;
-use crate::coe::Abort;
 use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 use anybus::BUFFER;
 use can::CanBus;
@@ -68,6 +80,7 @@ const TRANSMIT_ERROR: u16 = 8;
 /// CAN in error passive mode.
 const PASSIVE_MODE: u16 = 0x8120;
 
+/// The application of a gateway: CANopen master, its nodes and the CAN bus between them.
 #[derive(Debug, Clone)]
 pub struct Gateway {
     esi: Box<Device>,
@@ -367,16 +380,19 @@ impl Gateway {
         self.heartbeat = if runs { self.now + period } else { u64::MAX };
     }
 
+    /// Returns the NMT state of the gateway itself.
     #[must_use]
     pub fn nmt_state(&self) -> NmtState {
         self.nmt
     }
 
+    /// Returns the node with this number.
     #[must_use]
     pub fn node(&self, id: u8) -> Option<&Node> {
         self.nodes.iter().find(|node| node.id() == id)
     }
 
+    /// Returns the node with this number to change it.
     pub fn node_mut(&mut self, id: u8) -> Option<&mut Node> {
         self.nodes.iter_mut().find(|node| node.id() == id)
     }

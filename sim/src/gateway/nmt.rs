@@ -3,14 +3,19 @@
 /// The state of a CANopen device. The numbers are those of heartbeats and of object 0x1F82.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub enum NmtState {
+    /// Initialisation; also the boot-up message.
     #[default]
     Initialising = 0,
+    /// Stopped: NMT and error control only.
     Stopped = 4,
+    /// Operational: PDOs too.
     Operational = 5,
+    /// Pre-operational: SDOs, no PDOs.
     PreOperational = 127,
 }
 
 impl NmtState {
+    /// Converts the value of a heartbeat without its toggle bit; `None` for other values.
     #[must_use]
     pub fn from_code(code: u8) -> Option<Self> {
         Some(match code {
@@ -22,6 +27,7 @@ impl NmtState {
         })
     }
 
+    /// Returns the value in a heartbeat.
     #[must_use]
     pub fn code(self) -> u8 {
         self as u8
@@ -40,7 +46,7 @@ pub enum NmtCommand {
 
 impl NmtCommand {
     #[must_use]
-    pub fn from_specifier(specifier: u8) -> Option<Self> {
+    pub(crate) fn from_specifier(specifier: u8) -> Option<Self> {
         Some(match specifier {
             1 => Self::Start,
             2 => Self::Stop,
@@ -58,7 +64,7 @@ impl NmtCommand {
 
     /// Returns the target state. Resets lead to initialisation.
     #[must_use]
-    pub fn leads_to(self) -> NmtState {
+    pub(crate) fn leads_to(self) -> NmtState {
         match self {
             Self::Start => NmtState::Operational,
             Self::Stop => NmtState::Stopped,

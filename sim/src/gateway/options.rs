@@ -26,6 +26,7 @@ pub struct GatewayOptions {
     /// The bytes to and from EtherCAT (0x3000, 0x3001), 2 to 512 each, including control and status
     /// word. `None`: the default mapping of the ESI.
     pub input_size: Option<u16>,
+    /// The bytes from EtherCAT to the gateway (0x3001); see [`Self::input_size`].
     pub output_size: Option<u16>,
     /// 0x1006, in µs. 0: no SYNC.
     pub sync_period_us: u32,
@@ -33,6 +34,7 @@ pub struct GatewayOptions {
     pub heartbeat_ms: u16,
     /// 0x1F80. Bit 0: NMT master; bit 3: the MainDevice starts the nodes one by one.
     pub start_up: u32,
+    /// The drives behind the gateway.
     pub nodes: Vec<NodeOptions>,
     /// Further objects of the gateway's CANopen dictionary, written last.
     pub objects: Vec<(u16, u8, Vec<u8>)>,
@@ -57,15 +59,19 @@ impl Default for GatewayOptions {
 /// The error control of a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Supervision {
+    /// No error control.
     None,
     /// The node sends a heartbeat with this period, in ms. It may be late by half a period.
     Heartbeat {
+        /// The period in ms.
         period_ms: u16,
     },
     /// The gateway requests the state with this period, in ms. The node fails after this number of
     /// unanswered requests.
     Guarding {
+        /// The period in ms.
         period_ms: u16,
+        /// The number of unanswered requests.
         retries: u8,
     },
 }
@@ -73,9 +79,13 @@ pub enum Supervision {
 /// A drive behind the gateway.
 #[derive(Debug, Clone)]
 pub struct NodeOptions {
+    /// The node number, as at the DIP switch of the drive.
     pub id: u8,
+    /// The model.
     pub drive: Epos,
+    /// Motor, load and travel.
     pub plant: PlantParams,
+    /// The error control.
     pub supervision: Supervision,
     /// The network must not start without this node.
     pub mandatory: bool,
@@ -90,6 +100,7 @@ pub struct NodeOptions {
 }
 
 impl NodeOptions {
+    /// Returns a node with the plant of the model, a heartbeat every 100 ms and no PDO.
     #[must_use]
     pub fn new(id: u8, drive: Epos) -> Self {
         Self {
@@ -120,26 +131,56 @@ pub struct PdoLink {
     pub synchronous: bool,
 }
 
+/// The settings of a gateway are invalid.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum GatewayError {
+    /// A setting of the gateway is out of range.
     #[error("gateway: {what} {value} is not possible: {choices}")]
     Setting {
+        /// The setting.
         what: &'static str,
+        /// The rejected value.
         value: u32,
+        /// The permitted values.
         choices: &'static str,
     },
+    /// Two nodes have the same number.
     #[error("gateway: node {id} is there twice")]
-    Twice { id: u8 },
+    Twice {
+        /// The node number, as at the DIP switch of the drive.
+        id: u8,
+    },
+    /// The DIP switch of the drive cannot show the number.
     #[error("gateway: node {id}: a {drive} takes node numbers up to {most}")]
     NodeId {
+        /// The node number, as at the DIP switch of the drive.
         id: u8,
+        /// The model.
         drive: &'static str,
+        /// The highest number of this model.
         most: u8,
     },
+    /// The gateway rejects an object.
     #[error("gateway: object 0x{index:04x}:{sub:02x} is refused with 0x{code:08x}")]
-    Object { index: u16, sub: u8, code: u32 },
+    Object {
+        /// The index.
+        index: u16,
+        /// The subindex.
+        sub: u8,
+        /// The SDO abort code.
+        code: u32,
+    },
+    /// A PDO cannot be linked.
     #[error("gateway: node {id}, PDO {pdo}: {problem}")]
-    Pdo { id: u8, pdo: u8, problem: String },
+    Pdo {
+        /// The node number, as at the DIP switch of the drive.
+        id: u8,
+        /// The PDO number.
+        pdo: u8,
+        /// The problem as text.
+        problem: String,
+    },
 }
 
 /// The objects of the gateway, and those that each node receives at boot.

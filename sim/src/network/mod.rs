@@ -7,6 +7,26 @@
 //!
 //! A frame is processed in one call, with the time of its arrival at each device. Its effects take
 //! place in that order.
+//!
+//! ```
+//! use ecaxis_sim::frame::FrameBuilder;
+//! use ecaxis_sim::{DeviceOptions, FrameOutcome, Segment, SegmentOptions, SimDevice};
+//!
+//! let esi = ecaxis_esi::Device { physics: "YY".into(), ..Default::default() };
+//! let device = SimDevice::from_esi(&esi, &[], DeviceOptions::default()).unwrap();
+//! let mut segment = Segment::new(vec![device.clone(), device], SegmentOptions::default());
+//! let frame = FrameBuilder::default().datagram(7, 0, 0x0130, &[0; 2]).build();
+//!
+//! let mut whole = frame.clone();
+//! assert!(matches!(segment.transit(&mut whole, 0), FrameOutcome::Back { .. }));
+//! assert_eq!(whole[whole.len() - 2..], [2, 0]); // working counter
+//!
+//! // Without the cable between the two, the first device returns the frame.
+//! assert!(segment.plug(1, 0, false));
+//! let mut broken = frame;
+//! segment.transit(&mut broken, 1_000_000);
+//! assert_eq!(broken[broken.len() - 2..], [1, 0]);
+//! ```
 
 mod route;
 pub mod topology;
@@ -25,6 +45,7 @@ use topology::Topology;
 pub use wiring::Nic;
 use wiring::{End, Wiring};
 
+/// The properties of a segment as a whole.
 #[derive(Debug, Clone)]
 pub struct SegmentOptions {
     /// The seed of all randomness, unless the fault script contains a seed.
@@ -46,7 +67,9 @@ impl Default for SegmentOptions {
 /// The result of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FrameOutcome {
+    /// The frame does not return.
     Lost,
+    /// The frame returns.
     Back {
         /// The time at which the MainDevice has received the complete frame.
         at: Nanos,
@@ -99,6 +122,7 @@ impl Segment {
         Self::with_topology(devices, topology, options)
     }
 
+    /// Creates a segment with these connections. The topology has as many devices.
     #[must_use]
     pub fn with_topology(
         devices: Vec<SimDevice>,
@@ -145,27 +169,32 @@ impl Segment {
         self.faults.reports()
     }
 
+    /// Returns the number of devices.
     #[must_use]
     pub fn len(&self) -> usize {
         self.devices.len()
     }
 
+    /// True without devices.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.devices.is_empty()
     }
 
+    /// Returns the device at this position, counted from 0.
     #[must_use]
     pub fn device(&self, position: usize) -> Option<&SimDevice> {
         self.devices.get(position)
     }
 
+    /// Returns the device at this position to change it.
     pub fn device_mut(&mut self, position: usize) -> Option<&mut SimDevice> {
         let device = self.devices.get_mut(position)?;
         device.disturb(self.rests.get_mut(position)?);
         Some(device)
     }
 
+    /// Returns the connections of the devices.
     #[must_use]
     pub fn topology(&self) -> &Topology {
         &self.topology

@@ -2,6 +2,17 @@
 //!
 //! Frames pass the ports of a device in the order 0, 3, 1, 2 and back to 0. The order of devices
 //! therefore is the order of the branches of a tree. Contradicting connections are rejected.
+//!
+//! ```
+//! use ecaxis_sim::Medium::{Mii, None as Missing};
+//! use ecaxis_sim::network::topology::{Topology, Uplink};
+//!
+//! // Ports 0, 1 and 2 of a junction, then two devices with two ports.
+//! let media = [[Mii, Mii, Mii, Missing], [Mii, Mii, Missing, Missing], [Mii, Mii, Missing, Missing]];
+//! let topology = Topology::by_order(&media).unwrap();
+//! assert_eq!(topology.uplink(0), None); // the MainDevice
+//! assert_eq!(topology.uplink(2), Some(Uplink { device: 1, port: 1 }));
+//! ```
 
 use crate::device::SimDevice;
 use crate::esc::ports::{DOWNSTREAM, Medium, PORTS};
@@ -21,7 +32,9 @@ pub struct PortRequest {
 /// A port that leads away from the MainDevice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Uplink {
+    /// The device with the port, counted from 0.
     pub device: usize,
+    /// The port of that device.
     pub port: u8,
 }
 
@@ -45,45 +58,87 @@ pub enum SecondPort {
     Reflects,
 }
 
+/// The devices cannot be connected as requested. Devices count from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum TopologyError {
+    /// The device to connect to does not come earlier.
     #[error("device {device} cannot be connected to device {after}, which does not come before it")]
-    NotBefore { device: usize, after: usize },
+    NotBefore {
+        /// The device that cannot be connected.
+        device: usize,
+        /// The device to connect to.
+        after: usize,
+    },
+    /// The requested port leads to the MainDevice.
     #[error("device {device}: port 0 of device {after} leads to the MainDevice")]
-    Upstream { device: usize, after: usize },
+    Upstream {
+        /// The device that cannot be connected.
+        device: usize,
+        /// The device to connect to.
+        after: usize,
+    },
+    /// The requested port does not exist.
     #[error("device {device}: device {after} has no port {port}")]
     NoSuchPort {
+        /// The device that cannot be connected.
         device: usize,
+        /// The device to connect to.
         after: usize,
+        /// The requested port.
         port: u8,
     },
+    /// Another device is connected to the requested port.
     #[error("device {device}: port {port} of device {after} is taken by device {by}")]
     Taken {
+        /// The device that cannot be connected.
         device: usize,
+        /// The device to connect to.
         after: usize,
+        /// The requested port.
         port: u8,
+        /// The other device.
         by: usize,
     },
+    /// The order of devices contradicts the order in which frames pass the ports.
     #[error(
         "device {device}: frames pass port {port} of device {after} before they reach device {by}, \
          so what is connected there must come before device {by}"
     )]
     OutOfOrder {
+        /// The device that cannot be connected.
         device: usize,
+        /// The device to connect to.
         after: usize,
+        /// The requested port.
         port: u8,
+        /// The other device.
         by: usize,
     },
+    /// The two ports have different media.
     #[error("device {device}: port {port} of device {after} is of another medium")]
     OtherMedium {
+        /// The device that cannot be connected.
         device: usize,
+        /// The device to connect to.
         after: usize,
+        /// The requested port.
         port: u8,
     },
+    /// The device to connect to has no free port.
     #[error("device {device}: device {after} has no port left for it")]
-    NoPortAt { device: usize, after: usize },
+    NoPortAt {
+        /// The device that cannot be connected.
+        device: usize,
+        /// The device to connect to.
+        after: usize,
+    },
+    /// No earlier device has a free port.
     #[error("device {device}: no device before it has a port left")]
-    NoPort { device: usize },
+    NoPort {
+        /// The device that cannot be connected.
+        device: usize,
+    },
+    /// No free port can close the ring.
     #[error("no port is left to close the ring at")]
     NoPortForRing,
 }
@@ -258,6 +313,7 @@ impl Topology {
         self.uplinks.len()
     }
 
+    /// True without devices.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.uplinks.is_empty()

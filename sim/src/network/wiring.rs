@@ -7,6 +7,7 @@ use crate::esc::ports::{Medium, PORTS};
 /// A port of the MainDevice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Nic {
+    /// The first port.
     Primary,
     /// The port at the other end of a ring.
     Secondary,

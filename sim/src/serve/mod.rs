@@ -2,6 +2,19 @@
 //!
 //! * `socket`: the raw socket
 //! * `stats`: statistics
+//!
+//! ```no_run
+//! use std::sync::atomic::AtomicBool;
+//!
+//! use ecaxis_sim::{Segment, SegmentOptions, ServeStats, Server};
+//!
+//! let mut segment = Segment::new(Vec::new(), SegmentOptions::default());
+//! let server = Server::open(&["eth1"])?;
+//! let stop = AtomicBool::new(false); // set by another thread
+//! let stats: ServeStats = server.serve(&mut segment, &stop, |_segment, _now| {})?;
+//! println!("{} frames", stats.frames);
+//! # Ok::<(), ecaxis_sim::ServeError>(())
+//! ```
 
 mod socket;
 mod stats;
@@ -17,20 +30,29 @@ pub use stats::{Histogram, ServeStats};
 
 const MAX_FRAME: usize = 1522;
 
+/// A network interface cannot serve the segment. Contains its name.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
+    /// No interface has this name.
     #[error("the interface `{0}` does not exist")]
     NoSuchInterface(String),
+    /// The interface does not carry Ethernet frames.
     #[error("the interface `{0}` is not an Ethernet interface")]
     NotEthernet(String),
+    /// The interface disappeared or went down.
     #[error("the interface `{0}` is gone")]
     Gone(String),
+    /// The process lacks the capability `CAP_NET_RAW`.
     #[error("opening a raw socket on `{0}` is not permitted")]
     NotPermitted(String),
+    /// A system call failed.
     #[error("the interface `{nic}`: {what}: {source}")]
     Io {
+        /// The interface.
         nic: String,
+        /// The failed operation.
         what: &'static str,
+        /// The error of the system call.
         source: io::Error,
     },
 }

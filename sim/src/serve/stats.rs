@@ -6,7 +6,9 @@ use crate::Nanos;
 const STEPS: usize = 8;
 const BUCKETS: usize = 64 * STEPS;
 
+/// Counters of a served segment.
 #[derive(Debug, Clone, Default)]
+#[non_exhaustive]
 pub struct ServeStats {
     /// EtherCAT frames received.
     pub frames: u64,
@@ -22,6 +24,7 @@ pub struct ServeStats {
     pub malformed: u64,
     /// Frames other than EtherCAT. SubDevices destroy them unless configured otherwise.
     pub foreign: u64,
+    /// Replies that could not be sent.
     pub send_errors: u64,
     /// The time from the arrival of a frame until its reply is sent or delayed.
     pub turnaround: Histogram,
@@ -44,6 +47,7 @@ impl Default for Histogram {
 }
 
 impl Histogram {
+    /// Counts a duration in ns.
     pub fn add(&mut self, value: Nanos) {
         if let Some(count) = self.counts.get_mut(bucket(value)) {
             *count += 1;
@@ -51,6 +55,7 @@ impl Histogram {
         self.max = self.max.max(value);
     }
 
+    /// Returns the longest duration in ns.
     #[must_use]
     pub fn max(&self) -> Nanos {
         self.max

@@ -1,6 +1,6 @@
 //! The captured buses: their devices, and the state in which each capture starts.
 
-use ecaxis_sim::esc::chip::{EscInfo, eeprom};
+use ecaxis_sim::chip::{EscInfo, eeprom};
 
 pub struct Device {
     pub name: &'static str,

@@ -98,18 +98,15 @@ impl Objects {
     /// Adds objects that the image does not contain to a device's dictionary. Read objects get
     /// their value; written objects are writable and 0.
     pub fn feed(&self, device: &mut SimDevice) {
-        let store = device.store_mut();
-        let mut ensure = |(index, sub): (u16, u8), len: usize, write, value: &[u8]| {
-            let bits = u32::try_from(len * 8).unwrap();
-            let access = Access { read: true, write };
-            store.ensure(index, sub, "recorded", bits, access, value);
+        let mut add = |(index, sub): (u16, u8), write, value: &[u8]| {
+            device.add_object(index, sub, Access { read: true, write }, value);
         };
         for (key, data) in &self.downloads {
-            ensure(*key, data.len(), Writable::Always, &[]);
+            add(*key, Writable::Always, &vec![0; data.len()]);
         }
         for (key, (data, complete)) in &self.uploads {
             if !complete {
-                ensure(*key, data.len(), Writable::Never, data);
+                add(*key, Writable::Never, data);
             }
         }
     }

@@ -2,6 +2,7 @@
 
 use crate::foe::FoeOptions;
 
+/// Mailbox properties of a device that an ESI does not contain.
 #[derive(Debug, Clone)]
 pub struct MailboxOptions {
     /// The time in ns from fetching a request to its answer.
@@ -22,6 +23,7 @@ pub struct MailboxOptions {
     pub refuse_mapped: bool,
     /// Overrides the ESI: support of FoE.
     pub has_foe: Option<bool>,
+    /// Properties of the file access.
     pub foe: FoeOptions,
 }
 

@@ -232,8 +232,8 @@ impl SyncUnit {
     }
 
     /// True if the start time was missed, so that no pulse comes for centuries.
-    #[must_use]
-    pub fn never_starts(&self) -> bool {
+    #[cfg(test)]
+    fn never_starts(&self) -> bool {
         self.sync0_on() && self.pulses == 0 && self.due0 == u64::MAX
     }
 

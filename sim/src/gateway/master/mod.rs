@@ -87,9 +87,13 @@ struct Request {
 
 /// A finished SDO transfer with a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct SdoResult {
+    /// The node number.
     pub node: u8,
+    /// The index of the object.
     pub index: u16,
+    /// The subindex of the object.
     pub sub: u8,
     /// The data of an upload; empty after a download.
     pub data: Result<Vec<u8>, Abort>,

@@ -13,9 +13,13 @@ use crate::drive::PlantParams;
 
 /// The drives of the first EPOS generation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
 pub enum Epos {
+    /// EPOS 24/1.
     E24_1,
+    /// EPOS 24/5.
     E24_5,
+    /// EPOS 70/10.
     E70_10,
 }
 
@@ -25,6 +29,7 @@ const FIRMWARE: i64 = 0x2033;
 const DEVICE_TYPE: i64 = 0x0002_0192;
 
 impl Epos {
+    /// All models.
     pub const ALL: [Self; 3] = [Self::E24_1, Self::E24_5, Self::E70_10];
 
     /// Returns the vendor's product name.
@@ -37,6 +42,7 @@ impl Epos {
         }
     }
 
+    /// Returns the model with this product name ([`Self::name`]).
     #[must_use]
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|model| model.name() == name)

@@ -44,6 +44,7 @@ pub(super) struct Settings {
     pub(super) bit_rate: u32,
 }
 
+/// An EPOS drive as a CANopen node.
 #[derive(Debug, Clone)]
 pub struct Node {
     settings: Settings,
@@ -112,26 +113,31 @@ impl Node {
         node
     }
 
+    /// Returns the node number.
     #[must_use]
     pub fn id(&self) -> u8 {
         self.settings.id
     }
 
+    /// Returns the model.
     #[must_use]
     pub fn model(&self) -> Epos {
         self.settings.drive
     }
 
+    /// Returns the NMT state.
     #[must_use]
     pub fn nmt_state(&self) -> NmtState {
         self.nmt
     }
 
+    /// Returns the drive.
     #[must_use]
     pub fn drive(&self) -> &Drive {
         &self.drive
     }
 
+    /// Returns the drive to change it.
     pub fn drive_mut(&mut self) -> &mut Drive {
         &mut self.drive
     }
