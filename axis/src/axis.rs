@@ -63,6 +63,7 @@ const SHORTEST_CYCLE_S: f64 = 1e-6;
 /// Longest accepted cycle. A longer one would let the set-point jump.
 const LONGEST_CYCLE_S: f64 = 0.1;
 
+/// One axis: commands in, limited set-points out, supervision in between. Call it once per cycle.
 #[derive(Debug, Clone)]
 pub struct Axis {
     config: AxisConfig,
@@ -120,6 +121,7 @@ pub struct Axis {
 }
 
 impl Axis {
+    /// Creates a disabled axis. Fails if the configuration is contradictory or out of range.
     pub fn new(config: AxisConfig) -> Result<Self, ConfigError> {
         config.check()?;
         Ok(Self {
@@ -167,6 +169,7 @@ impl Axis {
         })
     }
 
+    /// Returns the configuration.
     #[must_use]
     pub const fn config(&self) -> &AxisConfig {
         &self.config

@@ -5,6 +5,7 @@ use crate::scale::Scale;
 use crate::setpoint::MotionLimits;
 use crate::units::UserVelocity;
 
+/// The limits of an axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
     /// Lowest and highest position, user units. `None`: unlimited.
@@ -24,24 +25,53 @@ pub struct Limits {
     pub following_error: Option<f64>,
 }
 
+/// A limit is invalid. Values in user units.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum LimitError {
+    /// A limit is not a finite number above zero.
     #[error("limit {what} is {value}: it must be a finite number above zero")]
-    NotPositive { what: &'static str, value: f64 },
+    NotPositive {
+        /// The limit's name.
+        what: &'static str,
+        /// The rejected value.
+        value: f64,
+    },
+    /// The position range is empty.
     #[error("position range [{low}, {high}] is empty or not finite")]
-    EmptyRange { low: f64, high: f64 },
+    EmptyRange {
+        /// The lower end.
+        low: f64,
+        /// The upper end.
+        high: f64,
+    },
+    /// The position range exceeds 32 bits of counts.
     #[error(
         "position range [{low}, {high}] is {counts:e} counts wide, more than the 2^31 a drive can distinguish"
     )]
-    RangeTooWide { low: f64, high: f64, counts: f64 },
+    RangeTooWide {
+        /// The lower end.
+        low: f64,
+        /// The upper end.
+        high: f64,
+        /// The width in counts.
+        counts: f64,
+    },
+    /// The velocity limit exceeds 32 bits of the drive's unit.
     #[error("velocity limit {velocity} units/s is {raw:e} {unit}, more than 32 bits hold")]
     VelocityNotRepresentable {
+        /// The limit per second.
         velocity: f64,
+        /// The limit in the drive's unit.
         raw: f64,
+        /// The drive's unit.
         unit: crate::scale::VelocityUnit,
     },
+    /// The torque limit exceeds 16 bits of per mille.
     #[error("torque limit {torque} % is more than the 3276.7 % that 16 bits of per mille hold")]
-    TorqueNotRepresentable { torque: f64 },
+    TorqueNotRepresentable {
+        /// The limit in percent.
+        torque: f64,
+    },
 }
 
 impl Limits {
@@ -65,6 +95,7 @@ impl Limits {
         }
     }
 
+    /// Checks the limits. Fails at the first invalid one.
     pub fn check(&self, scale: &Scale) -> Result<(), LimitError> {
         let positive = [
             ("velocity", Some(self.velocity)),

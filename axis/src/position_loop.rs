@@ -14,8 +14,11 @@ use crate::setpoint::Ramp;
 /// The position loops of an axis. The default has no loop and no offset.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Loops {
+    /// Feedforward offsets in CSP.
     pub csp: FeedForward,
+    /// The position loop in CSV; `None`: the axis has no positions there.
     pub csv: Option<VelocityLoop>,
+    /// The position loop in CST; `None`: the axis has torques only.
     pub cst: Option<PositionPid>,
 }
 
@@ -52,7 +55,7 @@ pub struct PositionPid {
 
 /// Inputs of a PID loop in one cycle, user units and seconds.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Deviation {
+pub(crate) struct Deviation {
     pub position: f64,
     pub velocity: f64,
     /// Acceleration of the set-point.
@@ -61,14 +64,14 @@ pub struct Deviation {
 
 /// The integral part of a PID loop, percent of rated torque.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Integral(f64);
+pub(crate) struct Integral(f64);
 
 impl PositionPid {
     /// Runs one cycle and returns the torque within ±`limit`. While the limit is active, the
     /// integral does not grow further. In a loop without integral part, a torque taken over
     /// decreases by `slope` per second.
     #[must_use]
-    pub fn advance(
+    pub(crate) fn advance(
         &self,
         integral: Integral,
         seen: Deviation,
@@ -93,7 +96,7 @@ impl PositionPid {
 
     /// Returns the integral with which the loop outputs `torque` now.
     #[must_use]
-    pub fn starting_with(&self, torque: f64, seen: Deviation) -> Integral {
+    pub(crate) fn starting_with(&self, torque: f64, seen: Deviation) -> Integral {
         let integral = torque - self.direct(seen);
         Integral(if integral.is_finite() { integral } else { 0.0 })
     }

@@ -142,11 +142,6 @@ impl Profile {
         self.goal.as_ref()
     }
 
-    #[must_use]
-    pub const fn halted(&self) -> bool {
-        self.halt
-    }
-
     /// PP: returns true while a target is pending.
     #[must_use]
     pub const fn pending(&self) -> bool {

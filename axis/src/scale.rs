@@ -2,6 +2,17 @@
 //!
 //! The constructors check a [`Scale`]; afterwards no conversion fails. Values outside the range of
 //! the wire type saturate. All conversions round to nearest.
+//!
+//! ```
+//! use ecaxis_axis::units::{Counts, RawVelocity, UserUnits, UserVelocity};
+//! use ecaxis_axis::{Scale, VelocityUnit};
+//!
+//! // 2000 counts and 5 mm per turn; the drive's velocities are in mrpm.
+//! let scale = Scale::new(2000.0, 5.0)?.with_velocity_unit(VelocityUnit::MILLI_RPM);
+//! assert_eq!(scale.position_to_counts(UserUnits(2.5)), Counts(1000));
+//! assert_eq!(scale.velocity_to_raw(UserVelocity(5.0)), RawVelocity(60_000));
+//! # Ok::<(), ecaxis_axis::ScaleError>(())
+//! ```
 
 mod drive_unit;
 mod drive_units;
@@ -18,27 +29,54 @@ use crate::units::{
     UserVelocity,
 };
 
+/// A scale is invalid.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum ScaleError {
+    /// A factor is not a finite number above zero.
     #[error("{what} is {value}: it must be a finite number above zero")]
-    NotPositive { what: &'static str, value: f64 },
+    NotPositive {
+        /// The factor's name.
+        what: &'static str,
+        /// The rejected value.
+        value: f64,
+    },
+    /// The offset is not finite.
     #[error("offset is {value}: it must be a finite number")]
-    Offset { value: f64 },
+    Offset {
+        /// The rejected value.
+        value: f64,
+    },
+    /// A ratio contains a zero.
     #[error("{what} is {above}:{below}: neither may be zero")]
     Ratio {
+        /// The factor's name.
         what: &'static str,
+        /// The numerator.
         above: u32,
+        /// The denominator.
         below: u32,
     },
+    /// The modulo range is too small or too large.
     #[error("a modulo of {value} units is less than 2 counts, or more than 2^31")]
-    Modulo { value: f64 },
+    Modulo {
+        /// The rejected value.
+        value: f64,
+    },
+    /// A torque cannot be converted: a property of the motor is missing.
     #[error("{what} is not known, which a torque in {unit} needs")]
     Torque {
+        /// The missing property.
         what: &'static str,
+        /// The unit of the torque.
         unit: &'static str,
     },
+    /// The resolution is out of range.
     #[error("one user unit is {counts_per_unit:e} counts, outside 1e-6 … 1e15")]
-    Unusable { counts_per_unit: f64 },
+    Unusable {
+        /// The counts of one user unit.
+        counts_per_unit: f64,
+    },
 }
 
 /// The conversions of one axis. `position = ±counts / counts_per_unit + offset`.
@@ -100,6 +138,7 @@ impl Scale {
         .derived())
     }
 
+    /// Returns the scale of a motor with gear and feed.
     pub fn of_drivetrain(drivetrain: &Drivetrain) -> Result<Self, ScaleError> {
         let ratio = |what, [above, below]: [u32; 2]| {
             if above == 0 || below == 0 {
@@ -113,6 +152,7 @@ impl Scale {
         Self::new(increments / turns, drivetrain.feed * shaft / motor)
     }
 
+    /// Sets the drive's unit of velocities (0x60A9).
     #[must_use]
     pub fn with_velocity_unit(mut self, unit: VelocityUnit) -> Self {
         self.velocity_unit = unit;
@@ -171,32 +211,38 @@ impl Scale {
         self.counts_per_unit.abs()
     }
 
+    /// Returns the counts per motor turn.
     #[must_use]
     pub const fn counts_per_turn(&self) -> f64 {
         self.counts_per_turn
     }
 
+    /// Returns the user units per motor turn.
     #[must_use]
     pub const fn units_per_turn(&self) -> f64 {
         self.units_per_turn
     }
 
+    /// Returns the drive's unit of velocities.
     #[must_use]
     pub const fn velocity_unit(&self) -> VelocityUnit {
         self.velocity_unit
     }
 
+    /// Returns the drive's unit of accelerations.
     #[must_use]
     pub fn acceleration_unit(&self) -> AccelerationUnit {
         self.acceleration_unit
             .unwrap_or_else(|| self.velocity_unit.into())
     }
 
+    /// True if user units and counts have opposite directions.
     #[must_use]
     pub const fn inverted(&self) -> bool {
         self.invert
     }
 
+    /// Returns the position in user units at 0 counts.
     #[must_use]
     pub const fn offset(&self) -> f64 {
         self.offset
@@ -214,6 +260,7 @@ impl Scale {
         1.0 / self.raw_velocity_per_unit.abs()
     }
 
+    /// Converts a position.
     #[must_use]
     pub fn position_to_user(&self, counts: Counts) -> UserUnits {
         UserUnits(counts.0 as f64 / self.counts_per_unit + self.offset)
@@ -227,16 +274,19 @@ impl Scale {
         [self.offset() - far, self.offset() + far]
     }
 
+    /// Converts a position, rounded to the nearest count.
     #[must_use]
     pub fn position_to_counts(&self, position: UserUnits) -> Counts {
         Counts(round_i64((position.0 - self.offset) * self.counts_per_unit))
     }
 
+    /// Converts a velocity.
     #[must_use]
     pub fn velocity_to_user(&self, raw: RawVelocity) -> UserVelocity {
         UserVelocity(f64::from(raw.0) / self.raw_velocity_per_unit)
     }
 
+    /// Converts a velocity, rounded to the drive's resolution.
     #[must_use]
     pub fn velocity_to_raw(&self, velocity: UserVelocity) -> RawVelocity {
         RawVelocity(round_i32(velocity.0 * self.raw_velocity_per_unit))
@@ -248,6 +298,7 @@ impl Scale {
         UserAcceleration(f64::from(raw.0) / self.raw_acceleration_per_unit)
     }
 
+    /// Converts an acceleration, rounded to the drive's resolution.
     #[must_use]
     pub fn acceleration_to_raw(&self, acceleration: UserAcceleration) -> RawAcceleration {
         let raw = (acceleration.0 * self.raw_acceleration_per_unit)
@@ -257,11 +308,13 @@ impl Scale {
         RawAcceleration(raw as u32)
     }
 
+    /// Converts a torque.
     #[must_use]
     pub fn torque_to_user(&self, raw: PerMille) -> Percent {
         Percent(f64::from(raw.0) / 10.0 * self.sign())
     }
 
+    /// Converts a torque, rounded to per mille.
     #[must_use]
     pub fn torque_to_raw(&self, torque: Percent) -> PerMille {
         PerMille((torque.0 * 10.0 * self.sign()).round() as i16)

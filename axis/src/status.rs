@@ -1,8 +1,15 @@
 //! The status of an axis, its trips, and the reasons for a rejected command.
+//!
+//! ```
+//! use ecaxis_axis::status::DriveFault;
+//!
+//! let fault = DriveFault { statusword: 0x0008, code: Some(0x8611) };
+//! assert!(fault.to_string().starts_with("drive fault 0x8611: "));
+//! ```
 
 use core::fmt;
 
-use crate::cia402::{Mode, ModeStatus, State, Statusword, describe};
+use crate::cia402::{Mode, State, Statusword, describe};
 use crate::homing::HomingError;
 use crate::setpoint::SetpointError;
 use crate::supervision::StopMethod;
@@ -10,6 +17,7 @@ use crate::touch_probe::ProbeStatus;
 
 /// The status of one axis in one cycle, in user units. `Copy`, so that a snapshot can contain it.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub struct AxisStatus {
     /// The active mode; its targets apply.
     pub mode: Mode,
@@ -19,7 +27,9 @@ pub struct AxisStatus {
     pub switch_failed: Option<Mode>,
     /// The power state in the last fresh Statusword.
     pub state: State,
+    /// Time since the drive entered this state, seconds.
     pub time_in_state_s: f64,
+    /// The last fresh Statusword.
     pub statusword: u16,
     /// The Controlword of the last outputs.
     pub controlword: u16,
@@ -46,8 +56,11 @@ pub struct AxisStatus {
     pub torque: f64,
     /// Commanded position of this cycle.
     pub target_position: f64,
+    /// Commanded velocity of this cycle.
     pub target_velocity: f64,
+    /// Commanded acceleration of this cycle.
     pub target_acceleration: f64,
+    /// Commanded torque of this cycle, percent of rated torque.
     pub target_torque: f64,
     /// Commanded minus reported position. The commanded position is the one of a dead time ago, at
     /// least one cycle.
@@ -65,10 +78,12 @@ pub struct AxisStatus {
     pub stale_cycles: u32,
     /// The condition that blocks enabling.
     pub waiting: Option<EnableBlocker>,
+    /// The touch probes.
     pub probes: [ProbeStatus; 2],
     /// Automatic fault resets since the last [`crate::Command::ResetFault`], or since the axis was
     /// last enabled for a minute.
     pub resets_tried: u8,
+    /// The state of the last homing.
     pub homing: HomingStatus,
     /// True if home was found and no homing has started since.
     pub homed: bool,
@@ -92,18 +107,15 @@ impl AxisStatus {
     pub const fn word(&self) -> Statusword {
         Statusword::from_bits_retain(self.statusword)
     }
-
-    /// Returns the mode-specific bits of the Statusword, decoded for the active mode.
-    #[must_use]
-    pub const fn mode_status(&self) -> ModeStatus {
-        self.word().in_mode(self.mode)
-    }
 }
 
 /// An active stop.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub struct StopStatus {
+    /// The present method of the stop.
     pub method: StopMethod,
+    /// The present phase.
     pub phase: StopPhase,
     /// Time since the method was chosen, or since the removal of power was requested.
     pub elapsed_s: f64,
@@ -113,7 +125,9 @@ pub struct StopStatus {
 
 /// The phase of a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
 pub enum StopPhase {
+    /// The axis slows down.
     Decelerating,
     /// The axis stands; the brake closes.
     Standstill,
@@ -127,22 +141,40 @@ pub enum StopPhase {
 
 /// The reason why an axis is not ready although it is to be enabled.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum EnableBlocker {
+    /// No position is reported.
     #[error("no position is reported (0x6064)")]
     Position,
+    /// Statusword bit 9 (remote) is not set.
     #[error("the drive is not controlled from here: Statusword bit 9 (remote) is not set")]
     Remote,
+    /// Statusword bit 4 (voltage enabled) is not set.
     #[error("the power stage has no voltage: Statusword bit 4 is not set")]
     Voltage,
+    /// 0x6061 shows another mode.
     #[error("the drive shows mode {display} instead of {expected}")]
-    Mode { expected: Mode, display: Mode },
+    Mode {
+        /// The requested mode.
+        expected: Mode,
+        /// The mode in 0x6061.
+        display: Mode,
+    },
+    /// Statusword bit 12 (drive follows command value) is not set.
     #[error("the drive does not follow the command value: Statusword bit 12 is not set in {mode}")]
-    Follows { mode: Mode },
+    Follows {
+        /// The mode of the axis.
+        mode: Mode,
+    },
+    /// The brake is opening.
     #[error("the brake is opening")]
     Brake,
     /// The drive gives no reason.
     #[error("the drive stays in {state}")]
-    Drive { state: State },
+    Drive {
+        /// The state of the drive.
+        state: State,
+    },
 }
 
 /// The state of the last homing.
@@ -151,14 +183,18 @@ pub enum HomingStatus {
     /// No homing has started.
     #[default]
     None,
+    /// Homing runs.
     Running,
+    /// Home was found.
     Attained,
+    /// Home was not found.
     Failed(HomingError),
 }
 
 /// A fault reported by the drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DriveFault {
+    /// The last fresh Statusword.
     pub statusword: u16,
     /// The code from 0x603F or from an emergency message, if known
     /// ([`crate::Axis::note_error_code`]).
@@ -177,103 +213,246 @@ impl fmt::Display for DriveFault {
 /// The reason why an axis stopped itself. Values in user units.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum Trip {
+    /// The following error exceeds its limit.
     #[error("following error {error:.4} exceeds {limit:.4}")]
-    FollowingError { error: f64, limit: f64 },
+    FollowingError {
+        /// The following error.
+        error: f64,
+        /// The limit.
+        limit: f64,
+    },
+    /// The axis is outside its position range.
     #[error("position {position:.4} is outside [{low:.4}, {high:.4}]")]
-    PositionLimit { position: f64, low: f64, high: f64 },
+    PositionLimit {
+        /// The position.
+        position: f64,
+        /// The lower end of the range.
+        low: f64,
+        /// The upper end of the range.
+        high: f64,
+    },
+    /// The reported velocity exceeds 1.2 times the limit.
     #[error("velocity {velocity:.4} exceeds 1.2 × the limit of {limit:.4}")]
-    OverVelocity { velocity: f64, limit: f64 },
+    OverVelocity {
+        /// The velocity.
+        velocity: f64,
+        /// The limit.
+        limit: f64,
+    },
+    /// The drive left Operation enabled without a command.
     #[error("the drive left Operation enabled for {state} without a command")]
-    PowerLost { state: State },
+    PowerLost {
+        /// The state of the drive.
+        state: State,
+    },
+    /// The torque exceeded its limit for too long.
     #[error("torque {torque:.1} % has been above {limit:.1} % for {time_s} s")]
     OverTorque {
+        /// The torque in percent.
         torque: f64,
+        /// The limit.
         limit: f64,
+        /// The time in seconds.
         time_s: f64,
     },
+    /// The reported acceleration exceeds its limit.
     #[error("acceleration {acceleration:.4} exceeds {limit:.4}")]
-    OverAcceleration { acceleration: f64, limit: f64 },
+    OverAcceleration {
+        /// The acceleration.
+        acceleration: f64,
+        /// The limit.
+        limit: f64,
+    },
+    /// The emergency stop was commanded.
     #[error("emergency stop")]
     EmergencyStop,
+    /// PP: the drive did not acknowledge a set-point.
     #[error("the drive did not acknowledge a set-point")]
     SetPointNotTaken,
+    /// Statusword bit 12 was cleared during motion.
     #[error(
         "the drive no longer follows the command value: Statusword bit 12 is not set in {mode}"
     )]
-    NotFollowing { mode: Mode },
+    NotFollowing {
+        /// The mode of the axis.
+        mode: Mode,
+    },
+    /// A stop did not bring the axis to rest in time.
     #[error(
         "the axis was not brought to rest by {method} within {time_s:.2} s: it moves at {velocity:.4}"
     )]
     NotStopped {
+        /// The velocity.
         velocity: f64,
+        /// The time in seconds.
         time_s: f64,
+        /// The present method of the stop.
         method: StopMethod,
     },
+    /// 0x6061 changed without a command.
     #[error("the drive changed its mode of operation from {expected} to {display}")]
-    ModeLost { expected: Mode, display: Mode },
+    ModeLost {
+        /// The requested mode.
+        expected: Mode,
+        /// The mode in 0x6061.
+        display: Mode,
+    },
 }
 
 /// The reason why a command was rejected. A rejected command changes nothing. Values in user units.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum CommandError {
+    /// The bus is not in Op.
     #[error("the bus is not in Op yet")]
     NotInOp,
+    /// The axis follows a gear, stream or other source.
     #[error("the axis follows something else; stop it first")]
     Following,
+    /// A parameter is not finite.
     #[error("{what} is {value}: not a finite number")]
-    NotFinite { what: &'static str, value: f64 },
+    NotFinite {
+        /// The parameter's name.
+        what: &'static str,
+        /// The rejected value.
+        value: f64,
+    },
+    /// A parameter is not in (0, 1].
     #[error("{what} is {value}: it must be above 0 and at most 1")]
-    NotAFraction { what: &'static str, value: f64 },
+    NotAFraction {
+        /// The parameter's name.
+        what: &'static str,
+        /// The rejected value.
+        value: f64,
+    },
+    /// A parameter is negative.
     #[error("{what} is {value}: it must not be negative")]
-    Negative { what: &'static str, value: f64 },
+    Negative {
+        /// The parameter's name.
+        what: &'static str,
+        /// The rejected value.
+        value: f64,
+    },
+    /// The target is outside the position range.
     #[error("position {position} is outside the range [{low}, {high}]")]
-    OutsideRange { position: f64, low: f64, high: f64 },
+    OutsideRange {
+        /// The position.
+        position: f64,
+        /// The lower end of the range.
+        low: f64,
+        /// The upper end of the range.
+        high: f64,
+    },
+    /// The velocity exceeds the limit.
     #[error("velocity {velocity} exceeds the limit of {limit}")]
-    TooFast { velocity: f64, limit: f64 },
+    TooFast {
+        /// The velocity.
+        velocity: f64,
+        /// The limit.
+        limit: f64,
+    },
+    /// The torque exceeds the limit.
     #[error("torque {percent} % exceeds the limit of {limit} %")]
-    TooMuchTorque { percent: f64, limit: f64 },
+    TooMuchTorque {
+        /// The torque in percent.
+        percent: f64,
+        /// The limit.
+        limit: f64,
+    },
+    /// The command needs another mode.
     #[error("{command} needs mode {needs}, the axis is in {mode}")]
     WrongMode {
+        /// The command.
         command: &'static str,
+        /// The necessary mode.
         needs: Mode,
+        /// The mode of the axis.
         mode: Mode,
     },
+    /// The mode is not among [`crate::AxisConfig::modes`].
     #[error("mode {mode} is not among those that were made ready for this axis")]
-    ModeNotOffered { mode: Mode },
+    ModeNotOffered {
+        /// The mode of the axis.
+        mode: Mode,
+    },
+    /// 0x6061 is not mapped, so a switch cannot be confirmed.
     #[error("the drive's mode is not visible: 0x6061 is not mapped")]
     NoModeDisplay,
+    /// The mode needs 0x6064, which is not mapped.
     #[error("mode {mode} needs a reported position: 0x6064 is not mapped")]
-    NoPosition { mode: Mode },
+    NoPosition {
+        /// The mode of the axis.
+        mode: Mode,
+    },
+    /// A mode switch is pending.
     #[error("the axis is just being switched to mode {to}")]
-    Switching { to: Mode },
+    Switching {
+        /// The mode of the pending switch.
+        to: Mode,
+    },
+    /// The motion cannot be planned.
     #[error(transparent)]
     Plan(#[from] SetpointError),
+    /// The brake is still opening.
     #[error("the brake is still opening")]
     BrakeOpening,
+    /// 0x60B9 is not mapped.
     #[error("no touch probe is mapped (0x60B9)")]
     NoProbe,
+    /// The axis is homing.
     #[error("the axis is homing")]
     Homing,
+    /// An external position is too far from the previous one.
     #[error("a step of {step} in one cycle is more than the {most} of the velocity limit")]
-    Step { step: f64, most: f64 },
+    Step {
+        /// The distance.
+        step: f64,
+        /// The largest accepted value.
+        most: f64,
+    },
+    /// An external velocity differs too much from the previous one.
     #[error(
         "velocity changes by {change} in one cycle, more than the {most} of the acceleration limit"
     )]
-    Jump { change: f64, most: f64 },
+    Jump {
+        /// The change of velocity.
+        change: f64,
+        /// The largest accepted value.
+        most: f64,
+    },
+    /// Frames are being lost.
     #[error("frames are being lost; the set-point waits")]
     FramesLost,
+    /// The axis is not enabled.
     #[error("the axis is not enabled (drive: {state})")]
-    NotEnabled { state: State },
+    NotEnabled {
+        /// The state of the drive.
+        state: State,
+    },
+    /// 0x6061 does not show the mode yet.
     #[error("the drive has not confirmed mode {expected}, it shows {display}")]
-    ModeNotConfirmed { expected: Mode, display: Mode },
+    ModeNotConfirmed {
+        /// The requested mode.
+        expected: Mode,
+        /// The mode in 0x6061.
+        display: Mode,
+    },
+    /// The drive is in Fault.
     #[error("{0}; reset it first")]
     Faulted(DriveFault),
+    /// The axis has tripped.
     #[error("the axis stopped itself: {0}; reset it first")]
     Tripped(Trip),
+    /// The axis is stopping or being disabled.
     #[error("the axis is stopping or being disabled")]
     Stopping,
+    /// The reaction group of the axis is stopped.
     #[error("the group of axes that it belongs to is stopped; reset it first")]
     GroupStopped,
+    /// The axis moves.
     #[error("the axis still moves at {velocity}")]
-    StillMoving { velocity: f64 },
+    StillMoving {
+        /// The velocity.
+        velocity: f64,
+    },
 }

@@ -1,4 +1,15 @@
 //! Supervision in addition to the limits, reaction to a trip, brake, and fault reset.
+//!
+//! ```
+//! use ecaxis_axis::supervision::{StopMethod, Supervision, TorqueWatch};
+//!
+//! let supervision = Supervision {
+//!     reaction: StopMethod::Ramp,
+//!     torque: Some(TorqueWatch { percent: 80.0, time_s: 2.0 }),
+//!     ..Supervision::default()
+//! };
+//! assert_eq!(supervision.emergency, StopMethod::QuickStop);
+//! ```
 
 /// Supervision in addition to [`crate::Limits`]. The default adds nothing and stops by quick stop.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -48,6 +59,7 @@ impl core::fmt::Display for StopMethod {
 pub struct TorqueWatch {
     /// Percent of rated torque.
     pub percent: f64,
+    /// The time for which the torque may exceed the limit, seconds.
     pub time_s: f64,
 }
 
@@ -66,6 +78,7 @@ pub enum FaultReset {
     /// Only [`crate::Command::ResetFault`].
     #[default]
     Manual,
+    /// The axis resets faults by itself.
     Automatic {
         /// Number of automatic resets without a command in between.
         tries: u8,

@@ -7,13 +7,18 @@
 /// Touch probe 1 or 2.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Probe {
+    /// Touch probe 1.
     First,
+    /// Touch probe 2.
     Second,
 }
 
+/// The edge that a touch probe captures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Edge {
+    /// The rising edge.
     Positive,
+    /// The falling edge.
     Negative,
 }
 
@@ -28,15 +33,19 @@ pub enum Source {
     Selected,
 }
 
+/// The status of a touch probe.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum ProbeStatus {
+    /// Switched off.
     #[default]
     Off,
     /// Requested; the drive has not confirmed it.
     Arming,
+    /// The drive waits for the edge.
     Armed,
     /// Position at the edge, user units.
     Captured {
+        /// The position, user units.
         position: f64,
     },
 }

@@ -5,6 +5,14 @@
 //! [`UserUnits`], [`UserVelocity`], [`UserAcceleration`], [`Percent`]. [`crate::Scale`] is the only
 //! conversion between both sides. [`crate::scale::TorqueScale`] first converts a torque in
 //! [`NewtonMetres`] or [`Amperes`] to [`Percent`].
+//!
+//! ```
+//! use ecaxis_axis::units::Counts;
+//!
+//! // The drive's 32-bit position wraps; the axis continues to count.
+//! let before = Counts(i64::from(i32::MAX));
+//! assert_eq!(before.unwrap_next(i32::MIN), Counts(i64::from(i32::MAX) + 1));
+//! ```
 
 /// Position in encoder counts, unwrapped: the value continues where the drive's 32-bit value wraps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]

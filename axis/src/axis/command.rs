@@ -10,6 +10,7 @@ use crate::supervision::StopMethod;
 use crate::touch_probe::{Edge, Probe, Source};
 use crate::units::{Counts, UserUnits};
 
+/// A command to an axis; an unsuitable one is rejected with a [`CommandError`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Command {
     /// Takes the drive to Operation enabled. Does not reset a fault.
@@ -31,14 +32,19 @@ pub enum Command {
     EmergencyStop,
     /// Captures the position of the next edge, once.
     ArmProbe {
+        /// The touch probe.
         probe: Probe,
+        /// The edge.
         edge: Edge,
+        /// The signal of the edge.
         source: Source,
         /// Stops like [`Command::Stop`] in the cycle that shows the edge. An axis with external
         /// set-points continues with them.
         stop: bool,
     },
+    /// Switches a touch probe off.
     DisarmProbe {
+        /// The touch probe.
         probe: Probe,
     },
     /// Switches the mode of operation, also in motion. The motion continues if the new mode
@@ -52,6 +58,7 @@ pub enum Command {
     },
     /// Moves to a position. In CSP and PP, and in CSV and CST with a position loop.
     MoveTo {
+        /// The target, user units.
         position: f64,
         /// Fraction of the velocity limit, above 0 and at most 1.
         speed: f64,
@@ -60,6 +67,7 @@ pub enum Command {
     },
     /// Moves by a distance from the set-point; otherwise like [`Command::MoveTo`].
     MoveBy {
+        /// The distance, user units.
         distance: f64,
         /// Fraction of the velocity limit, above 0 and at most 1.
         speed: f64,
@@ -68,6 +76,7 @@ pub enum Command {
     },
     /// Sets a target velocity. In CSV, CSP, PV, and CST with a position loop.
     Velocity {
+        /// The velocity, user units per second.
         velocity: f64,
         /// Fraction of the acceleration limit, above 0 and at most 1.
         ramp: f64,

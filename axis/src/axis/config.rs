@@ -6,13 +6,17 @@ use crate::position_loop::Loops;
 use crate::scale::Scale;
 use crate::supervision::{Brake, FaultReset, Supervision};
 
+/// The configuration of an axis. [`AxisConfig::new`] has defaults for all but mode, scale and
+/// limits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AxisConfig {
     /// The mode after start; any mode except homing.
     pub mode: Mode,
     /// Further modes that may be switched to: those with mapped targets.
     pub modes: Modes,
+    /// The conversion between counts and user units.
     pub scale: Scale,
+    /// The limits of position, motion and torque.
     pub limits: Limits,
     /// Distance from the target up to which a move is in target, user units.
     pub target_window: f64,
@@ -22,6 +26,7 @@ pub struct AxisConfig {
     /// True: moves and [`super::Command::Stop`] also keep the jerk limit ([`Limits::jerk`]). False:
     /// they are trapezoidal.
     pub jerk_limited: bool,
+    /// The position loops closed in the MainDevice.
     pub loops: Loops,
     /// Time in seconds from sending a set-point until a reported position can show it. It includes
     /// both transmissions, the drive's interpolation and its lag. In every mode, set-point and
@@ -35,8 +40,11 @@ pub struct AxisConfig {
     /// The drive's 0x605A, if known. Without transition 16 the axis is enabled again via Switch on
     /// disabled.
     pub quick_stop: Option<QuickStopOption>,
+    /// Further supervision.
     pub supervision: Supervision,
+    /// The holding brake.
     pub brake: Brake,
+    /// Resets of drive faults.
     pub fault_reset: FaultReset,
     /// Time in seconds after which a stop becomes harder. `None`: calculated from speed,
     /// acceleration and jerk, and extended while the axis still slows down.
@@ -195,18 +203,31 @@ pub(super) enum ControlledQuantity {
     Drive,
 }
 
+/// The configuration of an axis is invalid.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum ConfigError {
+    /// The axis cannot start in this mode.
     #[error("mode {0} is not one of CSP, CSV, CST, PP, PV")]
     Mode(Mode),
+    /// A limit is invalid.
     #[error(transparent)]
     Limit(#[from] LimitError),
+    /// A value is not a finite number above zero.
     #[error("{what} is {value}: it must be a finite number above zero")]
-    NotPositive { what: &'static str, value: f64 },
+    NotPositive {
+        /// The value's name.
+        what: &'static str,
+        /// The rejected value.
+        value: f64,
+    },
+    /// A value is out of range.
     #[error("{what} is {value}: it must be between 0 and {most}")]
     Outside {
+        /// The value's name.
         what: &'static str,
+        /// The rejected value.
         value: f64,
+        /// The largest accepted value.
         most: f64,
     },
 }

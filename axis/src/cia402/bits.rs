@@ -6,7 +6,7 @@ use super::words::{Controlword, Statusword};
 
 /// The mode-specific bits of a Statusword.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum ModeStatus {
+pub(crate) enum ModeStatus {
     Pp {
         /// Bit 10. With halt: the axis stands.
         target_reached: bool,
@@ -44,7 +44,7 @@ pub enum ModeStatus {
 
 /// Homing state: bits 13, 12 and 10.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum HomingState {
+pub(crate) enum HomingState {
     /// 000.
     InProgress,
     /// 001: not started or interrupted.
@@ -79,7 +79,7 @@ impl HomingState {
 impl Statusword {
     /// Decodes bits 10, 12 and 13 for the mode that 0x6061 shows.
     #[must_use]
-    pub const fn in_mode(self, mode: Mode) -> ModeStatus {
+    pub(crate) const fn in_mode(self, mode: Mode) -> ModeStatus {
         let reached = self.contains(Self::TARGET_REACHED);
         let bit_12 = self.contains(Self::FOLLOWS_COMMAND);
         let bit_13 = self.contains(Self::FOLLOWING_ERROR);
@@ -116,7 +116,7 @@ impl Statusword {
 
 /// The mode-specific bits of a Controlword.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum ModeCommand {
+pub(crate) enum ModeCommand {
     /// All bits are 0, as in all cyclic modes.
     #[default]
     Nothing,
@@ -144,17 +144,17 @@ pub enum ModeCommand {
 
 impl Controlword {
     /// Bit 4 in PP.
-    pub const NEW_SET_POINT: Self = Self::from_bits_retain(1 << 4);
+    pub(crate) const NEW_SET_POINT: Self = Self::from_bits_retain(1 << 4);
     /// Bit 4 in HM.
-    pub const START_HOMING: Self = Self::from_bits_retain(1 << 4);
+    pub(crate) const START_HOMING: Self = Self::from_bits_retain(1 << 4);
     /// Bit 5 in PP.
-    pub const CHANGE_AT_ONCE: Self = Self::from_bits_retain(1 << 5);
+    pub(crate) const CHANGE_AT_ONCE: Self = Self::from_bits_retain(1 << 5);
     /// Bit 6 in PP.
-    pub const RELATIVE: Self = Self::from_bits_retain(1 << 6);
+    pub(crate) const RELATIVE: Self = Self::from_bits_retain(1 << 6);
 
     /// Replaces the mode-specific bits by those of `command`. Other bits remain.
     #[must_use]
-    pub fn with(self, command: ModeCommand) -> Self {
+    pub(crate) fn with(self, command: ModeCommand) -> Self {
         let set = |bit: Self, on: bool| if on { bit } else { Self::empty() };
         self | match command {
             ModeCommand::Nothing => Self::empty(),

@@ -5,8 +5,11 @@
 
 /// The description of an error code.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Description {
+    /// The meaning of the code.
     pub text: &'static str,
+    /// Possible causes and remedies.
     pub hint: &'static str,
     /// True if the code is listed. Otherwise the text describes its class.
     pub exact: bool,

@@ -2,6 +2,7 @@
 
 use core::fmt;
 
+/// A mode of operation, 0x6060 and 0x6061.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Mode {
     /// Profile position.
@@ -21,6 +22,7 @@ pub enum Mode {
 }
 
 impl Mode {
+    /// Converts the value of 0x6060 or 0x6061.
     #[must_use]
     pub const fn from_code(code: i8) -> Self {
         match code {
@@ -34,6 +36,7 @@ impl Mode {
         }
     }
 
+    /// Returns the value of 0x6060.
     #[must_use]
     pub const fn code(self) -> i8 {
         match self {
@@ -68,6 +71,7 @@ impl fmt::Display for Mode {
 pub struct Modes(u8);
 
 impl Modes {
+    /// No mode.
     pub const NONE: Self = Self(0);
 
     /// Returns the set with one mode. [`Mode::Unknown`] gives the empty set.
@@ -76,11 +80,13 @@ impl Modes {
         Self::NONE.with(mode)
     }
 
+    /// Returns the set with this mode added.
     #[must_use]
     pub const fn with(self, mode: Mode) -> Self {
         Self(self.0 | Self::bit(mode))
     }
 
+    /// True if the set contains this mode.
     #[must_use]
     pub const fn contains(self, mode: Mode) -> bool {
         self.0 & Self::bit(mode) != 0

@@ -11,7 +11,9 @@ pub enum Deceleration {
     SlowDownRamp,
     /// 0x6085.
     QuickStopRamp,
+    /// With the current limit.
     CurrentLimit,
+    /// With the voltage limit.
     VoltageLimit,
     /// Codes below zero are vendor-specific, others are reserved.
     Other(i16),
@@ -22,6 +24,7 @@ pub enum Deceleration {
 pub struct QuickStopOption(pub i16);
 
 impl QuickStopOption {
+    /// Returns how the drive decelerates.
     #[must_use]
     pub const fn deceleration(self) -> Deceleration {
         match self.0 {
@@ -47,6 +50,7 @@ impl QuickStopOption {
 pub struct HaltOption(pub i16);
 
 impl HaltOption {
+    /// Returns how the drive decelerates.
     #[must_use]
     pub const fn deceleration(self) -> Deceleration {
         match self.0 {

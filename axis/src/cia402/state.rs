@@ -7,19 +7,28 @@ use super::words::Statusword;
 /// States of the power drive system (CiA 402-2, "Statusword, state coding").
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum State {
+    /// Not ready to switch on.
     NotReadyToSwitchOn,
+    /// Switch on disabled.
     SwitchOnDisabled,
+    /// Ready to switch on.
     ReadyToSwitchOn,
+    /// Switched on.
     SwitchedOn,
+    /// Operation enabled.
     OperationEnabled,
+    /// Quick stop active.
     QuickStopActive,
+    /// Fault reaction active.
     FaultReactionActive,
+    /// Fault.
     Fault,
     /// A Statusword that the table does not list; contains all bits.
     Unknown(u16),
 }
 
 impl State {
+    /// Decodes bits 0–3, 5 and 6 (CiA 402-2 "statusword").
     #[must_use]
     pub const fn from_statusword(word: Statusword) -> Self {
         let bits = word.bits();

@@ -16,16 +16,21 @@ use super::words::{Controlword, Statusword};
 /// The requested power of the drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Power {
+    /// Without power, ready to be enabled.
     #[default]
     Disabled,
+    /// Operation enabled.
     Enabled,
+    /// Quick stop active, or beyond.
     QuickStop,
     /// Removes the voltage at once, in any state.
     Off,
 }
 
+/// The request to the drive in one cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Request {
+    /// The requested power.
     pub power: Power,
     /// Sends fault reset pulses while the drive is in Fault.
     pub reset_fault: bool,
@@ -46,6 +51,7 @@ pub struct PowerState {
 }
 
 impl PowerState {
+    /// Returns the state before the first Statusword.
     #[must_use]
     pub const fn new() -> Self {
         Self {
@@ -57,6 +63,7 @@ impl PowerState {
         }
     }
 
+    /// Returns the state of the drive in the last Statusword.
     #[must_use]
     pub const fn state(&self) -> State {
         self.state
@@ -75,7 +82,9 @@ impl Default for PowerState {
     }
 }
 
+/// The progress of the drive towards the requested power.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum PowerProgress {
     /// The drive has the requested power.
     Reached,
@@ -89,10 +98,15 @@ pub enum PowerProgress {
     ResetFailed,
 }
 
+/// The result of one cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub struct Step {
+    /// The state of the drive.
     pub state: State,
+    /// The Controlword to send.
     pub controlword: Controlword,
+    /// The progress towards the request.
     pub progress: PowerProgress,
 }
 

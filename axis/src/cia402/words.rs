@@ -3,38 +3,51 @@
 use bitflags::bitflags;
 
 bitflags! {
-    /// 0x6041.
+    /// The Statusword, 0x6041 (CiA 402-2 "statusword").
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
     pub struct Statusword: u16 {
+        /// Ready to switch on.
         const READY_TO_SWITCH_ON = 1 << 0;
+        /// Switched on.
         const SWITCHED_ON = 1 << 1;
+        /// Operation enabled.
         const OPERATION_ENABLED = 1 << 2;
+        /// Fault.
         const FAULT = 1 << 3;
+        /// Voltage enabled: the power stage is supplied.
         const VOLTAGE_ENABLED = 1 << 4;
         /// Active low: set if no quick stop is active.
         const QUICK_STOP = 1 << 5;
+        /// Switch on disabled.
         const SWITCH_ON_DISABLED = 1 << 6;
+        /// Warning.
         const WARNING = 1 << 7;
+        /// Remote: the drive obeys the Controlword.
         const REMOTE = 1 << 9;
+        /// Target reached.
         const TARGET_REACHED = 1 << 10;
+        /// Internal limit active.
         const INTERNAL_LIMIT_ACTIVE = 1 << 11;
-        /// In the cyclic synchronous modes: the drive follows the command value. Other modes: see
-        /// [`super::bits`].
+        /// In the cyclic synchronous modes: the drive follows the command value. Other modes use
+        /// it otherwise.
         const FOLLOWS_COMMAND = 1 << 12;
-        /// In CSP: following error of the drive. Other modes: see [`super::bits`].
+        /// In CSP: following error of the drive. Other modes use it otherwise.
         const FOLLOWING_ERROR = 1 << 13;
         const _ = !0;
     }
 }
 
 bitflags! {
-    /// 0x6040.
+    /// The Controlword, 0x6040 (CiA 402-2 "controlword").
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
     pub struct Controlword: u16 {
+        /// Switch on.
         const SWITCH_ON = 1 << 0;
+        /// Enable voltage.
         const ENABLE_VOLTAGE = 1 << 1;
         /// Active low: a cleared bit requests quick stop.
         const QUICK_STOP = 1 << 2;
+        /// Enable operation.
         const ENABLE_OPERATION = 1 << 3;
         /// Acts on its rising edge.
         const FAULT_RESET = 1 << 7;

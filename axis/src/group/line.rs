@@ -13,17 +13,22 @@ use crate::setpoint::{
 pub struct LineAxis {
     /// The present set-point, at rest.
     pub from: Motion,
+    /// The target, user units.
     pub target: f64,
     /// Limits of this axis on the line.
     pub limits: MotionLimits,
+    /// Lowest and highest position, user units; `None`: unlimited.
     pub range: Option<[f64; 2]>,
 }
 
+/// The line is impossible for one of its axes.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[error("axis {axis} of the line: {error}")]
+#[non_exhaustive]
 pub struct LineError {
     /// Index in the slice passed to [`Line::plan`].
     pub axis: usize,
+    /// The reason.
     #[source]
     pub error: SetpointError,
 }
@@ -90,6 +95,7 @@ impl Line {
         }
     }
 
+    /// Returns the duration in seconds.
     #[must_use]
     pub fn duration_s(&self) -> f64 {
         self.path.duration_s()
@@ -140,6 +146,7 @@ impl LinePath {
         self.at.position
     }
 
+    /// Returns the target, user units.
     #[must_use]
     pub const fn target(&self) -> f64 {
         self.target

@@ -8,6 +8,21 @@
 //! This module owns no axis. A line gives each axis its own set-point source ([`LinePath`]). All
 //! sources compute bit-identical results, so the axes stay synchronous without communication in the
 //! cycle. Nothing allocates.
+//!
+//! ```
+//! use ecaxis_axis::group::arrive_together;
+//! use ecaxis_axis::setpoint::{Goal, JerkLimited, Motion, MotionLimits, MoveRequest};
+//!
+//! let limits = MotionLimits { velocity: 100.0, acceleration: 1000.0, jerk: 20_000.0 };
+//! let to = |target| {
+//!     let request = MoveRequest::within(Goal::Position(target), limits);
+//!     JerkLimited::new(request, Motion::default(), 0.001)
+//! };
+//! let mut moves = [to(10.0)?, to(100.0)?];
+//! let duration_s = arrive_together(&mut moves)?;
+//! assert!((moves[0].duration_s() - duration_s).abs() < 1e-6);
+//! # Ok::<(), ecaxis_axis::setpoint::SetpointError>(())
+//! ```
 
 mod line;
 mod together;

@@ -6,10 +6,15 @@ use crate::units::{UserAcceleration, UserUnits, UserVelocity};
 
 /// The equipment that a method requires.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[non_exhaustive]
 pub struct Needs {
+    /// Negative limit switch.
     pub negative_limit: bool,
+    /// Positive limit switch.
     pub positive_limit: bool,
+    /// Home switch.
     pub home_switch: bool,
+    /// Index pulse of the encoder.
     pub index: bool,
     /// A mechanical stop (0x30B2).
     pub obstacle: bool,
@@ -17,9 +22,13 @@ pub struct Needs {
 
 /// A homing method (0x6098).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Method {
+    /// The value of 0x6098.
     pub code: i8,
+    /// A short description.
     pub text: &'static str,
+    /// The signals that the method uses.
     pub needs: Needs,
 }
 
@@ -136,27 +145,52 @@ pub struct Homing {
 
 /// One start-up SDO.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct HomingObject {
+    /// The index.
     pub index: u16,
+    /// The subindex.
     pub subindex: u8,
+    /// The value.
     pub value: i64,
+    /// The length in bytes.
     pub bytes: u8,
 }
 
+/// A homing parameter is invalid.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum ParameterError {
+    /// The method is unknown.
     #[error("homing method {0} is not one of CiA 402 or maxon")]
     Method(i8),
+    /// A velocity or acceleration is out of range.
     #[error("{what} is {value}: it must be above zero and within the limit of {limit}")]
     Outside {
+        /// The parameter's name.
         what: &'static str,
+        /// The rejected value.
         value: f64,
+        /// The limit of the axis.
         limit: f64,
     },
+    /// A position is not representable as counts.
     #[error("{what} of {value} is no number of counts that 32 bits hold")]
-    Counts { what: &'static str, value: f64 },
+    Counts {
+        /// The parameter's name.
+        what: &'static str,
+        /// The value in user units.
+        value: f64,
+    },
+    /// A velocity or acceleration is below the resolution of the drive.
     #[error("{what} of {value} is less than the drive's smallest step")]
-    TooSmall { what: &'static str, value: f64 },
+    TooSmall {
+        /// The parameter's name.
+        what: &'static str,
+        /// The value in user units.
+        value: f64,
+    },
+    /// The method needs [`Homing::threshold_ma`].
     #[error("homing method {0} runs into a mechanical end and needs the current that shows it")]
     NoThreshold(i8),
 }
@@ -176,6 +210,7 @@ impl Homing {
         }
     }
 
+    /// Checks the parameters against scale and limits of the axis.
     pub fn check(&self, scale: &Scale, limits: &Limits) -> Result<(), ParameterError> {
         let method = method(self.method).ok_or(ParameterError::Method(self.method))?;
         let resolution = scale.velocity_resolution();

@@ -21,14 +21,22 @@ const REST_S: f64 = 0.05;
 /// The reason why the home position is unknown.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum HomingError {
+    /// The search took too long.
     #[error("home was not found within {timeout_s} s")]
-    Timeout { timeout_s: f64 },
+    Timeout {
+        /// The time limit in seconds.
+        timeout_s: f64,
+    },
+    /// The drive reports an error (Statusword bit 13).
     #[error("the drive reports a homing error")]
     Drive,
+    /// A command ended homing.
     #[error("homing was aborted")]
     Aborted,
+    /// 0x6061 did not show mode 6.
     #[error("the drive did not change to homing mode")]
     ModeRefused,
+    /// The drive left Operation enabled.
     #[error("the axis lost its power while homing")]
     PowerLost,
 }

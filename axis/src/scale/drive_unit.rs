@@ -31,8 +31,11 @@ const fn write((numerator, denominator): (u8, u8), prefix: i8) -> u32 {
 /// The base unit of a velocity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum VelocityBase {
+    /// Counts per second.
     CountsPerSecond,
+    /// Motor turns per second.
     TurnsPerSecond,
+    /// Motor turns per minute.
     TurnsPerMinute,
 }
 
@@ -44,9 +47,13 @@ pub struct VelocityUnit {
 }
 
 impl VelocityUnit {
+    /// Counts per second.
     pub const COUNTS_PER_SECOND: Self = Self::of(VelocityBase::CountsPerSecond);
+    /// Motor turns per second.
     pub const TURNS_PER_SECOND: Self = Self::of(VelocityBase::TurnsPerSecond);
+    /// Motor turns per minute.
     pub const RPM: Self = Self::of(VelocityBase::TurnsPerMinute);
+    /// Thousandths of motor turns per minute.
     pub const MILLI_RPM: Self = Self {
         base: VelocityBase::TurnsPerMinute,
         prefix: -3,
@@ -80,6 +87,7 @@ impl VelocityUnit {
         write(fraction, self.prefix)
     }
 
+    /// Returns the unit without its prefix.
     #[must_use]
     pub const fn base(self) -> VelocityBase {
         self.base
@@ -127,8 +135,11 @@ impl fmt::Display for VelocityUnit {
 /// The base unit of an acceleration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum AccelerationBase {
+    /// Counts per second².
     CountsPerSecondSquared,
+    /// Motor turns per second².
     TurnsPerSecondSquared,
+    /// Motor turns per minute and second.
     TurnsPerMinutePerSecond,
 }
 
@@ -140,12 +151,9 @@ pub struct AccelerationUnit {
 }
 
 impl AccelerationUnit {
+    /// Motor turns per minute and second.
     pub const RPM_PER_SECOND: Self = Self {
         base: AccelerationBase::TurnsPerMinutePerSecond,
-        prefix: 0,
-    };
-    pub const COUNTS_PER_SECOND_SQUARED: Self = Self {
-        base: AccelerationBase::CountsPerSecondSquared,
         prefix: 0,
     };
 

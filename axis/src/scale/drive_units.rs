@@ -33,30 +33,63 @@ pub struct DriveUnits {
 #[non_exhaustive]
 pub enum UnitMismatch {
     /// A ratio with a zero.
-    Ratio { index: u16, above: u32, below: u32 },
+    Ratio {
+        /// The object that decides.
+        index: u16,
+        /// The numerator.
+        above: u32,
+        /// The denominator.
+        below: u32,
+    },
     /// Position units per motor turn, computed from 0x608F, 0x6091 and 0x6092. `index` is the
     /// object that decides.
     CountsPerTurn {
+        /// The object that decides.
         index: u16,
+        /// The configured value.
         expected: f64,
+        /// The value of the drive.
         found: f64,
     },
     /// 0x60A8.
-    PositionUnit { found: u32 },
+    PositionUnit {
+        /// The value of the drive.
+        found: u32,
+    },
     /// 0x60A9.
-    VelocityUnit { expected: VelocityUnit, found: u32 },
+    VelocityUnit {
+        /// The configured value.
+        expected: VelocityUnit,
+        /// The value of the drive.
+        found: u32,
+    },
     /// 0x60AA.
     AccelerationUnit {
+        /// The configured value.
         expected: AccelerationUnit,
+        /// The value of the drive.
         found: u32,
     },
     /// 0x6076 in the drive's unit; `expected` is the configured value, if any.
-    RatedTorque { expected: Option<u32>, found: u32 },
+    RatedTorque {
+        /// The configured value.
+        expected: Option<u32>,
+        /// The value of the drive.
+        found: u32,
+    },
     /// maxon's 0x3001:05, µNm/A. [`DriveUnits::contradictions`] does not report it; the caller
     /// compares the configured value.
-    TorqueConstant { expected: u32, found: u32 },
+    TorqueConstant {
+        /// The configured value.
+        expected: u32,
+        /// The value of the drive.
+        found: u32,
+    },
     /// 0x607E: the drive inverts position, velocity or both.
-    Polarity { found: u8 },
+    Polarity {
+        /// The value of the drive.
+        found: u8,
+    },
 }
 
 /// Largest relative difference between equal ratios. A larger difference is another gear.

@@ -24,18 +24,23 @@ impl TorqueScale {
         Ok(Self { rated, constant })
     }
 
+    /// Converts a torque in N·m. Fails if the rated torque is unknown.
     pub fn of_newton_metres(&self, torque: NewtonMetres) -> Result<Percent, ScaleError> {
         Ok(Percent(torque.0 / self.rated("Nm")? * 100.0))
     }
 
+    /// Converts a torque to N·m. Fails if the rated torque is unknown.
     pub fn to_newton_metres(&self, torque: Percent) -> Result<NewtonMetres, ScaleError> {
         Ok(NewtonMetres(torque.0 / 100.0 * self.rated("Nm")?))
     }
 
+    /// Converts a motor current in A. Fails if rated torque or torque constant is unknown.
     pub fn of_amperes(&self, current: Amperes) -> Result<Percent, ScaleError> {
         self.of_newton_metres(NewtonMetres(current.0 * self.constant()?))
     }
 
+    /// Converts a torque to the motor current in A. Fails if rated torque or torque constant is
+    /// unknown.
     pub fn to_amperes(&self, torque: Percent) -> Result<Amperes, ScaleError> {
         Ok(Amperes(
             torque.0 / 100.0 * self.rated("A")? / self.constant()?,

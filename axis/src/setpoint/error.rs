@@ -8,34 +8,102 @@ const FARTHEST: f64 = 1e15;
 /// Accepted range of limits, so that no quotient or product overflows.
 const USABLE: core::ops::RangeInclusive<f64> = 1e-12..=1e15;
 
+/// A set-point source is impossible. Values in user units.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum SetpointError {
+    /// A value is not finite.
     #[error("{what} is {value}: it must be a finite number")]
-    NotFinite { what: &'static str, value: f64 },
+    NotFinite {
+        /// The value's name.
+        what: &'static str,
+        /// The rejected value.
+        value: f64,
+    },
+    /// A limit is too small or too large for the calculation.
     #[error("{what} is {value:e}: it must lie between 1e-12 and 1e15")]
-    NotUsable { what: &'static str, value: f64 },
+    NotUsable {
+        /// The value's name.
+        what: &'static str,
+        /// The rejected value.
+        value: f64,
+    },
+    /// A position is too far from zero.
     #[error("{what} is {value:e}, farther than 1e15")]
-    TooFar { what: &'static str, value: f64 },
+    TooFar {
+        /// The value's name.
+        what: &'static str,
+        /// The rejected value.
+        value: f64,
+    },
+    /// The motion leaves the position range.
     #[error("{reaches} would be reached on the way, outside the range [{low}, {high}]")]
-    LeavesRange { reaches: f64, low: f64, high: f64 },
+    LeavesRange {
+        /// The position outside the range.
+        reaches: f64,
+        /// The lower end of the range.
+        low: f64,
+        /// The upper end of the range.
+        high: f64,
+    },
+    /// The motion exceeds the velocity limit.
     #[error("a velocity of {velocity} would be reached, above the limit {limit}")]
-    TooFast { velocity: f64, limit: f64 },
+    TooFast {
+        /// The velocity per second.
+        velocity: f64,
+        /// The limit.
+        limit: f64,
+    },
+    /// The motion exceeds the acceleration limit.
     #[error("an acceleration of {acceleration} would be reached, above the limit {limit}")]
-    TooSteep { acceleration: f64, limit: f64 },
+    TooSteep {
+        /// The acceleration per second².
+        acceleration: f64,
+        /// The limit.
+        limit: f64,
+    },
+    /// The motion exceeds the jerk limit.
     #[error("a jerk of {jerk} would be reached, above the limit {limit}")]
-    TooMuchJerk { jerk: f64, limit: f64 },
+    TooMuchJerk {
+        /// The jerk per second³.
+        jerk: f64,
+        /// The limit.
+        limit: f64,
+    },
+    /// The oscillation is too fast for the cycle time.
     #[error("{frequency} Hz is more than the {highest} Hz that the cycle can show")]
-    TooOften { frequency: f64, highest: f64 },
+    TooOften {
+        /// The frequency in Hz.
+        frequency: f64,
+        /// The highest frequency in Hz.
+        highest: f64,
+    },
+    /// The duration is zero or too short.
     #[error("there is no time, or too little, for the way")]
     NoTime,
+    /// The motion starts at another position.
     #[error("the axis stands at {at} and must stand at {expected}")]
-    Elsewhere { at: f64, expected: f64 },
+    Elsewhere {
+        /// The position of the axis.
+        at: f64,
+        /// The start of the motion.
+        expected: f64,
+    },
+    /// The buffer has no free place.
     #[error("all {capacity} places are taken")]
-    Full { capacity: usize },
+    Full {
+        /// The capacity in points.
+        capacity: usize,
+    },
+    /// The stream is closed or has run out of points.
     #[error("the points have ended")]
     Ended,
+    /// The axis moves.
     #[error("the axis must stand still first; its set-point moves at {velocity}")]
-    NotAtRest { velocity: f64 },
+    NotAtRest {
+        /// The velocity of the set-point.
+        velocity: f64,
+    },
 }
 
 pub(crate) fn finite(what: &'static str, value: f64) -> Result<(), SetpointError> {
@@ -73,6 +141,7 @@ impl MotionLimits {
 }
 
 impl Motion {
+    /// Fails if a value is not finite or too far from zero.
     pub fn check(&self) -> Result<(), SetpointError> {
         position("position", self.position)?;
         position("velocity", self.velocity)?;

@@ -15,18 +15,24 @@ const PLANNED: f64 = 1.0 - 1e-4;
 /// Fraction of the acceleration limit for catching up. The rest is for following meanwhile.
 const CATCHING_UP: f64 = 0.5;
 
+/// The way in which a gear engages.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum GearInMode {
     /// With the present offset: the follower only has to reach the velocity.
     Here,
     /// With this offset in the follower's units: the follower also catches up with the position.
-    At { offset: f64 },
+    At {
+        /// The offset in the follower's units.
+        offset: f64,
+    },
 }
 
+/// The configuration of a gear.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GearConfig {
     /// Follower's units per master's unit; negative for opposite directions.
     pub ratio: f64,
+    /// The way in which the gear engages.
     pub engage: GearInMode,
     /// Time constant in seconds that smooths the master's velocity; 0: no smoothing.
     ///
@@ -35,7 +41,9 @@ pub struct GearConfig {
     /// smoothing, the follower counts as engaged while it is near on average, because the remaining
     /// noise may exceed its acceleration.
     pub smoothing_s: f64,
+    /// The limits of the follower.
     pub limits: MotionLimits,
+    /// Lowest and highest position of the follower; `None`: unlimited.
     pub range: Option<[f64; 2]>,
 }
 
@@ -101,6 +109,7 @@ impl Gear {
         self.engaged
     }
 
+    /// Returns the present offset in the follower's units.
     #[must_use]
     pub const fn offset(&self) -> f64 {
         self.offset

@@ -2,8 +2,10 @@
 
 use super::{Motion, Ramp, Setpoint};
 
+/// Brakes to standstill and holds the position.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hold {
+    /// The deceleration, user units per second².
     pub acceleration: f64,
 }
 
@@ -19,6 +21,7 @@ impl Hold {
         motion.then(motion.position + velocity * dt_s, velocity, dt_s)
     }
 
+    /// True if the axis stands.
     #[must_use]
     pub fn finished(self, motion: Motion) -> bool {
         motion.velocity == 0.0

@@ -22,6 +22,20 @@
 //!
 //! The velocity of a cycle is its change of position divided by its duration. So the plans bound
 //! exactly the velocity and acceleration of the positions sent to the drive.
+//!
+//! ```
+//! use ecaxis_axis::setpoint::{Goal, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint};
+//!
+//! let limits = MotionLimits { velocity: 100.0, acceleration: 1000.0, jerk: 20_000.0 };
+//! let mut motion = Motion::default();
+//! let mut plan = JerkLimited::new(MoveRequest::within(Goal::Position(10.0), limits), motion, 0.001)?;
+//! while !plan.finished(motion) {
+//!     motion = plan.advance(motion, 0.001);
+//!     assert!(motion.velocity <= limits.velocity * (1.0 + 1e-9));
+//! }
+//! assert_eq!(motion.position, 10.0);
+//! # Ok::<(), ecaxis_axis::setpoint::SetpointError>(())
+//! ```
 
 mod error;
 mod gear;
@@ -53,6 +67,7 @@ pub use wave::{PositionWave, Shape, Wave};
 /// A set-point: position, mean velocity of the last cycle, and its acceleration.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Motion {
+    /// The position, user units.
     pub position: f64,
     /// The last cycle's change of position divided by its duration.
     pub velocity: f64,
@@ -97,8 +112,11 @@ impl Motion {
 /// Limits of a jerk-limited motion, user units per second, second² and second³.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionLimits {
+    /// The velocity limit, user units per second.
     pub velocity: f64,
+    /// The acceleration limit, user units per second².
     pub acceleration: f64,
+    /// The jerk limit, user units per second³.
     pub jerk: f64,
 }
 

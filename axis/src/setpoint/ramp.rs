@@ -1,7 +1,9 @@
 //! A value that approaches its target with bounded slope: velocity in CSV, torque in CST.
 
+/// A velocity or torque that changes with limited slope.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ramp {
+    /// The final value.
     pub target: f64,
     /// Change per second.
     pub slope: f64,

@@ -7,10 +7,15 @@ use crate::group::LinePath;
 /// [`super::Stream`] (buffer), [`super::Playback`] (table), [`super::Gear`] (master).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Source {
+    /// Standstill.
     Hold(Hold),
+    /// A move without a jerk limit.
     Trapezoid(Trapezoid),
+    /// A jerk-limited move or velocity.
     JerkLimited(JerkLimited),
+    /// One axis of a straight line.
     Line(LinePath),
+    /// An oscillating position.
     Wave(PositionWave),
 }
 

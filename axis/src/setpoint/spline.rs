@@ -6,10 +6,13 @@ use super::{MotionLimits, SetpointError};
 /// A point to pass, and the velocity there.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Knot {
+    /// The position, user units.
     pub position: f64,
+    /// The velocity, user units per second.
     pub velocity: f64,
 }
 
+/// The path between two points.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Interpolation {
     /// Constant velocity from point to point; given velocities are ignored. Each change of velocity

@@ -9,23 +9,30 @@ use super::error::{finite, usable};
 use super::spline::{Interpolation, Piece, check_corner, check_end, check_stop};
 use super::{Hold, Knot, Motion, MotionLimits, Setpoint, SetpointError};
 
+/// The configuration of a stream.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StreamConfig {
+    /// The path between two points.
     pub interpolation: Interpolation,
     /// Time from one point to the next, seconds.
     pub interval_s: f64,
     /// Number of points that start the motion; the last point also starts it.
     pub prefill: usize,
+    /// The limits that every piece must keep.
     pub limits: MotionLimits,
+    /// Lowest and highest position; `None`: unlimited.
     pub range: Option<[f64; 2]>,
     /// Cycle time, seconds.
     pub dt_s: f64,
 }
 
+/// The state of a stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum StreamState {
     /// Waits for the first points.
     Waiting,
+    /// Passes the points.
     Moving,
     /// The last point has been passed.
     Ended,
@@ -113,6 +120,7 @@ impl<const N: usize> Stream<N> {
         Ok(())
     }
 
+    /// Returns the state.
     #[must_use]
     pub const fn state(&self) -> StreamState {
         self.state

@@ -10,27 +10,54 @@ use super::{Hold, Knot, Motion, MotionLimits, SetpointError};
 /// A problem and its line in the text, counted from 1.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("line {line}: {problem}")]
+#[non_exhaustive]
 pub struct TableError {
+    /// The line.
     pub line: usize,
+    /// The problem.
     #[source]
     pub problem: TableProblem,
 }
 
+/// The reason why a table is rejected.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum TableProblem {
+    /// A field is no number.
     #[error("`{field}` is no number")]
-    NotANumber { field: String },
+    NotANumber {
+        /// The start of the field.
+        field: String,
+    },
+    /// A row has another number of columns than the first one, or none that is possible.
     #[error("{found} columns where there are to be {expected}")]
     Columns {
+        /// The number of columns.
         found: usize,
+        /// The possible numbers.
         expected: &'static str,
     },
+    /// The times do not increase.
     #[error("time {time} s does not come after {before} s")]
-    NotLater { time: f64, before: f64 },
+    NotLater {
+        /// The time of the row in seconds.
+        time: f64,
+        /// The time of the row before in seconds.
+        before: f64,
+    },
+    /// The table is too short or too long.
     #[error("a table needs two rows at least, and {most} at most")]
-    Rows { most: usize },
+    Rows {
+        /// The largest number of rows.
+        most: usize,
+    },
+    /// Two rows are less than a cycle apart.
     #[error("{within} s after the row before is less than a cycle")]
-    TooClose { within: f64 },
+    TooClose {
+        /// Their distance in seconds.
+        within: f64,
+    },
+    /// The motion is impossible.
     #[error(transparent)]
     Motion(#[from] SetpointError),
 }
@@ -41,6 +68,7 @@ const MOST_ROWS: usize = 1_000_000;
 /// Maximum length of fields quoted in errors.
 const QUOTED: usize = 40;
 
+/// Positions over time, read from text.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Table {
     interpolation: Interpolation,
@@ -104,6 +132,7 @@ impl Table {
         [first, last].map(Option::unwrap_or_default)
     }
 
+    /// Returns the duration in seconds.
     #[must_use]
     pub fn duration_s(&self) -> f64 {
         self.pieces.iter().map(Piece::time).sum()
@@ -347,6 +376,7 @@ impl Playback {
         self.last
     }
 
+    /// True if the last point has been passed and the axis stands.
     #[must_use]
     pub fn finished(&self, motion: Motion) -> bool {
         self.state != State::Playing && motion.velocity == 0.0

@@ -10,10 +10,14 @@ use super::{Motion, Setpoint};
 /// without a reserve the errors would add up and end beyond the target.
 const PLANNED: f64 = 1.0 - 1e-4;
 
+/// A move to a position with limited velocity and acceleration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Trapezoid {
+    /// The target, user units.
     pub target: f64,
+    /// The velocity limit, user units per second.
     pub velocity: f64,
+    /// The acceleration limit, user units per second².
     pub acceleration: f64,
     /// Deceleration used if `acceleration` would overshoot: the reserve of the interrupted move.
     /// Never below `acceleration`.

@@ -10,9 +10,12 @@ use super::error::{position, usable};
 use super::spline::within;
 use super::{Goal, Hold, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint, SetpointError};
 
+/// The shape of an oscillation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shape {
+    /// A sine.
     Sine,
+    /// A rectangle.
     Square,
 }
 
@@ -77,11 +80,13 @@ impl Wave {
         })
     }
 
+    /// Returns the duration in seconds.
     #[must_use]
     pub fn duration_s(&self) -> f64 {
         self.length() / self.frequency
     }
 
+    /// True at the end.
     #[must_use]
     pub fn finished(&self) -> bool {
         self.phase >= self.length()
@@ -207,6 +212,7 @@ impl PositionWave {
         })
     }
 
+    /// Returns the limits.
     #[must_use]
     pub const fn limits(&self) -> &MotionLimits {
         &self.limits

@@ -18,6 +18,7 @@ use profile::{Profile, State, coasting, velocity_change};
 /// differences.
 const PLANNED: f64 = 1.0 - 1e-6;
 
+/// The goal of a jerk-limited move.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Goal {
     /// Standstill at a position.
@@ -29,7 +30,9 @@ pub enum Goal {
 /// The goal of a motion and its limits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MoveRequest {
+    /// The goal.
     pub goal: Goal,
+    /// The limits of velocity, acceleration and jerk.
     pub limits: MotionLimits,
     /// The axis limits, none below `limits`. Their acceleration and jerk apply if the present
     /// motion would otherwise pass the target or exceed the velocity limit.
@@ -40,6 +43,7 @@ pub struct MoveRequest {
 }
 
 impl MoveRequest {
+    /// Returns a move in the shortest time that the limits allow.
     #[must_use]
     pub const fn within(goal: Goal, limits: MotionLimits) -> Self {
         Self {
@@ -98,6 +102,7 @@ impl JerkLimited {
         Self::plan(order, self.now, motion, Some(self.used))
     }
 
+    /// Returns the request of this move.
     #[must_use]
     pub const fn order(&self) -> &MoveRequest {
         &self.order
@@ -122,6 +127,7 @@ impl JerkLimited {
         self.duration
     }
 
+    /// Returns the time to the end of the move in seconds.
     #[must_use]
     pub fn remaining_s(&self) -> f64 {
         (self.duration - self.total).max(0.0)
