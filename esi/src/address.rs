@@ -6,7 +6,9 @@ use std::fmt;
 /// sixteenth entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Address {
+    /// The index.
     pub index: u16,
+    /// The subindex.
     pub sub: u8,
 }
 
@@ -16,6 +18,7 @@ impl fmt::Display for Address {
     }
 }
 
+/// Returns the address of an object.
 #[must_use]
 pub fn address(index: u16, sub: u8) -> Address {
     Address { index, sub }

@@ -36,6 +36,7 @@ impl EsiError {
         &self.0.path
     }
 
+    /// Returns the problem at that position.
     #[must_use]
     pub fn problem(&self) -> &EsiProblem {
         &self.0.problem
@@ -53,33 +54,65 @@ impl EsiProblem {
     }
 }
 
+/// The problem of an unusable ESI file.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum EsiProblem {
+    /// The text is not well-formed XML.
     #[error("not well-formed XML: {0}")]
     Syntax(String),
+    /// The file ends inside this element.
     #[error("the file ends inside <{0}>")]
     Truncated(String),
+    /// The file ends inside a tag.
     #[error("the file ends inside a tag or a comment")]
     TruncatedTag,
+    /// The root element is not `EtherCATInfo`; contains its name.
     #[error(
         "the root element is <{0}>, an ESI file starts with <EtherCATInfo>, a file of modules with <EtherCATModule>"
     )]
     NotEsi(String),
+    /// The file has no element.
     #[error("there is no XML element in the file")]
     Empty,
+    /// A mandatory element or attribute is missing.
     #[error("{what} is missing")]
-    Missing { what: &'static str },
+    Missing {
+        /// The element or attribute.
+        what: &'static str,
+    },
+    /// A number is malformed or out of range.
     #[error("{what} {text:?} is not a number that fits ({min} to {max})")]
     Number {
+        /// The element or attribute.
         what: &'static str,
+        /// The text in the file.
         text: String,
+        /// The smallest accepted value.
         min: i128,
+        /// The largest accepted value.
         max: i128,
     },
+    /// A text is no sequence of hexadecimal bytes.
     #[error("{what} {text:?} is not a sequence of hexadecimal bytes")]
-    HexBytes { what: &'static str, text: String },
+    HexBytes {
+        /// The element or attribute.
+        what: &'static str,
+        /// The text in the file.
+        text: String,
+    },
+    /// The elements are nested too deeply.
     #[error("elements are nested deeper than {limit}")]
-    TooDeep { limit: usize },
+    TooDeep {
+        /// The limit of the reader.
+        limit: usize,
+    },
+    /// The contents exceed a limit of the reader.
     #[error("{what} exceed {limit}, which no device needs")]
-    TooLarge { what: &'static str, limit: usize },
+    TooLarge {
+        /// The element or attribute.
+        what: &'static str,
+        /// The limit of the reader.
+        limit: usize,
+    },
 }

@@ -1,5 +1,17 @@
 //! Bit offsets of mapped objects. PDOs of one SyncManager are packed bit by bit in assignment
 //! order. Each SyncManager starts at a byte.
+//!
+//! ```
+//! use ecaxis_esi::Layout;
+//!
+//! # let bytes = include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/examples/io.xml"));
+//! # let file = ecaxis_esi::parse(bytes)?;
+//! let device = &file.devices[0];
+//! let layout = Layout::new(device, &device.rx_pdos, &device.tx_pdos)?;
+//! assert_eq!((layout.rx_bytes(), layout.tx_bytes()), (1, 1));
+//! assert_eq!(layout.rx_field(0x7000, 1).unwrap().bit_offset, 0);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 use crate::model::{Device, FmmuUse, Pdo, SmUse};
 use crate::select::SelectError;
@@ -16,16 +28,22 @@ const PROCESS_MEMORY: u16 = 0x1000;
 pub struct Layout {
     /// Sorted by SyncManager number. Couplers have several SyncManagers in one direction.
     pub outputs: Vec<SmLayout>,
+    /// The SyncManagers of the inputs, sorted by number.
     pub inputs: Vec<SmLayout>,
+    /// The outputs in wire order.
     pub rx: Vec<Field>,
+    /// The inputs in wire order.
     pub tx: Vec<Field>,
 }
 
 /// The layout of one process data SyncManager.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SmLayout {
+    /// The SyncManager number.
     pub sm: u8,
+    /// The physical start address.
     pub start_address: u16,
+    /// The control byte, register 0x0804 of the SyncManager.
     pub control_byte: u8,
     /// The length in bytes.
     pub len: u16,
@@ -43,14 +61,20 @@ impl SmLayout {
 /// One mapped object. Gaps have no `Field`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Field {
+    /// The index of the PDO.
     pub pdo: u16,
+    /// The index of the object.
     pub index: u16,
+    /// The subindex.
     pub sub: u8,
     /// The offset from the start of the device's process data in this direction, across all
     /// SyncManagers.
     pub bit_offset: u32,
+    /// The length in bits.
     pub bit_len: u16,
+    /// The name in the ESI.
     pub name: String,
+    /// The data type in the ESI.
     pub data_type: String,
 }
 
@@ -73,16 +97,19 @@ impl Layout {
         Ok(layout)
     }
 
+    /// Returns the length of the outputs in bytes.
     #[must_use]
     pub fn rx_bytes(&self) -> usize {
         self.outputs.iter().map(|sm| usize::from(sm.len)).sum()
     }
 
+    /// Returns the length of the inputs in bytes.
     #[must_use]
     pub fn tx_bytes(&self) -> usize {
         self.inputs.iter().map(|sm| usize::from(sm.len)).sum()
     }
 
+    /// Returns the output with this object.
     #[must_use]
     pub fn rx_field(&self, index: u16, sub: u8) -> Option<&Field> {
         self.rx
@@ -90,6 +117,7 @@ impl Layout {
             .find(|field| field.index == index && field.sub == sub)
     }
 
+    /// Returns the input with this object.
     #[must_use]
     pub fn tx_field(&self, index: u16, sub: u8) -> Option<&Field> {
         self.tx

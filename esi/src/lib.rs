@@ -1,4 +1,6 @@
-//! EtherCAT SubDevice Information (ESI): bytes in, data out. No I/O, no clock, no unsafe.
+#![doc = include_str!("../README.md")]
+//!
+//! # Modules
 //!
 //! - [`Address`]: index and subindex of an object
 //! - [`model`]: the contents of an ESI file; the origin of each derived value keeps its line
@@ -9,6 +11,7 @@
 //! - [`sii`]: the EEPROM image, from an ESI device or from bytes
 //! - [`lint`](mod@lint): problems in a readable file
 
+#![deny(missing_docs)]
 #![forbid(unsafe_code)]
 
 mod address;

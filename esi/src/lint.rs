@@ -1,5 +1,19 @@
 //! Problems in a readable file: contradictions between its elements, and devices without a usable
 //! configuration.
+//!
+//! ```
+//! let esi = br##"<EtherCATInfo>
+//!   <Vendor><Id>#x1</Id></Vendor>
+//!   <Descriptions><Devices><Device Physics="YY">
+//!     <Type ProductCode="#x2" RevisionNo="#x3">IO</Type>
+//!     <TxPdo Sm="7"><Index>#x1a00</Index><Name>Inputs</Name></TxPdo>
+//!   </Device></Devices></Descriptions>
+//! </EtherCATInfo>"##;
+//! let file = ecaxis_esi::parse(esi)?;
+//! let findings = ecaxis_esi::lint(&file);
+//! assert!(!findings.is_empty());
+//! # Ok::<(), ecaxis_esi::EsiError>(())
+//! ```
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -15,6 +29,7 @@ const CYCLE_NS: u64 = 1_000_000;
 const MAX_EFFORT: usize = 20_000;
 const MAX_PLACES: u64 = 254;
 
+/// The severity of a finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Severity {
     /// A device or one of its modes cannot be used.
@@ -35,14 +50,19 @@ impl fmt::Display for Severity {
     }
 }
 
+/// A problem in a readable ESI file.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Finding {
+    /// The severity.
     pub severity: Severity,
     /// The name of the referenced file; `None`: the finding is in the main file.
     pub file: Option<String>,
+    /// The position of the element.
     pub position: Position,
     /// Element path, such as `EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[2]`.
     pub path: String,
+    /// The problem as text.
     pub message: String,
 }
 

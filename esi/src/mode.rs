@@ -3,6 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
+/// A CiA 402 mode of operation (0x6060).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Mode {
     /// Profile position.
@@ -20,6 +21,7 @@ pub enum Mode {
 }
 
 impl Mode {
+    /// All modes.
     pub const ALL: [Self; 6] = [
         Self::Pp,
         Self::Pv,
@@ -42,11 +44,13 @@ impl Mode {
         }
     }
 
+    /// Converts the value of 0x6060; `None` for other modes.
     #[must_use]
     pub fn from_code(code: i8) -> Option<Self> {
         Self::ALL.into_iter().find(|mode| mode.code() == code)
     }
 
+    /// Returns the abbreviation in lower case, such as `csp`.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -103,6 +107,7 @@ impl fmt::Display for Mode {
     }
 }
 
+/// The text names no mode.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0:?} is not a mode; there are pp, pv, hm, csp, csv and cst")]
 pub struct UnknownMode(String);

@@ -10,8 +10,11 @@ use super::{
 /// Identity object 0x1018 without the serial number.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub struct Identity {
+    /// The vendor ID, 0x1018:01.
     pub vendor: u32,
+    /// The product code, 0x1018:02.
     pub product: u32,
+    /// The revision number, 0x1018:03.
     pub revision: u32,
 }
 
@@ -25,11 +28,14 @@ impl fmt::Display for Identity {
     }
 }
 
+/// One `Device` of an ESI file (ETG.2000).
 #[derive(Debug, Clone, Default)]
 pub struct Device {
+    /// The position of the element.
     pub position: Position,
     /// Element path, as in [`super::Warning`].
     pub path: String,
+    /// Vendor, product code and revision.
     pub identity: Identity,
     /// Text of `Type`, e.g. `EPOS4`.
     pub type_name: String,
@@ -37,6 +43,7 @@ pub struct Device {
     pub name: String,
     /// Every `Name`, in file order.
     pub names: Vec<LocalName>,
+    /// `GroupType`: the group of the device.
     pub group: String,
     /// `Invisible`: configurators do not offer this device.
     pub invisible: bool,
@@ -46,26 +53,38 @@ pub struct Device {
     pub revision_check: RevisionCheck,
     /// `UseLrdLwr`: the device cannot process LRW.
     pub use_lrd_lwr: bool,
+    /// `Info`: electrical properties, time-outs.
     pub info: Info,
     /// `Physics`: one letter per port, Y = MII, K = E-bus (`"YY"`, `"YKKY"`).
     pub physics: String,
     /// `Profile/ProfileNo` or `Profile/ChannelInfo/ProfileNo`: 402 for drives, 5001 for modular
     /// devices.
     pub profile: Option<u32>,
+    /// `Fmmu` in file order.
     pub fmmus: Vec<Fmmu>,
+    /// `Sm` in file order.
     pub sync_managers: Vec<SyncManager>,
+    /// `Su` in file order.
     pub sync_units: Vec<SyncUnit>,
+    /// `RxPdo`: PDOs with outputs.
     pub rx_pdos: Vec<Pdo>,
+    /// `TxPdo`: PDOs with inputs.
     pub tx_pdos: Vec<Pdo>,
     /// `AlternativeSmMapping`: named PDO assignments.
     pub sm_mappings: Vec<SmMapping>,
+    /// `Mailbox`; `None`: the device has no mailbox.
     pub mailbox: Option<Mailbox>,
     /// `Dc/OpMode` in file order. The first one is the default.
     pub dc_modes: Vec<DcMode>,
+    /// `Slots` of a modular device.
     pub slots: Option<Slots>,
+    /// The objects of `Profile/Dictionary`.
     pub dictionary: Dictionary,
+    /// `DiagMessage` in file order.
     pub diag_messages: Vec<DiagMessage>,
+    /// `Eeprom`: parts of the EEPROM image.
     pub eeprom: Eeprom,
+    /// `ESC`: register values for Init.
     pub registers: InitialRegisters,
 }
 
@@ -99,7 +118,9 @@ impl Device {
 /// `HideType`. Without a product code in the file, the device's own product code applies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct HiddenType {
+    /// The product code; `None`: same as the device.
     pub product: Option<u32>,
+    /// The revision number.
     pub revision: u32,
 }
 
@@ -110,12 +131,19 @@ pub enum RevisionCheck {
     /// The file contains no rule. Configurators accept an equal or newer revision.
     #[default]
     Unstated,
+    /// Any revision.
     None,
+    /// The same revision.
     Equal,
+    /// An equal or newer revision.
     EqualOrGreater,
+    /// The same low word.
     LowEqual,
+    /// The same low word, an equal or greater high word.
     LowEqualHighEqualOrGreater,
+    /// The same high word.
     HighEqual,
+    /// The same high word, an equal or greater low word.
     HighEqualLowEqualOrGreater,
 }
 
@@ -147,23 +175,34 @@ pub struct Info {
     pub preop_timeout_ms: Option<u32>,
     /// PreOp → SafeOp and SafeOp → Op.
     pub safeop_op_timeout_ms: Option<u32>,
+    /// Any state → Init.
     pub back_to_init_timeout_ms: Option<u32>,
+    /// Op → SafeOp.
     pub back_to_safeop_timeout_ms: Option<u32>,
+    /// `StartToSafeopNoSync`.
     pub start_to_safeop_no_sync: bool,
+    /// The time until the device has read a request.
     pub mailbox_request_timeout_ms: Option<u32>,
+    /// The time until the device has written its response.
     pub mailbox_response_timeout_ms: Option<u32>,
+    /// The source of the explicit device identification.
     pub identification: Identification,
     /// The E-bus current that the device consumes, in mA. Negative: the device supplies current.
     pub ebus_current_ma: Option<i32>,
+    /// `Port` in file order.
     pub ports: Vec<Port>,
+    /// The size of the process RAM in bytes.
     pub dpram_bytes: Option<u32>,
+    /// The number of SyncManagers.
     pub sm_count: Option<u32>,
+    /// The number of FMMUs.
     pub fmmu_count: Option<u32>,
 }
 
 /// The source of the explicit device identification (a switch, or a number that the user sets).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub enum Identification {
+    /// The device has none.
     #[default]
     No,
     /// AL control bit 5 requests the identification; register 0x0134 contains it.
@@ -175,36 +214,51 @@ pub enum Identification {
 /// `Info/Port`, port 0 first.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Port {
+    /// The medium.
     pub kind: PortKind,
+    /// The label at the socket.
     pub label: String,
+    /// The delay from the socket to the controller in ns.
     pub rx_delay_ns: Option<u32>,
+    /// The delay from the controller to the socket in ns.
     pub tx_delay_ns: Option<u32>,
 }
 
+/// The medium of a port.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub enum PortKind {
+    /// The port does not exist or is not configured.
     #[default]
     None,
+    /// Ethernet through a PHY.
     Mii,
+    /// E-bus (LVDS).
     EBus,
 }
 
 /// `DiagMessage`: the text of a text ID in the diagnosis history (0x10F3).
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct DiagMessage {
+    /// The text ID.
     pub text_id: u16,
+    /// The text.
     pub text: String,
 }
 
 /// `ESC`: register values that the vendor requires in Init.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct InitialRegisters {
+    /// Physical read/write offset.
     pub reg0108: Option<u16>,
+    /// Watchdog divider.
     pub reg0400: Option<u16>,
+    /// PDI watchdog time.
     pub reg0410: Option<u16>,
+    /// Process data watchdog time.
     pub reg0420: Option<u16>,
 }
 
+/// `Eeprom`: the parts of an EEPROM image.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Eeprom {
     /// The size in bytes.
@@ -224,7 +278,9 @@ pub struct Eeprom {
 /// `Eeprom/Category`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct EepromCategory {
+    /// The category type (ETG.2010).
     pub number: u16,
+    /// The contents.
     pub data: Vec<u8>,
     /// Writing an image keeps the category that the device already contains.
     pub preserve: bool,

@@ -5,35 +5,48 @@ use super::{Bytes, Position, SlotDependence, Text};
 /// Objects in file order with resolved types. Each readable subindex is an item of its object.
 #[derive(Debug, Clone, Default)]
 pub struct Dictionary {
+    /// The objects with resolved types.
     pub objects: Vec<Object>,
 }
 
 impl Dictionary {
+    /// Returns the object with this index.
     #[must_use]
     pub fn object(&self, index: u16) -> Option<&Object> {
         self.objects.iter().find(|o| o.index == index)
     }
 
+    /// Returns one subindex of an object.
     #[must_use]
     pub fn item(&self, index: u16, sub: u8) -> Option<&ObjectItem> {
         self.object(index)?.items.iter().find(|i| i.sub == sub)
     }
 }
 
+/// The kind of an object (ETG.1000.6).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum ObjectCode {
+    /// A single value.
     #[default]
     Var,
+    /// Elements of one type.
     Array,
+    /// Elements of different types.
     Record,
 }
 
+/// One object of the dictionary.
 #[derive(Debug, Clone, Default)]
 pub struct Object {
+    /// The position of the element.
     pub position: Position,
+    /// The index.
     pub index: u16,
+    /// The dependence of the index on the slot.
     pub depends_on: SlotDependence,
+    /// The name.
     pub name: Text,
+    /// The kind.
     pub code: ObjectCode,
     /// The type name as in the file.
     pub type_name: Text,
@@ -56,22 +69,31 @@ impl Object {
     }
 }
 
+/// One subindex of an object.
 #[derive(Debug, Clone, Default)]
 pub struct ObjectItem {
+    /// The subindex.
     pub sub: u8,
+    /// The name.
     pub name: Text,
     /// The base type name (`USINT`, `DINT`, `STRING(5)`, `ARRAY [0..15] OF BYTE`).
     pub type_name: Text,
+    /// The length in bits.
     pub bit_len: u32,
     /// The bit offset inside the object for complete access, where subindex 0 is padded to 16 bits.
     pub bit_offset: u32,
     /// The default in little-endian order, exactly `bit_len.div_ceil(8)` bytes. Zero if the file
     /// has no default.
     pub default: Bytes,
+    /// True if the file contains a default value.
     pub has_default: bool,
+    /// The smallest value, if the file contains one.
     pub min: Option<Bytes>,
+    /// The largest value, if the file contains one.
     pub max: Option<Bytes>,
+    /// The access rights.
     pub access: Access,
+    /// The permitted PDO directions.
     pub pdo_mapping: PdoMapping,
     /// `Backup`: the drive keeps the value over a power cycle once parameters are stored.
     pub backup: bool,
@@ -81,9 +103,12 @@ pub struct ObjectItem {
     pub unit: u32,
 }
 
+/// The access rights of a subindex.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Access {
+    /// True if the subindex is readable.
     pub read: bool,
+    /// The states with write access.
     pub write: Writable,
 }
 
@@ -96,20 +121,29 @@ impl Default for Access {
     }
 }
 
+/// The EtherCAT states with write access.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Writable {
+    /// Read-only.
     Never,
+    /// Writable in every state with a mailbox.
     Always,
     /// `WriteRestrictions` list the states that allow writing.
     Only {
+        /// Writable in PreOp.
         pre_op: bool,
+        /// Writable in SafeOp.
         safe_op: bool,
+        /// Writable in Op.
         op: bool,
     },
 }
 
+/// The PDOs that may contain a subindex.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct PdoMapping {
+    /// True if an RxPDO may contain it.
     pub rx: bool,
+    /// True if a TxPDO may contain it.
     pub tx: bool,
 }

@@ -9,6 +9,16 @@
 //! * `dictionary`: objects with resolved types
 //! * `shared_str`: names and types that many elements share
 //! * `small_bytes`: values of objects
+//!
+//! ```
+//! # let bytes = include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/examples/io.xml"));
+//! # let file = ecaxis_esi::parse(bytes)?;
+//! let device = &file.devices[0];
+//! assert_eq!((file.vendor.id, device.identity.product), (1, 2));
+//! assert_eq!(device.sync_managers[3].start_address, 0x1200);
+//! assert_eq!(device.tx_pdos[0].entries[0].index, 0x6000);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 mod device;
 mod dictionary;
@@ -34,7 +44,9 @@ pub use sync::*;
 /// The position in the file at which an element starts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub struct Position {
+    /// The line, from 1.
     pub line: u32,
+    /// The column, from 1.
     pub column: u32,
 }
 
@@ -47,9 +59,13 @@ impl fmt::Display for Position {
 /// A whole ESI file (`EtherCATInfo`).
 #[derive(Debug, Clone, Default)]
 pub struct EsiFile {
+    /// The vendor.
     pub vendor: Vendor,
+    /// The groups of devices.
     pub groups: Vec<Group>,
+    /// The devices in file order.
     pub devices: Vec<Device>,
+    /// The modules in file order.
     pub modules: Vec<Module>,
     /// `InfoReference`: other files, usually with root `EtherCATModule`, that contain further
     /// modules.
@@ -58,29 +74,37 @@ pub struct EsiFile {
     pub warnings: Vec<Warning>,
 }
 
+/// A problem of one element that the reader skipped or replaced.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Warning {
     /// The name of the referenced file; `None`: the warning is in the main file.
     pub file: Option<String>,
+    /// The position of the element.
     pub position: Position,
     /// Element path, such as `EtherCATInfo/Descriptions/Devices/Device[1]/Sm[3]`.
     pub path: String,
     /// True if the element is unreadable and missing in the model. False if the reader kept an
     /// inconsistent element.
     pub left_out: bool,
+    /// The problem as text.
     pub message: String,
 }
 
+/// The vendor of an ESI file.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Vendor {
+    /// The vendor ID (ETG).
     pub id: u32,
+    /// The name.
     pub name: String,
 }
 
 /// `Group`: a group of devices in a configurator. [`Device::group`] contains its `Type`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Group {
+    /// `Type`.
     pub type_name: String,
+    /// `Name`.
     pub name: String,
 }
 
@@ -89,5 +113,6 @@ pub struct Group {
 pub struct LocalName {
     /// Windows locale: 1033 English, 1031 German.
     pub lcid: Option<u32>,
+    /// The text.
     pub text: String,
 }

@@ -2,6 +2,7 @@
 
 use super::{Position, Text};
 
+/// The direction of a PDO, seen from the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Direction {
     /// MainDevice → SubDevice (outputs, 0x16xx, 0x1C12).
@@ -10,27 +11,38 @@ pub enum Direction {
     Tx,
 }
 
+/// One PDO of a device or module.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Pdo {
+    /// The position of the element.
     pub position: Position,
+    /// The direction.
     pub direction: Direction,
+    /// The index.
     pub index: u16,
+    /// The name.
     pub name: String,
     /// The SyncManager of the default assignment; `None`: not assigned by default.
     pub sm: Option<u8>,
+    /// The number of its sync unit.
     pub su: Option<u8>,
     /// SyncManagers to which this PDO may not be assigned.
     pub excluded_sm: Vec<u8>,
     /// The contents are not changeable.
     pub fixed: bool,
+    /// `Mandatory`: every assignment contains the PDO.
     pub mandatory: bool,
+    /// `Virtual`: the PDO is not part of the PDO assignment.
     pub virtual_: bool,
     /// The module in a slot replaces this PDO's contents.
     pub overwritten_by_module: bool,
     /// In a module: the slot number shifts the index.
     pub depends_on: SlotDependence,
+    /// `OSFac`: samples per cycle.
     pub oversampling: Option<Oversampling>,
+    /// `Exclude`: PDOs that cannot be assigned at the same time.
     pub exclude: Vec<Excluded>,
+    /// The entries in order, gaps included.
     pub entries: Vec<Entry>,
 }
 
@@ -39,6 +51,7 @@ pub struct Pdo {
 pub struct Oversampling {
     /// The number of samples if the OpMode does not define it.
     pub factor: u16,
+    /// `OSMax`: the largest factor.
     pub max: Option<u16>,
     /// The index step of the entries from one sample to the next; the PDO's own step is 1. 0: all
     /// samples are in one PDO.
@@ -48,7 +61,9 @@ pub struct Oversampling {
 /// A PDO that cannot be assigned together with this one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Excluded {
+    /// The index.
     pub index: u16,
+    /// The dependence of the index on the slot.
     pub depends_on: SlotDependence,
 }
 
@@ -64,11 +79,14 @@ impl From<u16> for Excluded {
 /// The slot increments that shift an index in a module.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub struct SlotDependence {
+    /// The index depends on the slot.
     pub slot: bool,
+    /// The index depends on the slot group.
     pub group: bool,
 }
 
 impl Pdo {
+    /// Returns the length in bits.
     #[must_use]
     pub fn bit_len(&self) -> u32 {
         self.entries.iter().map(|e| u32::from(e.bit_len)).sum()
@@ -89,17 +107,24 @@ impl Pdo {
 /// A mapped object; `index` 0: a gap.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {
+    /// The position of the element.
     pub position: Position,
+    /// The index.
     pub index: u16,
+    /// The subindex.
     pub sub: u8,
+    /// The length in bits.
     pub bit_len: u16,
+    /// The name.
     pub name: Text,
     /// The ETG.2000 base type name (`UINT`, `DINT`, `BOOL`, …); empty for a gap.
     pub data_type: Text,
+    /// The dependence of the index on the slot.
     pub depends_on: SlotDependence,
 }
 
 impl Entry {
+    /// True for padding without an object.
     #[must_use]
     pub fn is_gap(&self) -> bool {
         self.index == 0
@@ -116,10 +141,13 @@ impl Entry {
 /// `AlternativeSmMapping`: a named list of the PDOs of each SyncManager.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct SmMapping {
+    /// The position of the element.
     pub position: Position,
     /// Element path, as in [`super::Warning`].
     pub path: String,
+    /// `Name`.
     pub name: String,
+    /// True for the default assignment.
     pub default: bool,
     /// (SyncManager, its PDOs in order). A SyncManager that is not listed keeps its default.
     pub sync_managers: Vec<(u8, Vec<u16>)>,

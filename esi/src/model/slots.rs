@@ -2,13 +2,18 @@
 
 use super::{Dictionary, InitCmd, Object, Pdo, Position, SlotDependence};
 
+/// `Slots`: the places for modules of a modular device.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Slots {
+    /// The position of the element.
     pub position: Position,
+    /// `MaxSlotCount`.
     pub max_count: Option<u32>,
+    /// The index steps from slot to slot.
     pub increments: Increments,
     /// The MainDevice must write the configured module identities to 0xF030.
     pub download_module_ident_list: bool,
+    /// `Slot` in file order.
     pub slots: Vec<Slot>,
     /// `ModulePdoGroup`, sorted by the number that modules refer to.
     pub pdo_groups: Vec<ModulePdoGroup>,
@@ -17,32 +22,45 @@ pub struct Slots {
 /// The index steps of a module from one slot or slot group to the next.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub struct Increments {
+    /// PDO indices, from slot to slot.
     pub pdo: u16,
+    /// Object indices, from slot to slot.
     pub index: u16,
+    /// PDO indices, from group to group.
     pub group_pdo: u16,
+    /// Object indices, from group to group.
     pub group_index: u16,
 }
 
 /// Modules of one group share a PDO. Padding aligns the data of each module.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ModulePdoGroup {
+    /// `Name`.
     pub name: String,
     /// The alignment of module data in bytes.
     pub alignment: u32,
+    /// The RxPDO of the group.
     pub rx_pdo: Option<u16>,
+    /// The TxPDO of the group.
     pub tx_pdo: Option<u16>,
 }
 
+/// One `Slot`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Slot {
+    /// The position of the element.
     pub position: Position,
+    /// `Name`.
     pub name: String,
     /// `SlotGroup`.
     pub group: Option<u32>,
+    /// The smallest number of modules.
     pub min_instances: u32,
+    /// The largest number of modules.
     pub max_instances: u32,
     /// The slot's own value instead of [`Slots::increments`].
     pub pdo_increment: Option<u16>,
+    /// Same as `pdo_increment`, for objects.
     pub index_increment: Option<u16>,
     /// (module identity, true for the default)
     pub module_idents: Vec<(u32, bool)>,
@@ -50,26 +68,36 @@ pub struct Slot {
     pub module_classes: Vec<String>,
 }
 
+/// One `Module` of an ESI file.
 #[derive(Debug, Clone, Default)]
 pub struct Module {
+    /// The position of the element.
     pub position: Position,
     /// Element path, as in [`super::Warning`].
     pub path: String,
     /// The name of the module's file if it differs from the file of the devices.
     pub file: Option<String>,
+    /// `ModuleIdent`: the identity in 0xF030 and 0xF050.
     pub ident: u32,
+    /// `ModuleClass`.
     pub class: Option<String>,
     /// The number of the [`ModulePdoGroup`].
     pub pdo_group: Option<u32>,
+    /// Text of `Type`.
     pub type_name: String,
+    /// `Name`.
     pub name: String,
     /// Same as [`Device::profile`](super::Device::profile).
     pub profile: Option<u32>,
+    /// `RxPdo`: PDOs with outputs.
     pub rx_pdos: Vec<Pdo>,
+    /// `TxPdo`: PDOs with inputs.
     pub tx_pdos: Vec<Pdo>,
+    /// `InitCmd` in file order.
     pub init_cmds: Vec<InitCmd>,
     /// `DcOpModeName`: the OpMode of the device that the module requires.
     pub dc_mode: Option<String>,
+    /// The objects of the module.
     pub dictionary: Dictionary,
 }
 

@@ -20,6 +20,7 @@ enum Repr {
 }
 
 impl Bytes {
+    /// Returns the bytes.
     #[must_use]
     pub fn as_slice(&self) -> &[u8] {
         match &self.0 {

@@ -5,11 +5,13 @@ use super::Position;
 /// One `Fmmu` element. Its index in `Device::fmmus` is its number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Fmmu {
+    /// The data that it maps.
     pub usage: FmmuUse,
     /// The SyncManager of this FMMU, if the file has one.
     pub sm: Option<u8>,
     /// The number of its sync unit.
     pub su: Option<u8>,
+    /// Enabled in Op only.
     pub op_only: bool,
 }
 
@@ -24,20 +26,29 @@ impl From<FmmuUse> for Fmmu {
     }
 }
 
+/// The data that an FMMU maps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum FmmuUse {
+    /// Outputs.
     Outputs,
+    /// Inputs.
     Inputs,
+    /// The status of the input mailbox.
     MBoxState,
     /// Empty or unknown text.
     Other,
 }
 
+/// The data of a SyncManager.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum SmUse {
+    /// Mailbox from MainDevice to device.
     MBoxOut,
+    /// Mailbox from device to MainDevice.
     MBoxIn,
+    /// Outputs.
     Outputs,
+    /// Inputs.
     Inputs,
     /// Empty or unknown text.
     Other,
@@ -46,14 +57,21 @@ pub enum SmUse {
 /// One `Sm` element. Its index in `Device::sync_managers` is its number.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SyncManager {
+    /// The position of the element.
     pub position: Position,
+    /// The usage.
     pub usage: SmUse,
+    /// `StartAddress`: the physical start address.
     pub start_address: u16,
     /// The size in bytes; 0 if the file has none.
     pub default_size: u16,
+    /// The smallest size in bytes.
     pub min_size: Option<u16>,
+    /// The largest size in bytes.
     pub max_size: Option<u16>,
+    /// `ControlByte`, register 0x0804 of the SyncManager.
     pub control_byte: u8,
+    /// `Enable`: the SyncManager is used by default.
     pub enable: bool,
     /// Not a SyncManager of the controller: process data at a register, accessible through an FMMU
     /// only.
@@ -67,12 +85,17 @@ pub struct SyncManager {
 /// `Dc/OpMode`. Times in ns.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct DcMode {
+    /// The position of the element.
     pub position: Position,
+    /// `Name`.
     pub name: String,
+    /// `Desc`.
     pub description: String,
     /// Low byte → 0x0980, high byte → 0x0981.
     pub assign_activate: u16,
+    /// Times of SYNC0.
     pub sync0: SyncTime,
+    /// Times of SYNC1.
     pub sync1: SyncTime,
     /// PDOs that the mode assigns: (SyncManager, PDOs in order). Empty if the mode keeps the
     /// assignment.
@@ -88,7 +111,9 @@ pub struct SyncTime {
     pub cycle_ns: i64,
     /// > 0: bus cycle × factor; < 0: bus cycle ÷ |factor|; 0: none.
     pub factor: i32,
+    /// The absolute shift in ns.
     pub shift_ns: i64,
+    /// The shift as a factor of the bus cycle, like `factor`.
     pub shift_factor: i32,
     /// `Input="1"`: the shift is relative to the input event.
     pub shift_input: bool,
@@ -97,9 +122,14 @@ pub struct SyncTime {
 /// `Su`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct SyncUnit {
+    /// `Name`.
     pub name: String,
+    /// `SeparateSu`.
     pub separate: bool,
+    /// `SeparateFrame`.
     pub separate_frame: bool,
+    /// `DependOnInputState`.
     pub depends_on_input_state: bool,
+    /// `FrameRepeatSupport`.
     pub frame_repeat: bool,
 }

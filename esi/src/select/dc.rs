@@ -5,14 +5,21 @@ use crate::model::{DcMode, Device, Position, SyncTime};
 
 /// The DC register values of one device.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct DcSettings {
+    /// The name of the mode.
     pub name: String,
+    /// The position of the `OpMode`.
     pub position: Position,
     /// Low byte → 0x0980, high byte → 0x0981.
     pub assign_activate: u16,
+    /// SYNC0 cycle time in ns, register 0x09A0.
     pub sync0_cycle_ns: u32,
+    /// SYNC0 shift in ns.
     pub sync0_shift_ns: i32,
+    /// SYNC1 cycle time in ns, register 0x09A4.
     pub sync1_cycle_ns: u32,
+    /// SYNC1 shift in ns.
     pub sync1_shift_ns: i32,
 }
 

@@ -10,7 +10,9 @@ use crate::model::{Device, EsiFile, Warning};
 pub struct DeviceQuery<'a> {
     /// `Type` or `Name` of the device, case-insensitive.
     pub name: Option<&'a str>,
+    /// The product code; `None`: any.
     pub product: Option<u32>,
+    /// The revision number; `None`: any.
     pub revision: Option<u32>,
 }
 

@@ -4,6 +4,21 @@
 //! `custom_pdo` handles user-defined contents. `oversampling` repeats oversampled PDOs. `dc`
 //! selects the OpMode. [`select`] combines these results with layout and start-up list. Nothing in
 //! this module communicates with a device.
+//!
+//! ```
+//! use ecaxis_esi::{DeviceQuery, SelectOptions, find_device, select};
+//!
+//! # let bytes = include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/examples/io.xml"));
+//! # let file = ecaxis_esi::parse(bytes)?;
+//! let query = DeviceQuery { product: Some(2), ..DeviceQuery::default() };
+//! let device = find_device(&file, &query)?;
+//! let selection = select(&file, device, &SelectOptions::default())?;
+//! assert_eq!(selection.rx[0].index, 0x1600);
+//!
+//! let wrong = SelectOptions { dc_mode: Some("sync"), ..SelectOptions::default() };
+//! assert!(select(&file, device, &wrong).is_err());
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 mod custom_pdo;
 mod dc;
@@ -30,14 +45,18 @@ use crate::startup::{self, StartupSdo};
 /// An object for a PDO mapping.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct EntryRef {
+    /// The index.
     pub index: u16,
+    /// The subindex.
     pub sub: u8,
 }
 
 /// A user-defined start-up SDO.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct UserSdo {
+    /// The index.
     pub index: u16,
+    /// The subindex.
     pub sub: u8,
     /// The value in little-endian order, with the length of the object.
     pub data: Vec<u8>,
@@ -46,6 +65,7 @@ pub struct UserSdo {
 /// The user's choices for one device.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct SelectOptions<'a> {
+    /// The mode of operation; `None`: no requirement.
     pub mode: Option<Mode>,
     /// User-defined contents of the output PDO.
     pub rx: Option<&'a [EntryRef]>,
@@ -58,44 +78,61 @@ pub struct SelectOptions<'a> {
     pub assignment: Option<&'a str>,
     /// The name or description of a `Dc/OpMode`, or `off`.
     pub dc_mode: Option<&'a str>,
+    /// The bus cycle in ns.
     pub cycle_ns: u64,
+    /// Start-up SDOs of the user, sent last.
     pub sdo: &'a [UserSdo],
 }
 
 /// The complete configuration of one device.
 #[derive(Debug, Clone)]
+#[non_exhaustive]
 pub struct Selection {
+    /// Vendor, product code and revision.
     pub identity: Identity,
+    /// The type name of the device.
     pub device_name: String,
     /// The modules in slot order.
     pub modules: Vec<SelectedModule>,
+    /// The mode of operation.
     pub mode: Option<Mode>,
     /// The named assignment that applies, from the user or from the DC mode.
     pub assignment: Option<String>,
     /// The PDOs on the wire in assignment order. `sm` is always set.
     pub rx: Vec<Pdo>,
+    /// The TxPDOs (inputs) in assignment order.
     pub tx: Vec<Pdo>,
     /// The objects of device and modules. A module's object replaces the device's object of the
     /// same index.
     pub dictionary: Dictionary,
     /// `None`: free run or SyncManager-synchronous, without distributed clock.
     pub dc: Option<DcSettings>,
+    /// The bit offsets of all objects.
     pub layout: Layout,
+    /// The SDOs to send before SafeOp, in order.
     pub startup: Vec<StartupSdo>,
     /// Decisions that the user may not expect.
     pub notes: Vec<String>,
 }
 
+/// A module in its slot.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct SelectedModule {
     /// The place, counted from 0 over all slots and their instances. In 0xF030 it has subindex
     /// `place + 1`.
     pub place: usize,
+    /// The module identity.
     pub ident: u32,
+    /// The type name.
     pub type_name: String,
+    /// The name.
     pub name: String,
+    /// The name of the slot.
     pub slot_name: String,
+    /// The position of the `Module`.
     pub position: Position,
+    /// Its commands, with the indices of this slot.
     pub init_cmds: Vec<InitCmd>,
     /// The indices of its PDOs in this slot.
     pub pdos: Vec<u16>,

@@ -22,11 +22,15 @@ pub enum DifferenceKind {
 
 /// One differing field.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Difference {
+    /// The kind of contents.
     pub aspect: DifferenceKind,
     /// The field, such as `RxPdo 0x1600 / entry 2 / bits`.
     pub field: String,
+    /// The value in the expected image.
     pub expected: String,
+    /// The value in the other image.
     pub found: String,
 }
 

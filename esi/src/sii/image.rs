@@ -13,11 +13,14 @@ use crate::select::default_pdos;
 /// Values that are individual to each unit.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct SiiOptions {
+    /// The station alias, word 4.
     pub alias: u16,
+    /// The serial number, words 14 and 15.
     pub serial: u32,
 }
 
 impl Sii {
+    /// Returns the contents of the image for a device, with the default modules.
     #[must_use]
     pub fn from_device(device: &Device, modules: &[Module], options: &SiiOptions) -> Self {
         let mut config = [0u8; 14];

@@ -9,24 +9,40 @@ use super::{
 };
 use crate::model::{FmmuUse, Identity};
 
+/// An EEPROM image is unreadable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum SiiError {
+    /// The image is shorter than its header.
     #[error("the image has {len} bytes, the header alone needs 128")]
-    TooShort { len: usize },
+    TooShort {
+        /// The length in bytes.
+        len: usize,
+    },
+    /// A category exceeds the image.
     #[error("category {category} at byte 0x{offset:x} claims {claimed} bytes, {left} are left")]
     Category {
+        /// The category type.
         category: u16,
+        /// The byte offset of the category.
         offset: usize,
+        /// The length in its header, in bytes.
         claimed: usize,
+        /// The bytes up to the end of the image.
         left: usize,
     },
+    /// The entries of a PDO exceed its category.
     #[error(
         "category {category} at byte 0x{offset:x}: PDO 0x{pdo:04x} claims {entries} entries, more than the category holds"
     )]
     Pdo {
+        /// The category type.
         category: u16,
+        /// The byte offset of the category.
         offset: usize,
+        /// The index of the PDO.
         pdo: u16,
+        /// The number of entries in its header.
         entries: u8,
     },
 }

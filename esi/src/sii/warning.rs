@@ -11,19 +11,28 @@ const MOST: usize = 100;
 
 /// One problem and its location.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct SiiWarning {
     /// The offset from the start of the image.
     pub offset: usize,
     /// `None`: in the header, or in the image as a whole.
     pub category: Option<u16>,
+    /// The problem.
     pub remark: WarningKind,
 }
 
+/// A problem of a readable EEPROM image.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
 #[non_exhaustive]
 pub enum WarningKind {
     /// The checksum is wrong, so a controller ignores the configuration.
-    Checksum { found: u8, right: u8 },
+    Checksum {
+        /// The checksum in the image.
+        found: u8,
+        /// The correct checksum.
+        right: u8,
+    },
     /// The end mark is missing.
     NoEnd,
     /// The end mark comes first: the image contains only the header.
@@ -31,15 +40,36 @@ pub enum WarningKind {
     /// A category that must be unique occurs again.
     Repeated,
     /// The remaining bytes do not form a whole record.
-    LeftOver { bytes: usize, record: usize },
+    LeftOver {
+        /// The bytes after the last record.
+        bytes: usize,
+        /// The length of a record in bytes.
+        record: usize,
+    },
     /// The category ends before its last text.
-    Strings { claimed: u8, found: usize },
+    Strings {
+        /// The claimed number.
+        claimed: u8,
+        /// The number found.
+        found: usize,
+    },
     /// The referenced text does not exist; it reads as empty.
-    NoString { number: u8, strings: usize },
+    NoString {
+        /// The text number.
+        number: u8,
+        /// The number of texts.
+        strings: usize,
+    },
     /// Not a direction and not the mailbox state.
-    Fmmu { code: u8 },
+    Fmmu {
+        /// The value in the image.
+        code: u8,
+    },
     /// Not a type of ETG.2010.
-    SyncManager { code: u8 },
+    SyncManager {
+        /// The value in the image.
+        code: u8,
+    },
 }
 
 impl fmt::Display for SiiWarning {

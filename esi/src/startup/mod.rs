@@ -4,6 +4,17 @@
 //! interpolation time, InitCmds of device and module, mode of operation, user-defined SDOs. Objects
 //! that the CoE flags declare read-only are not written. The ESI's defaults must then match the
 //! selection.
+//!
+//! ```
+//! use ecaxis_esi::{SelectOptions, select};
+//!
+//! # let bytes = include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/examples/io.xml"));
+//! # let file = ecaxis_esi::parse(bytes)?;
+//! let selection = select(&file, &file.devices[0], &SelectOptions::default())?;
+//! let objects: Vec<u16> = selection.startup.iter().map(|sdo| sdo.index).collect();
+//! assert!(objects.contains(&0x1c12)); // the PDO assignment of SyncManager 2
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 mod interpolation;
 mod pdo;
@@ -21,9 +32,13 @@ pub struct StartupSdo {
     /// The transition: `PS`, or `IP` (once PreOp is reached) or `SO` (before Op) from an InitCmd.
     /// The list is sorted in the order `IP`, `PS`, `SO`.
     pub transition: &'static str,
+    /// The index.
     pub index: u16,
+    /// The subindex.
     pub sub: u8,
+    /// True to write all subindices at once, from `sub` on.
     pub complete_access: bool,
+    /// The value.
     pub data: Vec<u8>,
     /// The name of the object; empty if the ESI has none.
     pub name: String,
