@@ -10,6 +10,7 @@ mod scale;
 
 pub(crate) use scale::is_maxon;
 
+use super::fields::KeyExt;
 use super::problem::{Problems, Span};
 use super::raw::{RawAxis, RawLimits, RawSdo, SdoValue};
 use super::units::unit;
@@ -30,11 +31,10 @@ pub(crate) fn setup(
     // The numbers are checked even if the unit's name is wrong.
     let shown = name.as_deref().unwrap_or("units");
     let scale = scale::scale(raw, shown, p);
-    let way = scale::way(raw, p);
     let torque = scale::torque(raw, sdos, selection, p);
     let limits = limits(&raw.limits, torque.as_ref(), shown, p);
     let ((velocity_unit, velocity_unit_from), limits) = (velocity?, limits?);
-    let (torque, way) = (torque?, way?);
+    let torque = torque?;
     let (acceleration_unit, acceleration_unit_from) =
         scale::acceleration_unit(velocity_unit, sdos, selection);
     let mut scale = scale?.with_velocity_unit(velocity_unit);
@@ -43,22 +43,21 @@ pub(crate) fn setup(
     }
     let mut config = AxisConfig::new(Mode::from_code(mode.code()), scale, limits);
     if let Some(window) = &raw.target_window {
-        config.target_window = *positive(window, "target_window", shown, p)?;
+        config.target_window = positive(window, "target_window", shown, p)?;
     }
     config.modes = modes(config.mode, selection);
     config.jerk_limited = raw.limits.jerk.is_some();
-    config.loops = control::loops(&raw.loops, shown, selection, p)?;
+    config.loops = control::loops(raw, shown, selection, p)?;
     control::guards(raw, &mut config, &torque, shown, p)?;
     config.quick_stop = quick_stop(sdos, selection);
     let homing = match &raw.homing {
         Some(homing) => Some(control::homing(homing, &config, selection, p)?),
         None => None,
     };
-    let timeout = raw.stop_timeout.as_ref();
-    config.stop_timeout_s = timeout.map(|timeout| *timeout.get_ref() as f64 * 1e-9);
-    config.follows_bit = raw.follows_bit.as_ref().is_none_or(|bit| *bit.get_ref());
-    if let Some(dead_time) = &raw.dead_time {
-        config.dead_time_s = *dead_time.get_ref() as f64 * 1e-9;
+    config.stop_timeout_s = control::seconds(&raw.stop_timeout);
+    config.follows_bit = raw.follows_bit.value().unwrap_or(true);
+    if let Some(dead_time_s) = control::seconds(&raw.dead_time) {
+        config.dead_time_s = dead_time_s;
     }
     if let Err(e) = Axis::new(config) {
         let (at, message) = refused(&e, raw, &torque, shown);
@@ -72,7 +71,7 @@ pub(crate) fn setup(
         velocity_unit_from,
         acceleration_unit_from,
         torque,
-        way,
+        way: raw.way.value().unwrap_or_default(),
         homing,
         brake_output: None,
     })
@@ -124,14 +123,14 @@ fn modes(own: Mode, selection: Option<&esi::Selection>) -> Modes {
 }
 
 /// Returns the value if it is positive. `unit` may be empty.
-pub(super) fn positive<'v>(
-    value: &'v Spanned<f64>,
+pub(super) fn positive(
+    value: &Spanned<f64>,
     what: &str,
     unit: &str,
     p: &mut Problems<'_>,
-) -> Option<&'v f64> {
+) -> Option<f64> {
     if *value.get_ref() > 0.0 {
-        return Some(value.get_ref());
+        return Some(*value.get_ref());
     }
     let gap = if unit.is_empty() { "" } else { " " };
     let message = format!(
@@ -146,9 +145,9 @@ pub(super) fn positive<'v>(
 fn refused(error: &ConfigError, raw: &RawAxis, known: &TorqueSetup, unit: &str) -> (Span, String) {
     let limits = &raw.limits;
     let of = |value: Option<Span>| value.unwrap_or(limits.span.clone());
-    let velocity = of(limits.velocity.as_ref().map(Spanned::span));
-    let position = of(limits.position.as_ref().map(Spanned::span));
-    let torque = of(limits.torque.as_ref().map(Spanned::span));
+    let velocity = of(limits.velocity.place());
+    let position = of(limits.position.place());
+    let torque = of(limits.torque.place());
     match error {
         ConfigError::Limit(LimitError::RangeTooWide { low, high, counts }) => (
             position,
@@ -185,19 +184,16 @@ fn refused(error: &ConfigError, raw: &RawAxis, known: &TorqueSetup, unit: &str) 
             what: "stop_timeout_s",
             ..
         } => (
-            of(raw.stop_timeout.as_ref().map(Spanned::span)),
+            of(raw.stop_timeout.place()),
             "`stop_timeout` must be above 0".to_owned(),
         ),
-        ConfigError::NotPositive { .. } => (
-            of(raw.target_window.as_ref().map(Spanned::span)),
-            error.to_string(),
-        ),
+        ConfigError::NotPositive { .. } => (of(raw.target_window.place()), error.to_string()),
         ConfigError::Limit(LimitError::NotPositive { .. }) | ConfigError::Mode(_) => {
             (limits.span.clone(), error.to_string())
         }
         ConfigError::Outside { .. } => {
-            let at = raw.dead_time.as_ref().map(Spanned::span);
-            let at = at.or(raw.loops.cst.as_ref().map(|cst| cst.span.clone()));
+            let cst = raw.cst.as_ref().map(|cst| cst.span.clone());
+            let at = raw.dead_time.place().or(cst);
             (at.unwrap_or(raw.span.clone()), error.to_string())
         }
     }
@@ -211,7 +207,7 @@ fn limits(
 ) -> Option<Limits> {
     let mut ok = true;
     let mut read = |value: &Option<Spanned<f64>>, what: &str, unit: &str| {
-        let value = value.as_ref().map(|v| positive(v, what, unit, p).copied());
+        let value = value.as_ref().map(|v| positive(v, what, unit, p));
         ok &= value != Some(None);
         value.flatten()
     };
@@ -247,7 +243,7 @@ fn limits(
         ok = false;
     }
     let limits = Limits {
-        position: raw.position.as_ref().map(|r| *r.get_ref()),
+        position: raw.position.value(),
         velocity: velocity?,
         acceleration: acceleration?,
         jerk,

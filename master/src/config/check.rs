@@ -6,19 +6,20 @@ use std::path::Path;
 use toml::Spanned;
 
 use super::device::{self, EsiFiles};
+use super::duration::show;
+use super::fields::KeyExt;
 use super::problem::{Problems, Span};
 use super::raw::{RawBus, RawDevice, RawMachine};
 use super::sim;
 use super::steps::{self, ResolvedDevice};
 use crate::bringup::MAX_SUBDEVICES;
-use crate::link::SocketKind;
 use crate::rt::spin::Spin;
 
-use super::{Bus, DeviceConfig, Exchange, Locator, Machine, Nic, Signal, duration, signal};
+use super::{Bus, DeviceConfig, Locator, Machine, Nic, Signal, signal};
 
 /// Returns `None` only if a problem has been reported.
 pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Option<Machine> {
-    let cycle_span = raw.bus.cycle.as_ref().map_or(0..0, Spanned::span);
+    let cycle_span = raw.bus.cycle.place().unwrap_or_default();
     let bus = bus(raw.bus, p);
     unique_names(&raw.devices, p);
     if let Some(beyond) = raw.devices.get(MAX_SUBDEVICES) {
@@ -81,7 +82,7 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         })
         .collect();
     let cycle_s = bus.as_ref().map_or(1e-3, |b| b.cycle_ns as f64 * 1e-9);
-    let repeat = raw.repeat.map_or(1, Spanned::into_inner);
+    let repeat = raw.repeat.value().unwrap_or(1);
     let program = steps::check(raw.steps, raw.stop, &known, folder, cycle_s, repeat, p);
     let brakes = brake_outputs(&brakes, &known, &program.outputs, p);
     let mut devices: Vec<DeviceConfig> = devices.into_iter().collect::<Option<_>>()?;
@@ -102,7 +103,7 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         stop: program.stop,
         tables: program.tables,
         repeat,
-        enable: raw.enable.is_none_or(Spanned::into_inner),
+        enable: raw.enable.value().unwrap_or(true),
     })
 }
 
@@ -151,71 +152,39 @@ fn brake_outputs(
 
 fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
     let defaults = Bus::default();
-    let cycle_ns = raw
-        .cycle
-        .as_ref()
-        .and_then(|c| in_range(c, 50_000, 100_000_000, "a cycle", p));
-    // The watchdog registers count 100 µs in 16 bits.
-    let watchdog = raw
-        .watchdog
-        .as_ref()
-        .map(|w| in_range(w, 1_000_000, 6_553_500_000, "a watchdog", p));
-    let watchdog_ns = watchdog.unwrap_or(Some(defaults.watchdog_ns));
-    if let (Some(cycle), Some(watchdog)) = (cycle_ns, watchdog_ns)
-        && watchdog < cycle * 2
-    {
-        let at = raw
-            .watchdog
-            .as_ref()
-            .or(raw.cycle.as_ref())
-            .map_or(0..0, Spanned::span);
-        let message = format!(
-            "the watchdog of {} expires between two cycles of {}",
-            duration::show(watchdog),
-            duration::show(cycle),
-        );
-        p.add_hint(at, message, "make `watchdog` several cycles long");
-    } else if let (Some(cycle), Some(watchdog)) = (cycle_ns, watchdog_ns) {
-        check_lost_frames(&raw, cycle, watchdog, p);
+    let cycle_ns = raw.cycle.value();
+    let watchdog_ns = raw.watchdog.value().unwrap_or(defaults.watchdog_ns);
+    let lost_frames = raw.lost_frames.value().unwrap_or(defaults.lost_frames);
+    if let Some(cycle) = cycle_ns {
+        if watchdog_ns < cycle * 2 {
+            let at = raw.watchdog.place().or(raw.cycle.place());
+            let message = format!(
+                "the watchdog of {} expires between two cycles of {}",
+                show(watchdog_ns),
+                show(cycle),
+            );
+            let hint = "make `watchdog` several cycles long";
+            p.add_hint(at.unwrap_or_default(), message, hint);
+        } else {
+            check_lost_frames(&raw, lost_frames, cycle, watchdog_ns, p);
+        }
+        if let Some(spin) = &raw.spin
+            && let Spin::For(ns) = spin.get_ref()
+            && *ns > cycle
+        {
+            let message =
+                "spinning longer than a cycle never sleeps: `spin` must not exceed `cycle`";
+            p.add(spin.span(), message);
+        }
     }
-    let clock_window = raw
-        .clock_window
-        .as_ref()
-        .map(|w| in_range(w, 100, 1_000_000_000, "a window for clocks", p));
-    let clock_window_ns = clock_window.unwrap_or(Some(defaults.clock_window_ns));
-    if let (Some(spin), Some(cycle)) = (&raw.spin, cycle_ns)
-        && spin.get_ref().is_some_and(|spin| spin > cycle)
+    let awake = raw.idle.value().unwrap_or(defaults.awake);
+    if let (Some(idle), true, None) = (&raw.idle, awake, &raw.cpu)
+        && !raw.written.has("cpu")
     {
-        p.add(
-            spin.span(),
-            "spinning longer than a cycle never sleeps: `spin` must not exceed `cycle`",
-        );
+        let message = "it is not said which CPU to keep awake";
+        let hint = "say where the real-time thread runs: `cpu = 1`";
+        p.add_hint(idle.span(), message, hint);
     }
-    let exchange = raw
-        .exchange
-        .map_or(Some(Exchange::SameCycle), |e| match e.get_ref().as_str() {
-            "same-cycle" => Some(Exchange::SameCycle),
-            "pipelined" => Some(Exchange::Pipelined),
-            other => {
-                p.add_hint(
-                    e.span(),
-                    format!("unknown exchange `{other}`"),
-                    "there are \"same-cycle\" and \"pipelined\"",
-                );
-                None
-            }
-        });
-    let awake = match &raw.idle {
-        Some(idle) => awake(idle, raw.cpu.is_some(), p),
-        None => Some(defaults.awake),
-    };
-    let link = raw.link.map_or(Some(defaults.link), |l| back_end(&l, p));
-    let timeout = |value: Option<Spanned<u64>>, default: u64, p: &mut Problems<'_>| match value {
-        Some(value) => in_range(&value, 1_000_000, 600_000_000_000, "a timeout", p),
-        None => Some(default),
-    };
-    let op_timeout_ns = timeout(raw.op_timeout, defaults.op_timeout_ns, p);
-    let enable_timeout_ns = timeout(raw.enable_timeout, defaults.enable_timeout_ns, p);
     let nic = match &raw.nic {
         Some(name) => nic(name, p),
         None => Some(Nic::Sim),
@@ -223,109 +192,42 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
     Some(Bus {
         nic: nic?,
         cycle_ns: cycle_ns?,
-        lost_frames: raw
-            .lost_frames
-            .map_or(defaults.lost_frames, Spanned::into_inner),
-        cpu: raw
-            .cpu
-            .and_then(|cpu| usize::try_from(cpu.into_inner()).ok()),
-        priority: raw.priority.map_or(defaults.priority, Spanned::into_inner),
-        spin: match raw.spin.and_then(Spanned::into_inner) {
-            Some(spin) => Spin::For(spin),
-            None => Spin::Auto,
-        },
-        awake: awake?,
-        op_timeout_ns: op_timeout_ns?,
-        enable_timeout_ns: enable_timeout_ns?,
-        watchdog_ns: watchdog_ns?,
-        clock_window_ns: clock_window_ns?,
-        exchange: exchange?,
-        link: link?,
-        written: raw.written,
+        lost_frames,
+        cpu: raw.cpu.value().and_then(|cpu| usize::try_from(cpu).ok()),
+        priority: raw.priority.value().unwrap_or(defaults.priority),
+        spin: raw.spin.value().unwrap_or_default(),
+        awake,
+        op_timeout_ns: raw.op_timeout.value().unwrap_or(defaults.op_timeout_ns),
+        enable_timeout_ns: raw
+            .enable_timeout
+            .value()
+            .unwrap_or(defaults.enable_timeout_ns),
+        watchdog_ns,
+        clock_window_ns: raw.clock_window.value().unwrap_or(defaults.clock_window_ns),
+        exchange: raw.exchange.value().unwrap_or(defaults.exchange),
+        link: raw.link.value().unwrap_or(defaults.link),
+        written: raw.written.keys,
     })
 }
 
-/// Returns `true` if `cpu` is kept awake.
-fn awake(idle: &Spanned<String>, has_cpu: bool, p: &mut Problems<'_>) -> Option<bool> {
-    match idle.get_ref().as_str() {
-        "sleep" => Some(false),
-        "awake" if has_cpu => Some(true),
-        "awake" => {
-            p.add_hint(
-                idle.span(),
-                "it is not said which CPU to keep awake",
-                "say where the real-time thread runs: `cpu = 1`",
-            );
-            None
-        }
-        other => {
-            p.add_hint(
-                idle.span(),
-                format!("unknown idle `{other}`"),
-                "there are \"sleep\" and \"awake\"",
-            );
-            None
-        }
-    }
-}
-
-fn back_end(name: &Spanned<String>, p: &mut Problems<'_>) -> Option<SocketKind> {
-    let found = SocketKind::ALL.iter().find(|b| b.name() == name.get_ref());
-    if found.is_none() {
-        let names: Vec<_> = SocketKind::ALL.iter().map(|b| format!("\"{b}\"")).collect();
-        p.add_hint(
-            name.span(),
-            format!("unknown link `{}`", name.get_ref()),
-            format!("there are {}", names.join(" and ")),
-        );
-    }
-    found.copied()
-}
-
 /// Checks that lost frames stop the axes before the drives' watchdogs expire.
-fn check_lost_frames(raw: &RawBus, cycle: u64, watchdog: u64, p: &mut Problems<'_>) {
-    let lost = raw
-        .lost_frames
-        .as_ref()
-        .map_or(Bus::default().lost_frames, |l| *l.get_ref());
+fn check_lost_frames(raw: &RawBus, lost: u32, cycle: u64, watchdog: u64, p: &mut Problems<'_>) {
     let gap = u64::from(lost) * cycle;
     if gap < watchdog {
         return;
     }
-    let at = raw.lost_frames.as_ref().map(Spanned::span);
-    let at = at.or(raw.watchdog.as_ref().map(Spanned::span));
-    let at = at.or(raw.cycle.as_ref().map(Spanned::span));
+    let at = raw.lost_frames.place().or(raw.watchdog.place());
+    let at = at.or(raw.cycle.place());
     let message = format!(
         "`lost_frames` = {lost} cycles of {} are {}, but the drives' `watchdog` stops them after {}",
-        duration::show(cycle),
-        duration::show(gap),
-        duration::show(watchdog),
+        show(cycle),
+        show(gap),
+        show(watchdog),
     );
     // At least 1, because the watchdog is two cycles or longer.
     let most = (watchdog - 1) / cycle;
     let hint = format!("write `lost_frames = {most}` or less, or a longer `watchdog`");
-    p.add_hint(at.unwrap_or(0..0), message, hint);
-}
-
-fn in_range(
-    ns: &Spanned<u64>,
-    low: u64,
-    high: u64,
-    what: &str,
-    p: &mut Problems<'_>,
-) -> Option<u64> {
-    let value = *ns.get_ref();
-    if (low..=high).contains(&value) {
-        return Some(value);
-    }
-    let message = format!(
-        "{what} of {} is not possible; it must be from {} to {}",
-        duration::show(value),
-        duration::show(low),
-        duration::show(high),
-    );
-    p.add(ns.span(), message);
-    None
+    p.add_hint(at.unwrap_or_default(), message, hint);
 }
 
 fn nic(name: &Spanned<String>, p: &mut Problems<'_>) -> Option<Nic> {
@@ -375,21 +277,15 @@ fn unique_names(devices: &[RawDevice], p: &mut Problems<'_>) {
 fn places(devices: &[RawDevice], p: &mut Problems<'_>) -> Vec<Option<Locator>> {
     let mut places: Vec<Option<(Locator, Span)>> = Vec::new();
     for device in devices {
+        let placed = ["position", "alias", "id"];
+        let placed = placed.iter().any(|key| device.written.has(key));
         let given = [
-            device
-                .position
-                .as_ref()
-                .map(|n| (Locator::Position(*n.get_ref()), n.span())),
-            device
-                .alias
-                .as_ref()
-                .map(|n| (Locator::Alias(*n.get_ref()), n.span())),
-            device
-                .id
-                .as_ref()
-                .map(|n| (Locator::Id(*n.get_ref()), n.span())),
+            (&device.position, Locator::Position as fn(u16) -> Locator),
+            (&device.alias, Locator::Alias),
+            (&device.id, Locator::Id),
         ];
-        let mut given = given.into_iter().flatten();
+        let given = given.into_iter();
+        let mut given = given.filter_map(|(n, at)| Some((at(n.value()?), n.place()?)));
         let place = match (given.next(), given.next()) {
             (Some(place), None) => Some(place),
             (Some(_), Some((_, span))) => {
@@ -399,7 +295,7 @@ fn places(devices: &[RawDevice], p: &mut Problems<'_>) -> Vec<Option<Locator>> {
                 );
                 None
             }
-            (None, _) if device.placed => None,
+            (None, _) if placed => None,
             (None, _) => {
                 let message = "it is not said where on the bus the device is";
                 let hint = format!("add `position = {}`, or `alias` or `id`", places.len());

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use ecaxis_esi as esi;
 use toml::Spanned;
 
+use super::fields::{Key, KeyExt};
 use super::problem::{Problems, Span, suggestion, unreadable};
 use super::raw::{RawDevice, RawEntry};
 use super::{DeviceConfig, Locator, Startup, axis, drive_limits, sdo, sim};
@@ -85,12 +86,17 @@ impl<'f> EsiFiles<'f> {
             self.folders.insert(folder.to_owned(), opened);
         }
         let known = self.folders.get(folder)?.as_ref()?;
-        let of = |number: &Option<Spanned<u32>>| number.as_ref().map(|n| *n.get_ref());
         let type_name = raw.type_name.as_ref().map(|t| t.get_ref().trim());
         let fits = |e: &&esi_library::Entry| {
-            of(&raw.vendor).is_none_or(|vendor| vendor == e.vendor)
-                && of(&raw.product).is_none_or(|product| product == e.product)
-                && of(&raw.revision).is_none_or(|revision| revision == e.revision)
+            raw.vendor.value().is_none_or(|vendor| vendor == e.vendor)
+                && raw
+                    .product
+                    .value()
+                    .is_none_or(|product| product == e.product)
+                && raw
+                    .revision
+                    .value()
+                    .is_none_or(|revision| revision == e.revision)
                 && type_name.is_none_or(|name| {
                     e.type_name.eq_ignore_ascii_case(name) || e.name.eq_ignore_ascii_case(name)
                 })
@@ -227,7 +233,7 @@ pub(crate) fn check(
         selection: chosen?,
         startup,
         identity: identity?,
-        serial: raw.serial.map(Spanned::into_inner),
+        serial: raw.serial.value(),
         axis: match axis {
             Some(axis) => Some(axis?),
             None if raw.axis.is_some() => return None,
@@ -335,14 +341,11 @@ fn find<'e>(
 ) -> Option<&'e esi::Device> {
     let query = esi::DeviceQuery {
         name: raw.type_name.as_ref().map(|n| n.get_ref().as_str()),
-        product: raw.product.as_ref().map(|n| *n.get_ref()),
-        revision: raw.revision.as_ref().map(|n| *n.get_ref()),
+        product: raw.product.value(),
+        revision: raw.revision.value(),
     };
-    let at = None
-        .or(raw.type_name.as_ref().map(Spanned::span))
-        .or(raw.product.as_ref().map(Spanned::span))
-        .or(raw.revision.as_ref().map(Spanned::span))
-        .or(raw.esi.as_ref().map(Spanned::span));
+    let at = raw.type_name.place().or(raw.product.place());
+    let at = at.or(raw.revision.place()).or(raw.esi.place());
     match esi::find_device(file, &query) {
         Ok(device) => Some(device),
         Err(e) => {
@@ -374,7 +377,7 @@ impl DeviceQuery<'_> {
         device: &esi::Device,
         p: &mut Problems<'_>,
     ) -> Option<esi::Selection> {
-        let entries = |list: &Option<Spanned<Vec<RawEntry>>>| {
+        let entries = |list: &Key<Vec<RawEntry>>| {
             let list = list.as_ref()?.get_ref().iter();
             Some(
                 list.map(|e| esi::EntryRef {
@@ -384,7 +387,7 @@ impl DeviceQuery<'_> {
                 .collect::<Vec<_>>(),
             )
         };
-        let (rx, tx) = (entries(&self.raw.rx), entries(&self.raw.tx));
+        let (rx, tx) = (entries(&self.raw.pdo.rx), entries(&self.raw.pdo.tx));
         let modules = self.raw.modules.as_ref().map(|m| m.get_ref().as_slice());
         let modules: Vec<&str> = modules
             .unwrap_or_default()
@@ -410,16 +413,13 @@ impl DeviceQuery<'_> {
         // The dictionary depends on the module, so values are encoded here.
         let mut sdos = Vec::new();
         for raw in &self.raw.sdo {
-            let item = first.dictionary.item(raw.index, raw.sub);
+            let (index, sub) = raw.address();
+            let item = first.dictionary.item(index, sub);
             let type_name = raw.type_name.as_ref().map(|t| t.get_ref().as_str());
             match sdo::encode(raw.value.get_ref(), type_name, item) {
-                Ok(data) => sdos.push(esi::UserSdo {
-                    index: raw.index,
-                    sub: raw.sub,
-                    data,
-                }),
+                Ok(data) => sdos.push(esi::UserSdo { index, sub, data }),
                 Err((message, hint)) => {
-                    let message = format!("SDO {}: {message}", esi::address(raw.index, raw.sub));
+                    let message = format!("SDO {}: {message}", esi::address(index, sub));
                     match hint {
                         Some(hint) => p.add_hint(raw.span.clone(), message, hint),
                         None => p.add(raw.value.span(), message),
@@ -439,40 +439,27 @@ impl DeviceQuery<'_> {
     fn report(&self, e: &esi::SelectError, p: &mut Problems<'_>) {
         use esi::SelectError as E;
         let raw = self.raw;
-        let device = raw.esi.as_ref().map_or(raw.span.clone(), Spanned::span);
+        let device = raw.esi.place().unwrap_or(raw.span.clone());
         let of = |value: Option<Span>| value.unwrap_or(device.clone());
-        let list = |name: &str| {
-            let list = if name.contains("rx") {
-                &raw.rx
-            } else {
-                &raw.tx
-            };
-            of(list.as_ref().map(Spanned::span))
+        let entries = |name: &str| match name.contains("rx") {
+            true => &raw.pdo.rx,
+            false => &raw.pdo.tx,
         };
+        let list = |name: &str| of(entries(name).place());
         let entry = |name: &str, index: u16, sub: u8| {
-            let entries = if name.contains("rx") {
-                &raw.rx
-            } else {
-                &raw.tx
-            };
-            let entries = entries
-                .as_ref()
-                .map(|l| l.get_ref().as_slice())
-                .unwrap_or_default();
-            let found = entries.iter().find(|e| e.index == index && e.sub == sub);
+            let mut entries = entries(name).iter().flat_map(Spanned::get_ref);
+            let found = entries.find(|e| (e.index, e.sub) == (index, sub));
             found.map_or(list(name), |e| e.span.clone())
         };
         let sdo = |index: u16, sub: u8| {
-            let found = raw.sdo.iter().find(|s| s.index == index && s.sub == sub);
+            let found = raw.sdo.iter().find(|s| s.address() == (index, sub));
             of(found.map(|s| s.span.clone()))
         };
         let at = match e {
-            E::ModeNotOffered { .. } => of(raw.mode.as_ref().map(Spanned::span)),
-            E::NoSuchDcMode { .. } => of(raw.dc.as_ref().map(Spanned::span)),
-            E::NoSuchModule { .. } | E::TooManyModules { .. } => {
-                of(raw.modules.as_ref().map(Spanned::span))
-            }
-            E::NoSuchAssignment { .. } => of(raw.assignment.as_ref().map(Spanned::span)),
+            E::ModeNotOffered { .. } => of(raw.mode.place()),
+            E::NoSuchDcMode { .. } => of(raw.dc.place()),
+            E::NoSuchModule { .. } | E::TooManyModules { .. } => of(raw.modules.place()),
+            E::NoSuchAssignment { .. } => of(raw.assignment.place()),
             E::CycleNotExpressible { .. } | E::DcOutOfRange { .. } => self.cycle.clone(),
             E::UnknownEntry { list, index, sub }
             | E::NotMappable {

@@ -3,9 +3,6 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// Text that precedes a key where a table is read.
-const READERS: [&str; 5] = [".get(", ".need(", "number(", "&mut f,", "optional!(p, f,"];
-
 fn is_key(word: &str) -> bool {
     let letter = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
     !word.is_empty() && word.chars().all(letter)
@@ -16,24 +13,27 @@ fn quoted(text: &str) -> Option<&str> {
     is_key(word).then_some(word)
 }
 
-/// Returns the keys that a source file reads from tables.
+/// Returns the keys of the tables and the list of verbs in a source file.
 fn keys(source: &str) -> BTreeSet<String> {
     let code = source.split("#[cfg(test)]").next().unwrap_or_default();
     let mut keys = BTreeSet::new();
-    for reader in READERS {
-        let asked = code.match_indices(reader);
-        let asked = asked.filter_map(|(at, _)| quoted(&code[at + reader.len()..]));
-        keys.extend(asked.map(str::to_owned));
+    for table in code.split("table! {").skip(1) {
+        let (table, _) = table.split_once("\n}\n").unwrap_or_default();
+        for line in table.lines().map(str::trim) {
+            let field = line.split_once(": ").filter(|(name, _)| is_key(name));
+            let renamed = line.split_once(" as ").and_then(|(_, rest)| quoted(rest));
+            let key = renamed.or(field.map(|(name, _)| name));
+            keys.extend(key.map(str::to_owned));
+        }
     }
-    // Keys in lists.
     for list in ["const VERBS", "const COMPANIONS"] {
         let Some((_, after)) = code.split_once(list) else {
             continue;
         };
         let (list, _) = after.split_once("];").unwrap_or_default();
         let (_, list) = list.split_once('=').unwrap_or_default();
-        for line in list.split('(').flat_map(|part| part.split('[')) {
-            keys.extend(quoted(line).map(str::to_owned));
+        for word in list.split(['(', '[', ',']) {
+            keys.extend(quoted(word).map(str::to_owned));
         }
     }
     keys
@@ -41,18 +41,15 @@ fn keys(source: &str) -> BTreeSet<String> {
 
 fn known() -> BTreeSet<String> {
     let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/config");
-    let raw = std::fs::read_dir(config.join("raw")).unwrap();
-    let mut files: Vec<_> = raw.map(|entry| entry.unwrap().path()).collect();
-    let own = ["sim.rs", "gateway.rs", "track.rs"];
-    files.extend(
-        own.map(|name| config.join(name))
-            .into_iter()
-            .filter(|f| f.exists()),
-    );
-    let sources = files
-        .iter()
-        .map(|file| std::fs::read_to_string(file).unwrap());
-    sources.flat_map(|source| keys(&source)).collect()
+    let files = [
+        "raw/mod.rs",
+        "raw/axis.rs",
+        "raw/step.rs",
+        "gateway.rs",
+        "travel.rs",
+    ];
+    let sources = files.map(|file| std::fs::read_to_string(config.join(file)).unwrap());
+    sources.iter().flat_map(|source| keys(source)).collect()
 }
 
 fn document() -> String {

@@ -272,7 +272,7 @@ pub(super) fn check(
     let mut notes = Vec::new();
     for conflict in axis.exceeded(drive, speed_unit(selection)) {
         let object = (conflict.index, conflict.sub);
-        let own = sdos.iter().rev().find(|s| (s.index, s.sub) == object);
+        let own = sdos.iter().rev().find(|s| s.address() == object);
         match own {
             Some(own) if conflict.certain => {
                 let hint = "lower the limit of the axis, or let the drive allow more";
@@ -283,10 +283,9 @@ pub(super) fn check(
         }
     }
     for own in sdos.iter().filter(|sdo| OFFSETS.contains(&sdo.index)) {
-        let is_zero =
-            written(own.index, own.sub).is_none_or(|sdo| sdo.data.iter().all(|b| *b == 0));
+        let (index, sub) = own.address();
+        let is_zero = written(index, sub).is_none_or(|sdo| sdo.data.iter().all(|b| *b == 0));
         if !is_zero {
-            let (index, sub) = (own.index, own.sub);
             let object = NamedObject { index, sub };
             let message = format!("{object} adds to every target of the axis, past its limits");
             p.add_hint(own.value.span(), message, "write 0, or leave it out");

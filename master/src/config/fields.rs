@@ -1,118 +1,278 @@
-//! Reads typed values from TOML tables. An invalid value becomes a problem and a `None`. Reading
-//! continues, so that one check finds all problems.
+//! Typed tables of the machine file. [`table!`] declares a table once: its keys with their types,
+//! ranges and examples. An invalid value becomes a problem and a `None`. Reading continues, so that
+//! one check finds all problems.
+
+use std::fmt::Display;
+use std::ops::RangeInclusive;
 
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-use super::duration;
-use super::problem::{Problems, Span, list, nearest};
+use super::duration::{self, show};
+use super::problem::{Problems, Span, list, nearest, suggestion};
 
-type Value<'d> = &'d Spanned<DeValue<'d>>;
+pub(crate) type Value<'d> = &'d Spanned<DeValue<'d>>;
 
-/// One table while it is read. Keys that are never read are unknown.
-pub(crate) struct Fields<'d> {
-    table: &'d DeTable<'d>,
+/// The value of a key; `None` if it is absent or invalid.
+pub(crate) type Key<T> = Option<Spanned<T>>;
+
+/// A time in ns, written as a text such as `"250us"`. No key of the file is a plain `u64`.
+pub(crate) type Ns = u64;
+
+pub(crate) trait KeyExt<T> {
+    fn value(&self) -> Option<T>
+    where
+        T: Copy;
+    fn place(&self) -> Option<Span>;
+}
+
+impl<T> KeyExt<T> for Key<T> {
+    fn value(&self) -> Option<T>
+    where
+        T: Copy,
+    {
+        self.as_ref().map(|v| *v.get_ref())
+    }
+
+    fn place(&self) -> Option<Span> {
+        self.as_ref().map(Spanned::span)
+    }
+}
+
+/// A type of values. `key` is for messages.
+pub(crate) trait Read: Sized {
+    /// What messages call a list of these values.
+    const LIST: &'static str = "a list";
+
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self>;
+}
+
+/// The permitted values of a key: a range, or words with their meanings.
+pub(crate) trait Domain<T> {
+    fn read(&self, value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<T>;
+}
+
+/// A type of fields in [`table!`].
+pub(crate) trait Field: Sized {
+    type Value;
+
+    /// Returns `None` if the whole table is unusable without this value.
+    fn of(value: Option<Self::Value>) -> Option<Self>;
+}
+
+/// A key that may be absent.
+impl<T> Field for Option<T> {
+    type Value = T;
+
+    fn of(value: Option<T>) -> Option<Self> {
+        Some(value)
+    }
+}
+
+/// A key without which the table is unusable.
+impl<T> Field for Spanned<T> {
+    type Value = Self;
+
+    fn of(value: Option<Self>) -> Option<Self> {
+        value
+    }
+}
+
+/// A list that may be absent. Its invalid elements are skipped.
+impl<T> Field for Vec<T> {
+    type Value = Elements<T>;
+
+    fn of(value: Option<Elements<T>>) -> Option<Self> {
+        Some(value.map_or_else(Vec::new, |elements| elements.0))
+    }
+}
+
+pub(crate) struct Elements<T>(Vec<T>);
+
+impl<T: Read> Read for Elements<T> {
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        let elements = array(p, value, T::LIST)?.into_iter();
+        Some(Self(elements.filter_map(|v| T::read(v, key, p)).collect()))
+    }
+}
+
+/// A list of which every element is valid.
+impl<T: Read> Read for Vec<T> {
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        let elements = array(p, value, T::LIST)?.into_iter();
+        let read: Vec<Option<T>> = elements.map(|v| T::read(v, key, p)).collect();
+        read.into_iter().collect()
+    }
+}
+
+/// Declares a table: `key: type [domain] as "other key" = "example" ,`. A key with an example must
+/// be there. A `table` without its key is empty; a `row` is part of a list.
+macro_rules! table {
+    ($name:literal, $(#[$meta:meta])* table $table:ident $fields:tt) => {
+        table!($name, $(#[$meta])* #[derive(Default)] row $table $fields);
+
+        impl Field for $table {
+            type Value = Self;
+
+            fn of(value: Option<Self>) -> Option<Self> {
+                Some(value.unwrap_or_default())
+            }
+        }
+    };
+    ($name:literal, $(#[$meta:meta])* row $table:ident {
+        $($(#[$doc:meta])* $field:ident: $type:ty $([$domain:expr])? $(as $key:literal)? $(= $example:literal)?,)*
+    }) => {
+        $(#[$meta])*
+        #[derive(Debug)]
+        #[allow(dead_code, reason = "`span` and `written` are not of interest in every table")]
+        pub(crate) struct $table {
+            pub span: Span,
+            pub written: Written,
+            $($(#[$doc])* pub $field: $type,)*
+        }
+
+        impl $table {
+            const KEYS: &[TableKey] = &[
+                $((table!(@key $field $($key)?), table!(@example $($example)?))),*
+            ];
+        }
+
+        impl Read for $table {
+            const LIST: &str = match $name.as_bytes() {
+                [b'[', b'[', ..] => concat!($name, " with two brackets"),
+                _ => "a list of tables",
+            };
+
+            fn read(value: Value<'_>, _: &str, p: &mut Problems<'_>) -> Option<Self> {
+                let table = Table::of(value, $name, Self::KEYS, p)?;
+                let written = table.written(p);
+                $(
+                    let key = table!(@key $field $($key)?);
+                    let read = table
+                        .get(key)
+                        .and_then(|v| table!(@read $type, v, key, p $(, $domain)?));
+                    let $field = <$type as Field>::of(read);
+                )*
+                table.done(p);
+                Some(Self { span: value.span(), written, $($field: $field?,)* })
+            }
+        }
+    };
+    (@key $field:ident $key:literal) => { $key };
+    (@key $field:ident) => { stringify!($field) };
+    (@example $example:literal) => { Some($example) };
+    (@example) => { None };
+    (@read $type:ty, $value:ident, $key:ident, $p:ident, $domain:expr) => {
+        Domain::read(&$domain, $value, $key, $p).map(|v| Spanned::new($value.span(), v))
+    };
+    (@read $type:ty, $value:ident, $key:ident, $p:ident) => {
+        <<$type as Field>::Value as Read>::read($value, $key, $p)
+    };
+}
+
+/// The keys that a table has.
+#[derive(Debug, Default)]
+pub(crate) struct Written {
+    /// The known keys, each with its line.
+    pub keys: Vec<(&'static str, u32)>,
+    /// `true` if there are unknown keys as well.
+    pub unknown: bool,
+}
+
+impl Written {
+    /// Returns `true` if the key is present, valid or not.
+    pub fn has(&self, key: &str) -> bool {
+        self.keys.iter().any(|(known, _)| *known == key)
+    }
+}
+
+/// A key; if it must be there, with an example: a value, or whole lines.
+pub(crate) type TableKey = (&'static str, Option<&'static str>);
+
+/// One table while it is read.
+pub(crate) struct Table<'d> {
+    entries: &'d DeTable<'d>,
     span: Span,
     /// The table's name in messages: `[bus]`.
     name: &'static str,
-    asked: Vec<&'static str>,
-    missing: Vec<(&'static str, &'static str)>,
+    keys: &'d [TableKey],
 }
 
-impl<'d> Fields<'d> {
-    pub fn new(table: &'d DeTable<'d>, span: Span, name: &'static str) -> Self {
-        Self {
-            table,
-            span,
+impl<'d> Table<'d> {
+    pub fn of(
+        value: Value<'d>,
+        name: &'static str,
+        keys: &'d [TableKey],
+        p: &mut Problems<'_>,
+    ) -> Option<Self> {
+        let DeValue::Table(entries) = value.get_ref() else {
+            return wrong(p, value, "a table");
+        };
+        Some(Self {
+            entries,
+            span: value.span(),
             name,
-            asked: Vec::new(),
-            missing: Vec::new(),
-        }
+            keys,
+        })
     }
 
-    pub fn get(&mut self, key: &'static str) -> Option<Value<'d>> {
-        self.asked.push(key);
-        self.table
-            .iter()
-            .find(|(k, _)| k.get_ref().as_ref() == key)
-            .map(|(_, v)| v)
+    pub fn get(&self, key: &str) -> Option<Value<'d>> {
+        self.entries.get(key)
     }
 
-    /// Returns `true` if the key is present, valid or not.
-    pub fn has(&self, key: &str) -> bool {
-        self.table.contains_key(key)
+    pub fn read<T: Read>(&self, key: &str, p: &mut Problems<'_>) -> Option<T> {
+        T::read(self.get(key)?, key, p)
     }
 
-    /// Like [`Fields::get`], but reports a missing key. `example` shows a possible line.
-    pub fn need(&mut self, key: &'static str, example: &'static str) -> Option<Value<'d>> {
-        let value = self.get(key);
-        if value.is_none() {
-            self.missing.push((key, example));
-        }
-        value
-    }
-
-    /// Returns the known keys of the table, each with its line.
-    pub fn written(&self, problems: &Problems<'_>) -> Vec<(&'static str, u32)> {
-        let keys = self.table.keys().filter_map(|key| {
-            let known = self
-                .asked
-                .iter()
-                .find(|asked| **asked == key.get_ref().as_ref())?;
-            Some((*known, problems.line(&key.span())))
-        });
-        keys.collect()
-    }
-
-    pub fn asked(&self, key: &str) -> bool {
-        self.asked.contains(&key)
-    }
-
-    /// Returns `true` if the table has keys that have not been read.
-    pub fn unknown(&self) -> bool {
-        self.table
-            .keys()
-            .any(|k| !self.asked.contains(&k.get_ref().as_ref()))
+    pub fn written(&self, p: &Problems<'_>) -> Written {
+        let line = |(key, _): &TableKey| {
+            let (written, _) = self.entries.get_key_value(*key)?;
+            Some((*key, p.line(&written.span())))
+        };
+        let keys: Vec<_> = self.keys.iter().filter_map(line).collect();
+        let unknown = keys.len() < self.entries.len();
+        Written { keys, unknown }
     }
 
     /// Reports unknown keys, then missing ones. A missing key that an unknown one resembles is not
     /// reported.
-    pub fn done(self, problems: &mut Problems<'_>) {
+    pub fn done(self, p: &mut Problems<'_>) {
         let mut meant = Vec::new();
-        for key in self.table.keys() {
+        for key in self.entries.keys() {
             let word = key.get_ref().as_ref();
-            if self.asked.contains(&word) {
+            let all = self.keys.iter().map(|(key, _)| *key);
+            if all.clone().any(|known| known == word) {
                 continue;
             }
-            let free = self
-                .asked
-                .iter()
-                .copied()
-                .filter(|k| !self.table.contains_key(*k));
-            let all = self.asked.iter().copied();
-            let hint = match nearest(word, free).or_else(|| nearest(word, all)) {
+            let free = all.clone().filter(|k| !self.entries.contains_key(*k));
+            let hint = match nearest(word, free).or_else(|| nearest(word, all.clone())) {
                 Some(k) => {
                     meant.push(k);
                     format!("did you mean `{k}`?")
                 }
-                None => format!("known keys: {}", list(self.asked.iter().copied())),
+                None => format!("known keys: {}", list(all)),
             };
-            problems.add_hint(
-                key.span(),
-                format!("unknown key `{word}` in {}", self.name),
-                hint,
-            );
+            let message = format!("unknown key `{word}` in {}", self.name);
+            p.add_hint(key.span(), message, hint);
         }
-        for (key, example) in self.missing {
-            if !meant.contains(&key) {
+        for (key, example) in self.keys {
+            if let Some(example) = example
+                && !self.entries.contains_key(*key)
+                && !meant.contains(key)
+            {
                 let message = format!("`{key}` is missing in {}", self.name);
-                problems.add_hint(self.span.clone(), message, format!("add `{example}`"));
+                let hint = match example.contains('\n') {
+                    true => format!("add `{example}`"),
+                    false => format!("add `{key} = {example}`"),
+                };
+                p.add_hint(self.span.clone(), message, hint);
             }
         }
     }
 }
 
-fn wrong<T>(problems: &mut Problems<'_>, value: Value<'_>, wanted: &str) -> Option<T> {
+/// Reports a value of the wrong type.
+pub(crate) fn wrong<T>(p: &mut Problems<'_>, value: Value<'_>, wanted: &str) -> Option<T> {
     let found = match value.get_ref() {
         DeValue::String(_) => "a string",
         DeValue::Integer(_) => "an integer",
@@ -122,21 +282,59 @@ fn wrong<T>(problems: &mut Problems<'_>, value: Value<'_>, wanted: &str) -> Opti
         DeValue::Array(_) => "a list",
         DeValue::Table(_) => "a table",
     };
-    problems.add(value.span(), format!("expected {wanted}, found {found}"));
+    p.add(value.span(), format!("expected {wanted}, found {found}"));
     None
 }
 
-pub(crate) fn string(problems: &mut Problems<'_>, value: Value<'_>) -> Option<Spanned<String>> {
+fn wrong_range<T>(p: &mut Problems<'_>, value: Value<'_>, wanted: &str) -> Option<T> {
+    /// The maximum number of digits shown of a number.
+    const SHOWN: usize = 24;
+    let text = p.text(&value.span());
+    let text = match text.char_indices().nth(SHOWN) {
+        Some((at, _)) => format!("{}…", &text[..at]),
+        None => text.to_owned(),
+    };
+    p.add(value.span(), format!("expected {wanted}, found {text}"));
+    None
+}
+
+/// Returns the elements of a list.
+pub(crate) fn array<'d>(
+    p: &mut Problems<'_>,
+    value: Value<'d>,
+    wanted: &str,
+) -> Option<Vec<Value<'d>>> {
     match value.get_ref() {
-        DeValue::String(s) => Some(Spanned::new(value.span(), s.to_string())),
-        _ => wrong(problems, value, "a string"),
+        DeValue::Array(a) => Some(a.iter().collect()),
+        _ => wrong(p, value, wanted),
     }
 }
 
-pub(crate) fn boolean(problems: &mut Problems<'_>, value: Value<'_>) -> Option<Spanned<bool>> {
-    match value.get_ref() {
-        DeValue::Boolean(b) => Some(Spanned::new(value.span(), *b)),
-        _ => wrong(problems, value, "true or false"),
+impl<T: Read> Read for Spanned<T> {
+    const LIST: &'static str = T::LIST;
+
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        Some(Self::new(value.span(), T::read(value, key, p)?))
+    }
+}
+
+impl Read for String {
+    const LIST: &'static str = "a list of names";
+
+    fn read(value: Value<'_>, _: &str, p: &mut Problems<'_>) -> Option<Self> {
+        match value.get_ref() {
+            DeValue::String(s) => Some(s.to_string()),
+            _ => wrong(p, value, "a string"),
+        }
+    }
+}
+
+impl Read for bool {
+    fn read(value: Value<'_>, _: &str, p: &mut Problems<'_>) -> Option<Self> {
+        match value.get_ref() {
+            DeValue::Boolean(b) => Some(*b),
+            _ => wrong(p, value, "true or false"),
+        }
     }
 }
 
@@ -144,16 +342,31 @@ pub(crate) fn boolean(problems: &mut Problems<'_>, value: Value<'_>) -> Option<S
 /// decimals.
 const LARGEST: f64 = 1e15;
 
-/// Reads an integer or decimal number of at most ±[`LARGEST`].
-pub(crate) fn number(problems: &mut Problems<'_>, value: Value<'_>) -> Option<Spanned<f64>> {
-    let parsed = match value.get_ref() {
-        DeValue::Float(f) => f.as_str().parse::<f64>().ok(),
-        DeValue::Integer(i) => whole(i).map(|i| i as f64),
-        _ => return wrong(problems, value, "a number"),
-    };
-    match parsed {
-        Some(n) if n.abs() <= LARGEST => Some(Spanned::new(value.span(), n)),
-        _ => wrong_range(problems, value, "a number from -1e15 to 1e15"),
+/// An integer or decimal number of at most ±[`LARGEST`].
+impl Read for f64 {
+    fn read(value: Value<'_>, _: &str, p: &mut Problems<'_>) -> Option<Self> {
+        let parsed = match value.get_ref() {
+            DeValue::Float(f) => f.as_str().parse().ok(),
+            DeValue::Integer(i) => whole(i).map(|i| i as f64),
+            _ => return wrong(p, value, "a number"),
+        };
+        match parsed.filter(|n: &f64| n.abs() <= LARGEST) {
+            None => wrong_range(p, value, "a number from -1e15 to 1e15"),
+            number => number,
+        }
+    }
+}
+
+impl Read for [f64; 2] {
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        let ends = array(p, value, "a list of two positions")?;
+        let [low, high] = ends.as_slice() else {
+            let example = format!("write `{key} = [10.0, 10.5]`");
+            p.add_hint(value.span(), format!("`{key}` has two ends"), example);
+            return None;
+        };
+        let [low, high] = [low, high].map(|end| f64::read(end, key, p));
+        Some([low?, high?])
     }
 }
 
@@ -161,44 +374,52 @@ fn whole(i: &toml::de::DeInteger<'_>) -> Option<i64> {
     i64::from_str_radix(i.as_str(), i.radix()).ok()
 }
 
-fn wrong_range<T>(problems: &mut Problems<'_>, value: Value<'_>, wanted: &str) -> Option<T> {
-    /// The maximum number of digits shown of a number.
-    const SHOWN: usize = 24;
-    let text = problems.text(&value.span());
-    let cut = text.char_indices().nth(SHOWN).map(|(at, _)| at);
-    let text = match cut {
-        Some(at) => format!("{}…", &text[..at]),
-        None => text.to_owned(),
-    };
-    problems.add(value.span(), format!("expected {wanted}, found {text}"));
-    None
-}
-
-/// Reads an integer between `min` and `max`. Also accepts a string, because other tools print
-/// identities so.
-pub(crate) fn integer<T>(
-    problems: &mut Problems<'_>,
-    value: Value<'_>,
-    min: T,
-    max: T,
-) -> Option<Spanned<T>>
+/// Reads an integer in `range`. Also accepts a string, because other tools print identities so.
+fn integer<T>(value: Value<'_>, range: &RangeInclusive<T>, p: &mut Problems<'_>) -> Option<T>
 where
-    T: TryFrom<i64> + PartialOrd + std::fmt::Display + Copy,
+    T: TryFrom<i64> + PartialOrd + Display,
 {
     let parsed = match value.get_ref() {
         DeValue::Integer(i) => whole(i),
         DeValue::String(s) => unquoted(s),
-        _ => return wrong(problems, value, "a whole number"),
+        _ => return wrong(p, value, "a whole number"),
     };
-    match parsed.and_then(|n| T::try_from(n).ok()) {
-        Some(n) if n >= min && n <= max => Some(Spanned::new(value.span(), n)),
-        _ => wrong_range(
-            problems,
-            value,
-            &format!("a whole number from {min} to {max}"),
-        ),
+    let parsed = parsed.and_then(|n| T::try_from(n).ok());
+    match parsed.filter(|n| range.contains(n)) {
+        None => {
+            let wanted = format!("a whole number from {} to {}", range.start(), range.end());
+            wrong_range(p, value, &wanted)
+        }
+        number => number,
     }
 }
+
+macro_rules! integers {
+    ($($type:ty),*) => {$(
+        impl Read for $type {
+            fn read(value: Value<'_>, _: &str, p: &mut Problems<'_>) -> Option<Self> {
+                integer(value, &(Self::MIN..=Self::MAX), p)
+            }
+        }
+
+        /// A key without which the table is unusable.
+        impl Field for $type {
+            type Value = Spanned<Self>;
+
+            fn of(value: Option<Spanned<Self>>) -> Option<Self> {
+                value.map(Spanned::into_inner)
+            }
+        }
+
+        impl Domain<$type> for RangeInclusive<$type> {
+            fn read(&self, value: Value<'_>, _: &str, p: &mut Problems<'_>) -> Option<$type> {
+                integer(value, self, p)
+            }
+        }
+    )*};
+}
+
+integers!(u8, u16, u32, i8, i64);
 
 /// Parses `"0x6064"`, `"#x6064"` or `"24676"`.
 pub(crate) fn unquoted(text: &str) -> Option<i64> {
@@ -214,21 +435,19 @@ pub(crate) fn unquoted(text: &str) -> Option<i64> {
     text.parse().ok()
 }
 
-/// Reads a duration in ns.
-pub(crate) fn duration(problems: &mut Problems<'_>, value: Value<'_>) -> Option<Spanned<u64>> {
-    let text = match value.get_ref() {
-        DeValue::String(s) => s,
-        DeValue::Integer(_) | DeValue::Float(_) => {
-            let number = problems.text(&value.span());
-            let hint = format!("write \"{number}ms\" or \"{number}us\", with the quotes");
-            problems.add_hint(value.span(), "a duration needs a unit", hint);
-            return None;
-        }
-        _ => return wrong(problems, value, "a duration such as \"1ms\""),
-    };
-    match duration::parse(text) {
-        Ok(ns) => Some(Spanned::new(value.span(), ns)),
-        Err(e) => {
+impl Read for Ns {
+    fn read(value: Value<'_>, _: &str, p: &mut Problems<'_>) -> Option<Self> {
+        let text = match value.get_ref() {
+            DeValue::String(s) => s,
+            DeValue::Integer(_) | DeValue::Float(_) => {
+                let number = p.text(&value.span());
+                let hint = format!("write \"{number}ms\" or \"{number}us\", with the quotes");
+                p.add_hint(value.span(), "a duration needs a unit", hint);
+                return None;
+            }
+            _ => return wrong(p, value, "a duration such as \"1ms\""),
+        };
+        let parsed = duration::parse(text).map_err(|e| {
             let all = value.span();
             // Only within plain quotes the text's bytes equal the file's.
             let at = if all.len() == text.len() + 2 && !e.at.is_empty() {
@@ -236,31 +455,35 @@ pub(crate) fn duration(problems: &mut Problems<'_>, value: Value<'_>) -> Option<
             } else {
                 all
             };
-            problems.add_hint(at, e.message, e.hint);
-            None
+            p.add_hint(at, e.message, e.hint);
+        });
+        parsed.ok()
+    }
+}
+
+impl Domain<Ns> for RangeInclusive<Ns> {
+    fn read(&self, value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Ns> {
+        let ns = Ns::read(value, key, p)?;
+        if self.contains(&ns) {
+            return Some(ns);
         }
+        let [ns, low, high] = [ns, *self.start(), *self.end()].map(show);
+        let message = format!("`{key}` of {ns} is not possible; it must be from {low} to {high}");
+        p.add(value.span(), message);
+        None
     }
 }
 
-pub(crate) fn table<'d>(
-    problems: &mut Problems<'_>,
-    value: Value<'d>,
-    name: &'static str,
-) -> Option<Fields<'d>> {
-    match value.get_ref() {
-        DeValue::Table(t) => Some(Fields::new(t, value.span(), name)),
-        _ => wrong(problems, value, "a table"),
-    }
-}
-
-/// Returns the elements of a list.
-pub(crate) fn array<'d>(
-    problems: &mut Problems<'_>,
-    value: Value<'d>,
-    wanted: &str,
-) -> Option<Vec<Value<'d>>> {
-    match value.get_ref() {
-        DeValue::Array(a) => Some(a.iter().collect()),
-        _ => wrong(problems, value, wanted),
+/// Words with their meanings.
+impl<T: Copy, const N: usize> Domain<T> for [(&'static str, T); N] {
+    fn read(&self, value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<T> {
+        let word = String::read(value, key, p)?;
+        let known = self.iter().find(|(name, _)| *name == word);
+        if known.is_none() {
+            let message = format!("`{key}` cannot be \"{word}\"");
+            let names = self.iter().map(|(name, _)| *name);
+            p.add_hint(value.span(), message, suggestion(&word, names, "there are"));
+        }
+        known.map(|(_, meaning)| *meaning)
     }
 }

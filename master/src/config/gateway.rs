@@ -3,167 +3,141 @@
 use ecaxis_esi as esi;
 use ecaxis_sim::gateway::{BIT_RATES, Epos, GatewayOptions, NodeOptions, PdoLink, Supervision};
 use toml::Spanned;
-use toml::de::DeValue;
 
-use super::fields::{self, Fields};
+use super::fields::{Domain, Field, Ns, Read, Table, TableKey, Value, Written};
 use super::problem::{Problems, Span, list, suggestion};
-use super::raw;
+use super::raw::{RawEntry, RawSim};
 
-type Value<'d> = &'d Spanned<DeValue<'d>>;
+const MS: Ns = 1_000_000;
 
-const MS: u64 = 1_000_000;
-
-/// The gateway as written. Each node has its place in the file.
-#[derive(Debug)]
-pub(crate) struct RawGateway {
-    span: Span,
-    options: GatewayOptions,
-    nodes: Vec<(NodeOptions, Span)>,
-    /// `true` if a mistake has been reported.
-    wrong: bool,
+table! { "[[device.sim.node]]",
+    row RawNode {
+        id: u8 [1..=127] = "1",
+        drive: Spanned<Epos> = "\"EPOS 24/5\"",
+        heartbeat: Option<Heartbeat>,
+        mandatory: Option<bool>,
+        inputs: Vec<RawLink>,
+        outputs: Vec<RawLink>,
+    }
 }
 
-/// Returns `None` if the table has no gateway keys.
-pub(crate) fn read(f: &mut Fields<'_>, span: Span, p: &mut Problems<'_>) -> Option<RawGateway> {
-    let mentioned = ["bit_rate", "sync", "node"]
-        .into_iter()
-        .any(|key| f.get(key).is_some());
-    let before = p.count();
-    let mut options = GatewayOptions::default();
-    if let Some(rate) = f
-        .get("bit_rate")
-        .and_then(|v| fields::integer(p, v, 1, u32::MAX))
-    {
-        if !BIT_RATES.contains(rate.get_ref()) {
-            let rates = BIT_RATES.iter().map(ToString::to_string);
-            let hint = format!("bits a second: {}", rates.collect::<Vec<_>>().join(", "));
-            p.add_hint(rate.span(), "no such bit rate", hint);
-        }
-        options.bit_rate = rate.into_inner();
-    }
-    if let Some(ns) = f.get("sync").and_then(|v| fields::duration(p, v)) {
-        options.sync_period_us = u32::try_from(ns.into_inner() / 1000).unwrap_or(u32::MAX);
-    }
-    let nodes = f.get("node");
-    let nodes = nodes.and_then(|v| fields::array(p, v, "[[device.sim.node]] with two brackets"));
-    let mut read = Vec::new();
-    for value in nodes.unwrap_or_default() {
-        let table = fields::table(p, value, "[[device.sim.node]]");
-        let node = table.and_then(|f| node(f, p));
-        read.extend(node.map(|node| (node, value.span())));
-    }
-    mentioned.then(|| RawGateway {
-        span,
-        options,
-        nodes: read,
-        wrong: p.count() > before,
-    })
-}
-
-fn node(mut f: Fields<'_>, p: &mut Problems<'_>) -> Option<NodeOptions> {
-    let id = f.need("id", "id = 1");
-    let id = id.and_then(|v| fields::integer(p, v, 1u8, 127));
-    let drive = f.need("drive", "drive = \"EPOS 24/5\"");
-    let drive = drive.and_then(|v| {
-        let name = fields::string(p, v)?;
-        let found = Epos::from_name(name.get_ref());
+impl Read for Epos {
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        let name = String::read(value, key, p)?;
+        let found = Self::from_name(&name);
         if found.is_none() {
-            let names = || Epos::ALL.iter().map(|drive| drive.name());
-            let hint = suggestion(name.get_ref(), names(), "drives");
-            p.add_hint(
-                name.span(),
-                format!("unknown drive `{}`", name.get_ref()),
-                hint,
-            );
+            let names = Self::ALL.iter().map(|drive| drive.name());
+            let hint = suggestion(&name, names, "drives");
+            p.add_hint(value.span(), format!("unknown drive `{name}`"), hint);
         }
         found
-    });
-    let heartbeat = f.get("heartbeat").and_then(|v| milliseconds(p, v));
-    let mandatory = f.get("mandatory").and_then(|v| fields::boolean(p, v));
-    let inputs = links(&mut f, "inputs", p);
-    let outputs = links(&mut f, "outputs", p);
-    f.done(p);
-    let mut node = NodeOptions::new(id?.into_inner(), drive?);
-    if let Some(period_ms) = heartbeat {
+    }
+}
+
+/// A period in ms.
+#[derive(Debug)]
+pub(crate) struct Heartbeat(u16);
+
+impl Read for Heartbeat {
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        let ms = u16::try_from(Ns::read(value, key, p)? / MS).ok();
+        let ms = ms.filter(|ms| *ms >= 10);
+        if ms.is_none() {
+            p.add(value.span(), "a heartbeat takes 10 ms to 65 s");
+        }
+        ms.map(Self)
+    }
+}
+
+table! { "a PDO of a node",
+    row RawLink {
+        pdo: u8 [1..=3] = "1",
+        at: u16 [2..=511] = "2",
+        objects: Vec<MappableObject>,
+        synchronous: Option<bool>,
+    }
+}
+
+/// Index, subindex and bits of an object.
+#[derive(Debug)]
+pub(crate) struct MappableObject(u16, u8, u8);
+
+impl Read for MappableObject {
+    const LIST: &'static str = RawEntry::LIST;
+
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        let RawEntry { index, sub, .. } = RawEntry::read(value, key, p)?;
+        let bits = Epos::mappable_bits(index, sub);
+        if bits.is_none() {
+            let message = format!("{} cannot be mapped", esi::address(index, sub));
+            p.add(value.span(), message);
+        }
+        bits.map(|bits| Self(index, sub, bits))
+    }
+}
+
+fn node(raw: &RawNode) -> NodeOptions {
+    let mut node = NodeOptions::new(raw.id, *raw.drive.get_ref());
+    if let Some(Heartbeat(period_ms)) = raw.heartbeat {
         node.supervision = Supervision::Heartbeat { period_ms };
     }
-    node.mandatory = mandatory.is_some_and(Spanned::into_inner);
-    (node.inputs, node.outputs) = (inputs, outputs);
-    Some(node)
+    node.mandatory = raw.mandatory.unwrap_or(false);
+    let links = |links: &[RawLink]| links.iter().map(link).collect();
+    (node.inputs, node.outputs) = (links(&raw.inputs), links(&raw.outputs));
+    node
 }
 
-fn milliseconds(p: &mut Problems<'_>, value: Value<'_>) -> Option<u16> {
-    let ns = fields::duration(p, value)?;
-    let ms = u16::try_from(ns.get_ref() / MS).ok().filter(|ms| *ms >= 10);
-    if ms.is_none() {
-        p.add(ns.span(), "a heartbeat takes 10 ms to 65 s");
+fn link(raw: &RawLink) -> PdoLink {
+    let contents = raw.objects.iter();
+    PdoLink {
+        pdo: raw.pdo,
+        at: raw.at,
+        contents: contents
+            .map(|&MappableObject(index, sub, bits)| (index, sub, bits))
+            .collect(),
+        synchronous: raw.synchronous.unwrap_or(true),
     }
-    ms
 }
 
-fn links(f: &mut Fields<'_>, key: &'static str, p: &mut Problems<'_>) -> Vec<PdoLink> {
-    let values = f.get(key);
-    let values = values.and_then(|v| fields::array(p, v, "a list of PDOs"));
-    let mut links = Vec::new();
-    for value in values.unwrap_or_default() {
-        if let Some(f) = fields::table(p, value, "a PDO of a node") {
-            links.extend(link(f, p));
-        }
-    }
-    links
-}
-
-fn link(mut f: Fields<'_>, p: &mut Problems<'_>) -> Option<PdoLink> {
-    let pdo = f.need("pdo", "pdo = 1");
-    let pdo = pdo.and_then(|v| fields::integer(p, v, 1u8, 3));
-    let at = f.need("at", "at = 2");
-    let at = at.and_then(|v| fields::integer(p, v, 2u16, 511));
-    let mut contents = Vec::new();
-    if let Some(objects) = f.get("objects").and_then(|v| raw::read_entries(v, p)) {
-        for entry in objects.into_inner() {
-            match Epos::mappable_bits(entry.index, entry.sub) {
-                Some(bits) => contents.push((entry.index, entry.sub, bits)),
-                None => p.add(
-                    entry.span,
-                    format!("{} cannot be mapped", esi::address(entry.index, entry.sub)),
-                ),
-            }
-        }
-    }
-    let synchronous = f.get("synchronous").and_then(|v| fields::boolean(p, v));
-    f.done(p);
-    Some(PdoLink {
-        pdo: pdo?.into_inner(),
-        at: at?.into_inner(),
-        contents,
-        synchronous: synchronous.is_none_or(Spanned::into_inner),
-    })
-}
-
-/// Checks the gateway against its device, if known, and returns its options.
+/// Checks the gateway against its device and returns its options; `None` without gateway keys.
 pub(crate) fn setup(
-    raw: RawGateway,
+    raw: &RawSim,
     device: Option<&esi::Device>,
     p: &mut Problems<'_>,
 ) -> Option<GatewayOptions> {
-    let mut options = raw.options;
-    let mut wrong = raw.wrong;
-    let device = device?;
-    for (node, span) in raw.nodes {
-        options.nodes.push(node);
-        // Validated after each node, so that the error marks the right one.
-        if !wrong && let Err(error) = options.validate(device) {
-            p.add(span, error.to_string());
-            wrong = true;
+    let keys = ["bit_rate", "sync", "node"];
+    if !keys.iter().any(|key| raw.written.has(key)) {
+        return None;
+    }
+    let mut options = GatewayOptions::default();
+    if let Some(rate) = &raw.bit_rate {
+        if BIT_RATES.contains(rate.get_ref()) {
+            options.bit_rate = *rate.get_ref();
+        } else {
+            let rates = BIT_RATES.map(|rate| rate.to_string()).join(", ");
+            let hint = format!("bits a second: {rates}");
+            p.add_hint(rate.span(), "no such bit rate", hint);
         }
     }
+    if let Some(ns) = &raw.sync {
+        options.sync_period_us = u32::try_from(ns.get_ref() / 1000).unwrap_or(u32::MAX);
+    }
+    let device = device?;
     if !ecaxis_sim::gateway::is_gateway(device) {
         let message = format!("`{}` is not a CANopen gateway", device.type_name);
         let hint = format!("a gateway carries bytes of {}", list(["0x2100", "0x2000"]));
-        p.add_hint(raw.span, message, hint);
+        p.add_hint(raw.span.clone(), message, hint);
         return None;
     }
-    (!wrong).then_some(options)
+    for raw in &raw.node {
+        options.nodes.push(node(raw));
+        // Validated after each node, so that the error marks the right one.
+        if let Err(error) = options.validate(device) {
+            p.add(raw.span.clone(), error.to_string());
+            return None;
+        }
+    }
+    Some(options)
 }
 
 #[cfg(test)]

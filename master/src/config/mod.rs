@@ -33,6 +33,7 @@ mod documented;
 pub(crate) mod drive_limits;
 mod drive_units;
 pub mod duration;
+#[macro_use]
 mod fields;
 mod gateway;
 mod problem;
@@ -60,6 +61,9 @@ pub use crate::rt::exchange::ExchangeMode as Exchange;
 
 use ecaxis_axis::StopMethod;
 use ecaxis_esi as esi;
+
+use fields::Read;
+use raw::RawMachine;
 
 use crate::esi_library::RevisionMatch;
 use crate::file;
@@ -596,10 +600,11 @@ pub fn parse(path: &Path, text: &str) -> Result<Machine, ConfigError> {
         return Err(problems.into_error());
     }
     let (document, mut errors) = toml::de::DeTable::parse_recoverable(text);
+    let root = toml::Spanned::new(0..0, toml::de::DeValue::Table(document.into_inner()));
     // Checks after a syntax error would only report consequences of it.
     if !errors.is_empty() {
         // A malformed table would make its subtables look incomplete.
-        raw::names(&document, &mut problems);
+        RawMachine::check_keys(&root, &mut problems);
         if !problems.is_empty() {
             errors.retain(|error| !error.message().starts_with("duplicate key"));
         }
@@ -614,8 +619,8 @@ pub fn parse(path: &Path, text: &str) -> Result<Machine, ConfigError> {
         }
         return Err(problems.into_error());
     }
-    let raw = raw::read(&document, &mut problems);
-    match check::machine(path, raw, &mut problems) {
+    let raw = RawMachine::read(&root, "", &mut problems);
+    match raw.and_then(|raw| check::machine(path, raw, &mut problems)) {
         Some(machine) if problems.is_empty() => Ok(machine),
         _ => Err(problems.into_error()),
     }

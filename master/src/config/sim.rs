@@ -4,13 +4,12 @@ use ecaxis_esi as esi;
 use ecaxis_sim::gateway::GatewayOptions;
 use ecaxis_sim::network::topology::Media;
 use ecaxis_sim::{Medium, PortRequest, Topology, TopologyError};
-use toml::Spanned;
 
-use super::fields::{self, Fields};
-use super::gateway::{self, RawGateway};
+use super::fields::KeyExt;
+use super::gateway;
 use super::problem::{Problems, Span, suggestion};
-use super::raw::RawDevice;
-use super::travel::{self, RawTrack, TrackSetup};
+use super::raw::{RawDevice, RawSim};
+use super::travel::{self, TrackSetup};
 use super::{AxisSetup, DeviceConfig, Locator};
 
 /// Settings of a simulated device that its ESI file does not describe.
@@ -34,39 +33,8 @@ pub struct SimSetup {
     pub track: TrackSetup,
 }
 
-/// `[device.sim]` as written.
-#[derive(Debug)]
-pub(crate) struct RawSim {
-    after: Option<Spanned<String>>,
-    port: Option<Spanned<u8>>,
-    cable: Option<Spanned<u64>>,
-    drift_ppm: Option<Spanned<f64>>,
-    offset: Option<Spanned<u64>>,
-    jitter: Option<Spanned<u64>>,
-    gateway: Option<RawGateway>,
-    track: Option<RawTrack>,
-}
-
 /// The maximum drift. Crystals are far better.
 const MOST_DRIFT_PPM: f64 = 1000.0;
-/// The maximum cable delay (200 km of cable) and clock jitter.
-const LONGEST_NS: u64 = 1_000_000;
-
-pub(crate) fn read(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawSim {
-    let raw = RawSim {
-        after: f.get("after").and_then(|v| fields::string(p, v)),
-        port: f.get("port").and_then(|v| fields::integer(p, v, 1, 3)),
-        cable: f.get("cable").and_then(|v| fields::duration(p, v)),
-        drift_ppm: f.get("drift_ppm").and_then(|v| fields::number(p, v)),
-        offset: f.get("offset").and_then(|v| fields::duration(p, v)),
-        jitter: f.get("jitter").and_then(|v| fields::duration(p, v)),
-        gateway: gateway::read(&mut f, span, p),
-        track: f.get("track").and_then(|v| travel::read(v, p)),
-    };
-    f.done(p);
-    raw
-}
-
 /// Checks the settings. `names` are those of all devices; for `axis` see [`travel::check`].
 pub(crate) fn check(
     raw: RawSim,
@@ -85,18 +53,8 @@ pub(crate) fn check(
     }
     if let (Some(port), None) = (&raw.port, &raw.after) {
         let message = "it is not said which device's port this is";
-        p.add_hint(
-            port.span(),
-            message,
-            "add `after`, the name of the device it is connected to",
-        );
-    }
-    for (value, what) in [(&raw.cable, "a cable"), (&raw.jitter, "a jitter")] {
-        if let Some(value) = value
-            && *value.get_ref() > LONGEST_NS
-        {
-            p.add(value.span(), format!("{what} of more than 1 ms is none"));
-        }
+        let hint = "add `after`, the name of the device it is connected to";
+        p.add_hint(port.span(), message, hint);
     }
     if let Some(drift) = &raw.drift_ppm
         && drift.get_ref().abs() > MOST_DRIFT_PPM
@@ -106,17 +64,18 @@ pub(crate) fn check(
             "a clock that is off by more than 1000 ppm is broken",
         );
     }
-    let ns = |value: &Option<Spanned<u64>>| value.as_ref().map(|v| *v.get_ref());
     SimSetup {
         after: raw.after.as_ref().map(|a| a.get_ref().clone()),
-        port: raw.port.as_ref().map(|p| *p.get_ref()),
-        cable_ns: ns(&raw.cable),
-        drift_ppm: raw.drift_ppm.as_ref().map(|d| *d.get_ref()),
-        offset_ns: ns(&raw.offset).unwrap_or(0),
-        jitter_ns: ns(&raw.jitter)
+        port: raw.port.value(),
+        cable_ns: raw.cable.value(),
+        drift_ppm: raw.drift_ppm.value(),
+        offset_ns: raw.offset.value().unwrap_or(0),
+        jitter_ns: raw
+            .jitter
+            .value()
             .and_then(|ns| u32::try_from(ns).ok())
             .unwrap_or(0),
-        gateway: raw.gateway.and_then(|raw| gateway::setup(raw, device, p)),
+        gateway: gateway::setup(&raw, device, p),
         track: raw
             .track
             .and_then(|raw| travel::check(&raw, axis, p))
@@ -281,8 +240,7 @@ impl Places {
     pub(crate) fn of(devices: &[RawDevice]) -> Self {
         let place = |device: &RawDevice| {
             let sim = device.sim.as_ref()?;
-            let port = sim.port.as_ref().map(Spanned::span);
-            let span = port.or(sim.after.as_ref().map(Spanned::span))?;
+            let span = sim.port.place().or(sim.after.place())?;
             Some((device.name.as_ref()?.get_ref().clone(), span))
         };
         Self(devices.iter().filter_map(place).collect())
@@ -382,8 +340,8 @@ mod tests {
             // Frames pass a coupler's terminals before the devices at its second socket.
             (&[("x", "B", 1, ""), ("t", "T", 2, "after = \"c\"")], "frames pass port 1 of \"c\" before they reach \"x\", so \"t\" comes before it", "port 3 first"),
             (&[("x", "B", 1, "drift_ppm = 2000")], "more than 1000 ppm", ""),
-            (&[("x", "B", 1, "jitter = \"2ms\"")], "a jitter of more than 1 ms", ""),
-            (&[("x", "B", 1, "cable = \"2ms\"")], "a cable of more than 1 ms", ""),
+            (&[("x", "B", 1, "jitter = \"2ms\"")], "`jitter` of 2 ms is not possible", ""),
+            (&[("x", "B", 1, "cable = \"2ms\"")], "`cable` of 2 ms is not possible", ""),
             (&[("x", "B", 1, "drift = 1.0")], "unknown key `drift` in [device.sim]", "`drift_ppm`"),
         ] {
             let mut bus = vec![c];

@@ -1,6 +1,6 @@
 //! Options for start-up SDOs besides writing them.
 
-use super::raw::{RawDevice, RawStartup};
+use super::raw::RawDevice;
 
 /// The options of a device's start-up SDOs.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -22,18 +22,20 @@ pub struct StartupOptions {
 impl Startup {
     /// Returns the options of a device. An SDO's own options override the device's.
     pub(crate) fn of(raw: &RawDevice) -> Self {
-        let way = |own: RawStartup| StartupOptions {
-            verify: own.verify.or(raw.startup.verify).unwrap_or(false),
-            skip_equal: own.skip_equal.or(raw.startup.skip_equal).unwrap_or(false),
+        let all = StartupOptions {
+            verify: raw.startup.verify.unwrap_or(false),
+            skip_equal: raw.startup.skip_equal.unwrap_or(false),
         };
-        let own = raw
-            .sdo
-            .iter()
-            .map(|sdo| (sdo.index, sdo.sub, way(sdo.startup)));
-        Self {
-            all: way(RawStartup::default()),
-            own: own.collect(),
-        }
+        let own = raw.sdo.iter().map(|sdo| {
+            let (index, sub) = sdo.address();
+            let options = StartupOptions {
+                verify: sdo.verify.unwrap_or(all.verify),
+                skip_equal: sdo.skip_equal.unwrap_or(all.skip_equal),
+            };
+            (index, sub, options)
+        });
+        let own = own.collect();
+        Self { all, own }
     }
 
     /// Returns the options of an object. Store and restore parameters (0x1010, 0x1011) read back

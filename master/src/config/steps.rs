@@ -13,12 +13,11 @@ mod probe;
 mod stop;
 mod target;
 
-use super::axis::control::one_of;
+use super::fields::{Key, KeyExt};
 use super::problem::{Problems, Span, suggestion};
-use super::raw::{RawAction, RawCondition, RawSignal, RawStep, RawStop};
+use super::raw::{RawAction, RawAxes, RawCondition, RawSignal, RawStep, RawStop};
 use super::{
-    Action, AxisSetup, Condition, DeviceConfig, Signal, Step, StopSetup, TableFile, duration,
-    signal,
+    Action, AxisSetup, Condition, DeviceConfig, Signal, Step, StopSetup, TableFile, signal,
 };
 use ecaxis_axis::Mode;
 pub(crate) use preconditions::enables;
@@ -26,13 +25,9 @@ use target::{TargetKind, fraction};
 
 /// The default fraction of the limits for the move to the beginning of a table.
 const GENTLE: f64 = 0.1;
-/// The default smoothing of a gear that follows actual positions, in ns.
-const SMOOTHING_NS: u64 = 10_000_000;
 const WHOLE_TORQUE_RAMP_NS: u64 = 100_000_000;
 /// The default timeout for an input in ns.
 const WAIT_NS: u64 = 10_000_000_000;
-/// The maximum timeout in ns: half an hour more than a week.
-const LONGEST_WAIT_NS: u64 = 606_600_000_000_000;
 /// The maximum number of steps in a program, including those inside repetitions.
 const MOST_STEPS: usize = 10_000;
 
@@ -122,7 +117,8 @@ struct ProgramChecker<'c> {
 impl ProgramChecker<'_> {
     fn all(&mut self, steps: Vec<RawStep>, prefix: &str, p: &mut Problems<'_>) -> Vec<Step> {
         let mut checked = Vec::with_capacity(steps.len());
-        for (index, RawStep { span, action }) in steps.into_iter().enumerate() {
+        for (index, step) in steps.into_iter().enumerate() {
+            let span = step.span.clone();
             self.count += 1;
             if self.count == MOST_STEPS + 1 {
                 p.add(span, format!("a program has {MOST_STEPS} steps at most"));
@@ -133,7 +129,7 @@ impl ProgramChecker<'_> {
             self.number.clone_from(&number);
             let place = (number.clone(), None);
             self.places.borrow_mut().insert(place, span.clone());
-            if let Some(action) = self.one(action, &number, span, p) {
+            if let Some(action) = self.one(step, &number, p) {
                 checked.push(Step {
                     number,
                     line,
@@ -144,13 +140,13 @@ impl ProgramChecker<'_> {
         checked
     }
 
-    fn one(
-        &mut self,
-        action: RawAction,
-        number: &str,
-        at: Span,
-        p: &mut Problems<'_>,
-    ) -> Option<Action> {
+    fn one(&mut self, raw: RawStep, number: &str, p: &mut Problems<'_>) -> Option<Action> {
+        let RawStep {
+            span,
+            action,
+            speed,
+            ramp,
+        } = raw;
         Some(match action {
             RawAction::Enable(axes) => Action::Enable {
                 axes: self.axes(axes, p)?,
@@ -161,27 +157,18 @@ impl ProgramChecker<'_> {
             RawAction::Reset(axes) => Action::Reset {
                 axes: self.axes(axes, p)?,
             },
-            RawAction::Home(axes) => self.home(axes, &at, p)?,
+            RawAction::Home(axes) => self.home(axes, &span, p)?,
             RawAction::Stop(axes) => Action::Stop {
                 axes: self.axes(axes, p)?,
             },
             RawAction::Move {
                 relative,
                 targets,
-                speed,
-                ramp,
-                arrive,
+                together,
             } => {
-                let ways = [("each", false), ("together", true)];
-                let together = one_of(arrive.as_ref(), &ways, "arrive", p);
-                let at = ramp.as_ref().map(Spanned::span);
-                let (speed, ramp) = (fraction(speed, "speed", p), fraction(ramp, "ramp", p));
-                let what = if relative {
-                    TargetKind::Way
-                } else {
-                    TargetKind::Position
-                };
-                let targets = self.targets(targets, what, p)?;
+                let at = ramp.place();
+                let (speed, ramp) = (fraction(&speed, "speed", p), fraction(&ramp, "ramp", p));
+                let targets = self.targets(targets, TargetKind::of_move(relative), p)?;
                 let (speed, ramp) = (speed?, ramp?);
                 self.check_ramp_time(&targets, ramp, at, p, |_, limit| limit * speed);
                 Action::Move {
@@ -189,97 +176,35 @@ impl ProgramChecker<'_> {
                     targets,
                     speed,
                     ramp,
-                    together: together?,
+                    together,
                 }
             }
-            RawAction::Probe(probe) => self.probe(&probe, p)?,
-            RawAction::Line {
-                relative,
-                targets,
-                speed,
-                ramp,
-            } => {
-                let (speed, ramp) = (fraction(speed, "speed", p), fraction(ramp, "ramp", p));
-                let what = if relative {
-                    TargetKind::Way
-                } else {
-                    TargetKind::Position
-                };
+            RawAction::Probe(axis, probe) => {
+                let pace = (fraction(&speed, "speed", p), fraction(&ramp, "ramp", p));
+                self.probe(&axis, &probe, pace, p)?
+            }
+            RawAction::Line { relative, targets } => {
+                let (speed, ramp) = (fraction(&speed, "speed", p), fraction(&ramp, "ramp", p));
                 Action::Line {
                     relative,
-                    targets: self.targets(targets, what, p)?,
+                    targets: self.targets(targets, TargetKind::of_move(relative), p)?,
                     speed: speed?,
                     ramp: ramp?,
                 }
             }
-            RawAction::Wave {
-                square,
-                axis,
-                amplitude,
-                frequency,
-                periods,
-            } => self.wave(
-                square,
-                &axis,
-                &amplitude?,
-                &frequency?,
-                *periods?.get_ref(),
-                p,
-            )?,
-            RawAction::Table {
-                axis,
-                file,
-                speed,
-                ramp,
-            } => {
-                let speed = speed.map_or(Some(GENTLE), |s| fraction(Some(s), "speed", p));
-                let ramp = ramp.map_or(Some(GENTLE), |r| fraction(Some(r), "ramp", p));
+            RawAction::Wave { square, axis, wave } => self.wave(square, &axis, &wave, p)?,
+            RawAction::Table { axis, file } => {
+                let gentle = |value: &Key<f64>, what, p: &mut Problems<'_>| match value {
+                    Some(_) => fraction(value, what, p),
+                    None => Some(GENTLE),
+                };
+                let (speed, ramp) = (gentle(&speed, "speed", p), gentle(&ramp, "ramp", p));
                 self.table(&axis, &file, [speed?, ramp?], p)?
             }
-            RawAction::Gear {
-                axis: name,
-                to,
-                ratio,
-                actual,
-                offset,
-                smoothing,
-            } => {
-                let axis = self.positioned(&name, "gear", p)?.0;
-                let to = to?;
-                let master = self.axis(&to, p)?.0;
-                if axis == master {
-                    p.add(
-                        to.span(),
-                        format!("`{}` cannot follow itself", name.get_ref()),
-                    );
-                    return None;
-                }
-                let ratio = match &ratio {
-                    Some(ratio) if *ratio.get_ref() == 0.0 => {
-                        p.add(ratio.span(), "with a `ratio` of 0 nothing is followed");
-                        return None;
-                    }
-                    Some(ratio) => *ratio.get_ref(),
-                    None => 1.0,
-                };
-                let actual = actual.is_some_and(Spanned::into_inner);
-                Action::Gear {
-                    axis,
-                    master,
-                    actual,
-                    ratio,
-                    offset: offset.map(Spanned::into_inner),
-                    smoothing_ns: match smoothing {
-                        Some(smoothing) => smoothing.into_inner(),
-                        // Actual positions are whole counts, so they need smoothing.
-                        None if actual => SMOOTHING_NS,
-                        None => 0,
-                    },
-                }
-            }
-            RawAction::Velocity { targets, ramp } => {
-                let at = ramp.as_ref().map(Spanned::span);
-                let ramp = fraction(ramp, "ramp", p);
+            RawAction::Gear(axis, gear) => self.gear(&axis, &gear, p)?,
+            RawAction::Velocity(targets) => {
+                let at = ramp.place();
+                let ramp = fraction(&ramp, "ramp", p);
                 let targets = self.targets(targets, TargetKind::Velocity, p)?;
                 self.check_ramp_time(&targets, ramp?, at, p, |target, _| target.abs());
                 Action::Velocity {
@@ -289,7 +214,7 @@ impl ProgramChecker<'_> {
             }
             RawAction::Torque { targets, ramp } => Action::Torque {
                 targets: self.targets(targets, TargetKind::Torque, p)?,
-                ramp_ns: ramp.map_or(WHOLE_TORQUE_RAMP_NS, Spanned::into_inner),
+                ramp_ns: ramp.unwrap_or(WHOLE_TORQUE_RAMP_NS),
             },
             RawAction::Mode(named) => {
                 let count = named.len();
@@ -300,9 +225,7 @@ impl ProgramChecker<'_> {
                 targets.sort_by_key(|(index, _)| *index);
                 (count > 0 && targets.len() == count).then_some(Action::Mode { targets })?
             }
-            RawAction::Dwell(ns) => Action::Dwell {
-                ns: ns.into_inner(),
-            },
+            RawAction::Dwell(ns) => Action::Dwell { ns },
             RawAction::Wait {
                 conditions,
                 timeout,
@@ -312,10 +235,9 @@ impl ProgramChecker<'_> {
                     .into_iter()
                     .filter_map(|condition| self.condition(&condition, p))
                     .collect();
-                let timeout_ns = timeout.map_or(Some(WAIT_NS), |timeout| wait(&timeout, p))?;
                 (count > 0 && conditions.len() == count).then_some(Action::Wait {
                     conditions,
-                    timeout_ns,
+                    timeout_ns: timeout.unwrap_or(WAIT_NS),
                 })?
             }
             RawAction::Set(values) => {
@@ -327,7 +249,7 @@ impl ProgramChecker<'_> {
                 (count > 0 && values.len() == count).then_some(Action::Set { values })?
             }
             RawAction::Repeat { times, steps } => Action::Repeat {
-                times: times.into_inner(),
+                times,
                 steps: self.all(steps, &format!("{number}."), p),
             },
         })
@@ -341,11 +263,7 @@ impl ProgramChecker<'_> {
     }
 
     /// Returns the named axes of the machine; `None`: all.
-    fn axes(
-        &self,
-        names: Option<Vec<Spanned<String>>>,
-        p: &mut Problems<'_>,
-    ) -> Option<Vec<usize>> {
+    fn axes(&self, names: RawAxes, p: &mut Problems<'_>) -> Option<Vec<usize>> {
         let Some(names) = names else {
             let axes = self.devices.iter().enumerate();
             return Some(
@@ -438,18 +356,5 @@ fn possible(signal: &Signal, value: &Spanned<f64>, p: &mut Problems<'_>) -> Opti
         "it is a floating-point number of 32 bits".to_owned()
     };
     p.add_hint(value.span(), message, hint);
-    None
-}
-
-fn wait(timeout: &Spanned<u64>, p: &mut Problems<'_>) -> Option<u64> {
-    let ns = *timeout.get_ref();
-    if (1_000_000..=LONGEST_WAIT_NS).contains(&ns) {
-        return Some(ns);
-    }
-    let message = format!(
-        "a timeout of {} is not possible; it must be from 1 ms to a week",
-        duration::show(ns)
-    );
-    p.add(timeout.span(), message);
     None
 }

@@ -7,23 +7,34 @@ use toml::Spanned;
 use toml::de::DeValue;
 
 use super::AxisSetup;
-use super::fields::{self, Fields};
+use super::fields::{Field, Key, Read, Table, TableKey, Value, Written};
 use super::problem::{Problems, Span};
 
-type Value<'d> = &'d Spanned<DeValue<'d>>;
+table! { "`track`",
+    /// Positions are in the axis's unit, as shown at power-on.
+    table RawTrack {
+        start: Key<f64>,
+        negative_limit: Key<f64>,
+        positive_limit: Key<f64>,
+        home: Key<[f64; 2]>,
+        probe1: Key<[f64; 2]>,
+        probe2: Key<[f64; 2]>,
+        ends: Key<[f64; 2]>,
+        index: Key<Index>,
+    }
+}
 
-/// `track` as written. Positions are in the axis's unit, as shown at power-on.
-#[derive(Debug)]
-pub(crate) struct RawTrack {
-    span: Span,
-    start: Option<Spanned<f64>>,
-    negative_limit: Option<Spanned<f64>>,
-    positive_limit: Option<Spanned<f64>>,
-    home: Option<Spanned<[f64; 2]>>,
-    probes: [Option<Spanned<[f64; 2]>>; 2],
-    ends: Option<Spanned<[f64; 2]>>,
-    /// An inner `None` means `false`: there is no index pulse.
-    index: Option<Option<Spanned<f64>>>,
+/// The position of the index pulse; `None` is written `false`: there is no pulse.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Index(Option<f64>);
+
+impl Read for Index {
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        match value.get_ref() {
+            DeValue::Boolean(false) => Some(Self(None)),
+            _ => f64::read(value, key, p).map(|position| Self(Some(position))),
+        }
+    }
 }
 
 /// The position of the simulated axis at power-on in the drive's counts, and its track.
@@ -31,46 +42,6 @@ pub(crate) struct RawTrack {
 pub struct TrackSetup {
     pub start: i32,
     pub track: Track,
-}
-
-pub(crate) fn read(value: Value<'_>, p: &mut Problems<'_>) -> Option<RawTrack> {
-    let mut f = fields::table(p, value, "`track`")?;
-    let raw = RawTrack {
-        span: value.span(),
-        start: number(&mut f, "start", p),
-        negative_limit: number(&mut f, "negative_limit", p),
-        positive_limit: number(&mut f, "positive_limit", p),
-        home: range(&mut f, "home", p),
-        probes: [range(&mut f, "probe1", p), range(&mut f, "probe2", p)],
-        ends: range(&mut f, "ends", p),
-        index: f.get("index").map(|v| match v.get_ref() {
-            DeValue::Boolean(false) => None,
-            _ => fields::number(p, v),
-        }),
-    };
-    f.done(p);
-    Some(raw)
-}
-
-fn number(f: &mut Fields<'_>, key: &'static str, p: &mut Problems<'_>) -> Option<Spanned<f64>> {
-    f.get(key).and_then(|v| fields::number(p, v))
-}
-
-fn range(f: &mut Fields<'_>, key: &'static str, p: &mut Problems<'_>) -> Option<Spanned<[f64; 2]>> {
-    let value = f.get(key)?;
-    let ends = fields::array(p, value, "a list of two positions")?;
-    let [first, last] = ends.as_slice() else {
-        let example = format!("write `{key} = [10.0, 10.5]`");
-        p.add_hint(value.span(), format!("`{key}` has two ends"), example);
-        return None;
-    };
-    let [Some(first), Some(last)] = [fields::number(p, first), fields::number(p, last)] else {
-        return None;
-    };
-    Some(Spanned::new(
-        value.span(),
-        [first.into_inner(), last.into_inner()],
-    ))
 }
 
 /// Converts positions to counts. `axis`: the device's axis; `Err`: it has none; `None`: it is
@@ -98,13 +69,16 @@ pub(crate) fn check(
             positive_limit: to.counts(raw.positive_limit.as_ref()),
             home: to.range(raw.home.as_ref(), "home"),
             probes: [
-                to.range(raw.probes[0].as_ref(), "probe1"),
-                to.range(raw.probes[1].as_ref(), "probe2"),
+                to.range(raw.probe1.as_ref(), "probe1"),
+                to.range(raw.probe2.as_ref(), "probe2"),
             ],
             ends: to.range(raw.ends.as_ref(), "ends"),
             index: match &raw.index {
                 None => Track::default().index,
-                Some(index) => to.counts(index.as_ref()),
+                Some(index) => {
+                    let Index(position) = *index.get_ref();
+                    position.and_then(|position| to.place(position, &index.span()))
+                }
             },
             normally_closed: 0,
         },

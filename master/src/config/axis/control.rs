@@ -1,13 +1,14 @@
 //! Control and supervision of an axis: loops, brake, supervision, fault reset, homing.
 
 use ecaxis_axis::homing::{self, Homing, ParameterError};
-use ecaxis_axis::supervision::{Brake, FaultReset, StopMethod, Supervision, TorqueWatch};
+use ecaxis_axis::supervision::{Brake, FaultReset, Supervision, TorqueWatch};
 use ecaxis_axis::{AxisConfig, FeedForward, Loops, PositionPid, VelocityLoop};
 use ecaxis_esi as esi;
 use toml::Spanned;
 
-use super::super::problem::{Problems, suggestion};
-use super::super::raw::{RawAxis, RawHoming, RawLoops};
+use super::super::fields::{Key, KeyExt, Ns};
+use super::super::problem::Problems;
+use super::super::raw::{RawAxis, RawHoming};
 use super::super::{HomingSetup, TorqueSetup};
 use super::{MAXON, positive};
 
@@ -16,12 +17,12 @@ const TORQUE_TIME_S: f64 = 0.1;
 const RESET_DELAY_S: f64 = 1.0;
 const HOMING_TIMEOUT_NS: u64 = 60_000_000_000;
 
-fn seconds(time: Option<&Spanned<u64>>) -> Option<f64> {
-    time.map(|t| *t.get_ref() as f64 * 1e-9)
+pub(super) fn seconds(time: &Key<Ns>) -> Option<f64> {
+    time.value().map(|ns| ns as f64 * 1e-9)
 }
 
 pub(super) fn loops(
-    raw: &RawLoops,
+    raw: &RawAxis,
     unit: &str,
     selection: Option<&esi::Selection>,
     p: &mut Problems<'_>,
@@ -37,8 +38,8 @@ pub(super) fn loops(
         mapped.then_some(*value.get_ref())
     };
     let csp = FeedForward {
-        velocity: offset(&raw.velocity_offset, 0x60b1)?,
-        acceleration: offset(&raw.torque_offset, 0x60b2)?,
+        velocity: offset(&raw.csp.velocity_offset, 0x60b1)?,
+        acceleration: offset(&raw.csp.torque_offset, 0x60b2)?,
     };
     let reported = selection.is_none_or(|s| s.layout.tx_field(0x6064, 0).is_some());
     let needs_position = [
@@ -54,32 +55,27 @@ pub(super) fn loops(
     }
     let csv = match &raw.csv {
         Some(csv) => Some(VelocityLoop {
-            kv: *positive(csv.kv.as_ref()?, "csv.kv", "1/s", p)?,
-            feed_forward: part(csv.feed_forward.as_ref(), 1.0, "csv.feed_forward", p)?,
+            kv: positive(csv.kv.as_ref()?, "csv.kv", "1/s", p)?,
+            feed_forward: weight(&csv.feed_forward, "csv.feed_forward", p)?,
         }),
         None => None,
     };
     let cst = match &raw.cst {
         Some(cst) => Some(PositionPid {
-            kp: *positive(cst.kp.as_ref()?, "cst.kp", &format!("% per {unit}"), p)?,
-            tn_s: seconds(cst.tn.as_ref()),
-            tv_s: seconds(cst.tv.as_ref()).unwrap_or(0.0),
-            acceleration: cst.acceleration.as_ref().map_or(0.0, |a| *a.get_ref()),
+            kp: positive(cst.kp.as_ref()?, "cst.kp", &format!("% per {unit}"), p)?,
+            tn_s: seconds(&cst.tn),
+            tv_s: seconds(&cst.tv).unwrap_or(0.0),
+            acceleration: cst.acceleration.value().unwrap_or(0.0),
         }),
         None => None,
     };
     Some(Loops { csp, csv, cst })
 }
 
-/// Returns a weight from 0 to 1.
-fn part(
-    value: Option<&Spanned<f64>>,
-    default: f64,
-    what: &str,
-    p: &mut Problems<'_>,
-) -> Option<f64> {
+/// Returns a weight from 0 to 1; the default is 1.
+fn weight(value: &Key<f64>, what: &str, p: &mut Problems<'_>) -> Option<f64> {
     let Some(value) = value else {
-        return Some(default);
+        return Some(1.0);
     };
     let n = *value.get_ref();
     if (0.0..=1.0).contains(&n) {
@@ -101,18 +97,18 @@ pub(super) fn guards(
     p: &mut Problems<'_>,
 ) -> Option<()> {
     config.brake = Brake {
-        release_s: seconds(raw.brake.release.as_ref()).unwrap_or(0.0),
-        engage_s: seconds(raw.brake.engage.as_ref()).unwrap_or(0.0),
+        release_s: seconds(&raw.brake.release).unwrap_or(0.0),
+        engage_s: seconds(&raw.brake.engage).unwrap_or(0.0),
     };
-    if let Some(tries) = &raw.fault_reset.tries {
+    if let Some(tries) = raw.fault_reset.tries.value() {
         config.fault_reset = FaultReset::Automatic {
-            tries: *tries.get_ref(),
-            delay_s: seconds(raw.fault_reset.delay.as_ref()).unwrap_or(RESET_DELAY_S),
+            tries,
+            delay_s: seconds(&raw.fault_reset.delay).unwrap_or(RESET_DELAY_S),
         };
     }
     let watch = &raw.supervise;
     let mut above_zero = |value: &Option<Spanned<f64>>, what: &str, unit: &str| match value {
-        Some(value) => positive(value, what, unit, p).map(|n| Some(*n)),
+        Some(value) => positive(value, what, unit, p).map(Some),
         None => Some(None),
     };
     let torque = above_zero(&watch.torque, "supervise.torque", known.unit.sign())?;
@@ -127,58 +123,18 @@ pub(super) fn guards(
         &format!("{unit}/s"),
     )?;
     config.supervision = Supervision {
-        reaction: one_of(raw.on_trip.as_ref(), &STOP_METHODS, "on_trip", p)?,
-        emergency: one_of(
-            raw.on_emergency.as_ref(),
-            &STOPS_BY_DRIVE,
-            "on_emergency",
-            p,
-        )?,
+        reaction: raw.on_trip.value().unwrap_or_default(),
+        emergency: raw.on_emergency.value().unwrap_or_default(),
         torque: torque.map(|torque| TorqueWatch {
             percent: known.percent(torque),
-            time_s: seconds(watch.torque_time.as_ref()).unwrap_or(TORQUE_TIME_S),
+            time_s: seconds(&watch.torque_time).unwrap_or(TORQUE_TIME_S),
         }),
         acceleration,
         standstill,
-        target_dwell_s: seconds(watch.target_time.as_ref()).unwrap_or(0.0),
-        standstill_dwell_s: seconds(watch.standstill_time.as_ref()).unwrap_or(0.0),
+        target_dwell_s: seconds(&watch.target_time).unwrap_or(0.0),
+        standstill_dwell_s: seconds(&watch.standstill_time).unwrap_or(0.0),
     };
     Some(())
-}
-
-/// The stop methods of an axis, as the machine file names them.
-pub(crate) const STOP_METHODS: [(&str, StopMethod); 3] = [
-    ("quick-stop", StopMethod::QuickStop),
-    ("ramp", StopMethod::Ramp),
-    ("no-power", StopMethod::DisableVoltage),
-];
-
-/// The stop methods that a drive carries out by itself.
-pub(crate) const STOPS_BY_DRIVE: [(&str, StopMethod); 2] = [
-    ("quick-stop", StopMethod::QuickStop),
-    ("no-power", StopMethod::DisableVoltage),
-];
-
-pub(crate) fn one_of<T: Copy + Default>(
-    word: Option<&Spanned<String>>,
-    all: &[(&str, T)],
-    key: &str,
-    p: &mut Problems<'_>,
-) -> Option<T> {
-    let Some(word) = word else {
-        return Some(T::default());
-    };
-    let known = all.iter().find(|(name, _)| name == word.get_ref());
-    if known.is_none() {
-        let message = format!("`{key}` cannot be \"{}\"", word.get_ref());
-        let names = all.iter().map(|(name, _)| *name);
-        p.add_hint(
-            word.span(),
-            message,
-            suggestion(word.get_ref(), names, "there are"),
-        );
-    }
-    known.map(|(_, value)| *value)
 }
 
 /// Returns the homing with its SDOs.
@@ -188,15 +144,14 @@ pub(super) fn homing(
     selection: Option<&esi::Selection>,
     p: &mut Problems<'_>,
 ) -> Option<HomingSetup> {
-    let number = |value: &Option<Spanned<f64>>| value.as_ref().map(|n| *n.get_ref());
     let homing = Homing {
-        method: *raw.method.as_ref()?.get_ref(),
-        search_velocity: number(&raw.search),
-        zero_velocity: number(&raw.zero),
-        acceleration: number(&raw.acceleration),
-        distance: number(&raw.distance),
-        position: number(&raw.position),
-        threshold_ma: raw.threshold.as_ref().map(|n| *n.get_ref()),
+        method: raw.method.value()?,
+        search_velocity: raw.search.value(),
+        zero_velocity: raw.zero.value(),
+        acceleration: raw.acceleration.value(),
+        distance: raw.distance.value(),
+        position: raw.position.value(),
+        threshold_ma: raw.threshold.value(),
     };
     if let Err(error) = homing.check(&config.scale, &config.limits) {
         let hint = match &error {
@@ -256,9 +211,6 @@ pub(super) fn homing(
     Some(HomingSetup {
         homing,
         startup,
-        timeout_ns: raw
-            .timeout
-            .as_ref()
-            .map_or(HOMING_TIMEOUT_NS, |t| *t.get_ref()),
+        timeout_ns: raw.timeout.value().unwrap_or(HOMING_TIMEOUT_NS),
     })
 }

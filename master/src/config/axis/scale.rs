@@ -1,17 +1,17 @@
 //! The scaling of an axis: encoder, gear, feed, modulo; the drive's units of velocity, acceleration
 //! and torque.
 
-use ecaxis_axis::scale::{ModuloDirection, TorqueScale};
+use ecaxis_axis::scale::TorqueScale;
 use ecaxis_axis::units::{Amperes, NewtonMetres};
 use ecaxis_axis::{AccelerationUnit, Scale, ScaleError, VelocityUnit};
 use ecaxis_esi as esi;
 use toml::Spanned;
 
-use super::super::problem::{Problems, suggestion};
+use super::super::fields::{Key, KeyExt};
+use super::super::problem::Problems;
 use super::super::raw::{RawAxis, RawSdo, SdoValue};
 use super::super::units::is_turn;
 use super::super::{TorqueSetup, TorqueUnit, UnitSource};
-use super::control::one_of;
 use super::{MAXON, positive};
 
 /// The maximum number of counts per motor turn.
@@ -43,7 +43,7 @@ pub(super) fn scale(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<S
         return None;
     }
     let per_turn = per_turn(raw, unit, p);
-    let scale = match Scale::new(*encoder?, per_turn?) {
+    let scale = match Scale::new(encoder?, per_turn?) {
         Ok(scale) => scale,
         Err(e) => {
             let at = raw.per_turn.as_ref().or(raw.feed.as_ref());
@@ -58,16 +58,15 @@ pub(super) fn scale(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<S
             return None;
         }
     };
-    let offset = raw.offset.as_ref().map_or(0.0, |o| *o.get_ref());
-    let invert = raw.invert.as_ref().is_some_and(|i| *i.get_ref());
+    let offset = raw.offset.value().unwrap_or(0.0);
+    let invert = raw.invert.value().unwrap_or(false);
     let scale = scale.with_invert(invert).with_offset(offset).ok()?;
     modulo(raw, scale, unit, p)
 }
 
 /// Returns the user units per motor turn, given directly or by gear and feed.
 fn per_turn(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<f64> {
-    let geared = raw.gear.as_ref().map(Spanned::span);
-    let geared = geared.or(raw.feed.as_ref().map(Spanned::span));
+    let geared = raw.gear.place().or(raw.feed.place());
     if let (Some(at), Some(_)) = (geared, &raw.per_turn) {
         p.add_hint(
             at,
@@ -77,9 +76,10 @@ fn per_turn(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<f64> {
         return None;
     }
     if let Some(per_turn) = &raw.per_turn {
-        return positive(per_turn, "per_turn", unit, p).copied();
+        return positive(per_turn, "per_turn", unit, p);
     }
-    if let (false, Some(name)) = (raw.scaled, &raw.unit)
+    let scaled = raw.written.has("per_turn") || raw.written.has("feed");
+    if let (false, Some(name)) = (scaled, &raw.unit)
         && !is_turn(unit)
     {
         let message =
@@ -97,10 +97,10 @@ fn per_turn(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<f64> {
         return None;
     }
     let feed = match &raw.feed {
-        Some(feed) => *positive(feed, "feed", unit, p)?,
+        Some(feed) => positive(feed, "feed", unit, p)?,
         None => 1.0,
     };
-    let [motor, shaft] = raw.gear.as_ref().map_or([1, 1], |gear| *gear.get_ref());
+    let [motor, shaft] = raw.gear.value().unwrap_or([1, 1]);
     Some(feed * f64::from(shaft) / f64::from(motor))
 }
 
@@ -134,23 +134,6 @@ fn modulo(raw: &RawAxis, scale: Scale, unit: &str, p: &mut Problems<'_>) -> Opti
     }
 }
 
-const WAYS: [(&str, ModuloDirection); 3] = [
-    ("shortest", ModuloDirection::Shortest),
-    ("positive", ModuloDirection::Positive),
-    ("negative", ModuloDirection::Negative),
-];
-
-pub(super) fn way(raw: &RawAxis, p: &mut Problems<'_>) -> Option<ModuloDirection> {
-    one_of(raw.way.as_ref(), &WAYS, "way", p)
-}
-
-const VELOCITY_UNITS: [(&str, VelocityUnit); 4] = [
-    ("rpm", VelocityUnit::RPM),
-    ("mrpm", VelocityUnit::MILLI_RPM),
-    ("counts/s", VelocityUnit::COUNTS_PER_SECOND),
-    ("turns/s", VelocityUnit::TURNS_PER_SECOND),
-];
-
 const SI_UNIT_VELOCITY: u16 = 0x60a9;
 const SI_UNIT_ACCELERATION: u16 = 0x60aa;
 const RATED_TORQUE: u16 = 0x6076;
@@ -162,20 +145,8 @@ pub(super) fn velocity_unit(
     selection: Option<&esi::Selection>,
     p: &mut Problems<'_>,
 ) -> Option<(VelocityUnit, UnitSource)> {
-    if let Some(text) = &raw.velocity_unit {
-        let known = VELOCITY_UNITS
-            .iter()
-            .find(|(name, _)| *name == text.get_ref());
-        if known.is_none() {
-            let message = format!("unknown unit of velocity \"{}\"", text.get_ref());
-            let names = VELOCITY_UNITS.iter().map(|(name, _)| *name);
-            p.add_hint(
-                text.span(),
-                message,
-                suggestion(text.get_ref(), names, "units"),
-            );
-        }
-        return known.map(|(_, unit)| (*unit, UnitSource::File));
+    if let Some(unit) = raw.velocity_unit.value() {
+        return Some((unit, UnitSource::File));
     }
     let Some((code, from)) = startup_value(SI_UNIT_VELOCITY, sdos, selection) else {
         return Some((VelocityUnit::default(), UnitSource::Nothing));
@@ -196,7 +167,7 @@ fn startup_value(
     sdos: &[RawSdo],
     selection: Option<&esi::Selection>,
 ) -> Option<(u32, UnitSource)> {
-    let written = sdos.iter().rev().find(|s| s.index == index && s.sub == 0);
+    let written = sdos.iter().rev().find(|s| s.address() == (index, 0));
     let written = written.and_then(|s| match s.value.get_ref() {
         SdoValue::Integer(n) => u32::try_from(*n).ok(),
         _ => None,
@@ -222,12 +193,6 @@ pub(super) fn acceleration_unit(
     known.unwrap_or((velocity.into(), UnitSource::Nothing))
 }
 
-const TORQUE_UNITS: [(&str, TorqueUnit); 3] = [
-    ("percent", TorqueUnit::Percent),
-    ("Nm", TorqueUnit::NewtonMetres),
-    ("A", TorqueUnit::Amperes),
-];
-
 /// Returns the torque unit and the known motor data.
 pub(super) fn torque(
     raw: &RawAxis,
@@ -235,9 +200,9 @@ pub(super) fn torque(
     selection: Option<&esi::Selection>,
     p: &mut Problems<'_>,
 ) -> Option<TorqueSetup> {
-    let unit = one_of(raw.torque_unit.as_ref(), &TORQUE_UNITS, "torque_unit", p)?;
-    let mut known = |value: &Option<Spanned<f64>>, what: &str, unit: &str| match value {
-        Some(value) => positive(value, what, unit, p).map(|n| Some(*n)),
+    let unit = raw.torque_unit.value().unwrap_or_default();
+    let mut known = |value: &Key<f64>, what: &str, unit: &str| match value {
+        Some(value) => positive(value, what, unit, p).map(Some),
         None => Some(None),
     };
     let constant = known(&raw.torque_constant, "torque_constant", "Nm/A");
@@ -251,10 +216,7 @@ pub(super) fn torque(
         }
         _ => (None, UnitSource::Nothing),
     };
-    let at = raw
-        .torque_unit
-        .as_ref()
-        .map_or(raw.span.clone(), Spanned::span);
+    let at = raw.torque_unit.place().unwrap_or(raw.span.clone());
     let drive_knows = selection.is_some_and(is_maxon);
     let unknown = unit == TorqueUnit::Amperes && constant.is_none();
     if unknown && !drive_knows {
@@ -277,7 +239,7 @@ pub(super) fn torque(
         limit_said: raw.limits.torque.is_some(),
     };
     // The drive reports the rated torque later. Until then torques are fractions of the limit.
-    let limit = raw.limits.torque.as_ref().map(|n| *n.get_ref());
+    let limit = raw.limits.torque.value();
     match (unit, rated, limit) {
         (TorqueUnit::Percent, ..) => Some(torque),
         (_, Some(rated), _) if !unknown => torque.with_rated(rated, rated_from),

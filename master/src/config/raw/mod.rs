@@ -1,95 +1,128 @@
-//! The machine file as written. Types are checked; references are not resolved.
+//! The machine file as written. Types and ranges are checked; references are not resolved.
 
 use toml::Spanned;
-use toml::de::{DeTable, DeValue};
+use toml::de::DeValue;
 
+use ecaxis_axis::StopMethod;
 use ecaxis_esi::Address;
 
-use super::fields::{self, Fields};
+use super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Written, unquoted};
+use super::gateway::RawNode;
 use super::problem::{Problems, Span};
-use super::sim::{self, RawSim};
-
-/// Reads `$field` with one of the readers of [`fields`] if it is present.
-macro_rules! optional {
-    ($p:expr, $f:expr, $key:literal, $($reader:tt)+) => {
-        match $f.get($key) {
-            Some(v) => optional!(@ $p, v, $($reader)+),
-            None => None,
-        }
-    };
-    (@ $p:expr, $v:expr, integer($min:expr, $max:expr)) => { fields::integer($p, $v, $min, $max) };
-    (@ $p:expr, $v:expr, $reader:ident) => { fields::$reader($p, $v) };
-}
+use super::travel::RawTrack;
+use super::{Exchange, GroupStopScope};
+use crate::link::SocketKind;
+use crate::rt::spin::Spin;
 
 mod axis;
-mod motion;
 mod step;
-mod stop;
 
-pub(crate) use axis::{RawAxis, RawHoming, RawLimits, RawLoops};
-pub(crate) use motion::RawProbe;
-pub(crate) use step::{RawAction, RawCondition, RawSignal, RawStep, RawTarget};
-pub(crate) use stop::{RawGroup, RawStop};
+pub(crate) use axis::{RawAxis, RawHoming, RawLimits};
+pub(crate) use step::{
+    Conditions, Named, RawAction, RawAxes, RawCondition, RawGear, RawProbe, RawSignal, RawStep,
+    RawWave,
+};
 
-#[derive(Debug, Default)]
-pub(crate) struct RawMachine {
-    pub bus: RawBus,
-    pub devices: Vec<RawDevice>,
-    pub stop: RawStop,
-    pub steps: Vec<RawStep>,
-    pub repeat: Option<Spanned<u32>>,
-    pub enable: Option<Spanned<bool>>,
+table! { "the machine file",
+    table RawMachine {
+        repeat: Key<u32> [1..=1_000_000],
+        enable: Key<bool>,
+        bus: RawBus = "[bus]\ncycle = \"1ms\"",
+        devices: Vec<RawDevice> as "device" = "[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"",
+        stop: RawStop,
+        steps: Vec<RawStep> as "step",
+    }
 }
 
-#[derive(Debug, Default)]
-pub(crate) struct RawBus {
-    pub nic: Option<Spanned<String>>,
-    pub cycle: Option<Spanned<u64>>,
-    pub lost_frames: Option<Spanned<u32>>,
-    pub cpu: Option<Spanned<u32>>,
-    pub priority: Option<Spanned<u8>>,
-    /// An inner `None` means `"auto"`.
-    pub spin: Option<Spanned<Option<u64>>>,
-    pub idle: Option<Spanned<String>>,
-    pub op_timeout: Option<Spanned<u64>>,
-    pub enable_timeout: Option<Spanned<u64>>,
-    pub watchdog: Option<Spanned<u64>>,
-    pub clock_window: Option<Spanned<u64>>,
-    pub exchange: Option<Spanned<String>>,
-    pub link: Option<Spanned<String>>,
-    /// Keys that are present, each with its line.
-    pub written: Vec<(&'static str, u32)>,
+impl RawMachine {
+    /// Reports unknown keys and tables of the top level only.
+    pub fn check_keys(root: Value<'_>, p: &mut Problems<'_>) {
+        let keys: Vec<TableKey> = Self::KEYS.iter().map(|(key, _)| (*key, None)).collect();
+        if let Some(table) = Table::of(root, "the machine file", &keys, p) {
+            table.done(p);
+        }
+    }
 }
 
-#[derive(Debug)]
-pub(crate) struct RawDevice {
-    pub span: Span,
-    pub name: Option<Spanned<String>>,
-    pub esi: Option<Spanned<String>>,
-    /// `true` if a locator is present, valid or not.
-    pub placed: bool,
-    pub position: Option<Spanned<u16>>,
-    pub alias: Option<Spanned<u16>>,
-    pub id: Option<Spanned<u16>>,
-    pub type_name: Option<Spanned<String>>,
-    pub vendor: Option<Spanned<u32>>,
-    pub product: Option<Spanned<u32>>,
-    pub revision: Option<Spanned<u32>>,
-    pub identity: Option<Spanned<String>>,
-    pub serial: Option<Spanned<u32>>,
-    pub mode: Option<Spanned<String>>,
-    pub dc: Option<Spanned<String>>,
-    pub modules: Option<Spanned<Vec<String>>>,
-    pub assignment: Option<Spanned<String>>,
-    pub rx: Option<Spanned<Vec<RawEntry>>>,
-    pub tx: Option<Spanned<Vec<RawEntry>>>,
-    pub sdo: Vec<RawSdo>,
-    /// `startup`: the defaults for all start-up SDOs.
-    pub startup: RawStartup,
-    pub axis: Option<RawAxis>,
-    pub sim: Option<RawSim>,
+const MS: Ns = 1_000_000;
+const S: Ns = 1000 * MS;
+
+const IDLE_MODES: [(&str, bool); 2] = [("sleep", false), ("awake", true)];
+const EXCHANGES: [(&str, Exchange); 2] = [
+    ("same-cycle", Exchange::SameCycle),
+    ("pipelined", Exchange::Pipelined),
+];
+const LINKS: [(&str, SocketKind); 2] = [
+    (SocketKind::Ring.name(), SocketKind::Ring),
+    (SocketKind::Packet.name(), SocketKind::Packet),
+];
+
+table! { "[bus]",
+    table RawBus {
+        nic: Key<String>,
+        cycle: Key<Ns> [50_000..=100 * MS] = "\"1ms\"",
+        lost_frames: Key<u32> [1..=1000],
+        cpu: Key<u32> [0..=1023],
+        priority: Key<u8> [1..=99],
+        spin: Key<Spin>,
+        /// `true` if `cpu` is kept awake.
+        idle: Key<bool> [IDLE_MODES],
+        op_timeout: Key<Ns> [MS..=600 * S],
+        enable_timeout: Key<Ns> [MS..=600 * S],
+        // The watchdog registers count 100 µs in 16 bits.
+        watchdog: Key<Ns> [MS..=6553 * S + 500 * MS],
+        clock_window: Key<Ns> [100..=S],
+        exchange: Key<Exchange> [EXCHANGES],
+        link: Key<SocketKind> [LINKS],
+    }
 }
 
+/// `"auto"`, a duration, or a plain 0.
+impl Read for Spin {
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        match value.get_ref() {
+            DeValue::String(s) if s == "auto" => Some(Self::Auto),
+            DeValue::Integer(i) if i.as_str() == "0" => Some(Self::For(0)),
+            _ => Ns::read(value, key, p).map(Self::For),
+        }
+    }
+}
+
+table! { "[[device]]",
+    table RawDevice {
+        name: Key<String> = "\"x\"",
+        esi: Key<String> = "\"esi/EPOS4.xml\"",
+        position: Key<u16>,
+        alias: Key<u16> [1..=u16::MAX],
+        id: Key<u16> [1..=u16::MAX],
+        type_name: Key<String> as "type",
+        vendor: Key<u32>,
+        product: Key<u32>,
+        revision: Key<u32>,
+        identity: Key<String>,
+        serial: Key<u32>,
+        mode: Key<String>,
+        dc: Key<String>,
+        /// A name for each slot, `-` for none.
+        modules: Key<Vec<String>>,
+        assignment: Key<String>,
+        pdo: RawPdos,
+        sdo: Vec<RawSdo>,
+        /// The defaults for all start-up SDOs.
+        startup: RawStartup,
+        axis: Option<RawAxis>,
+        sim: Option<RawSim>,
+    }
+}
+
+table! { "`pdo`",
+    table RawPdos {
+        rx: Key<Vec<RawEntry>>,
+        tx: Key<Vec<RawEntry>>,
+    }
+}
+
+/// An object: `"0x607A:00"`, `"0x607A"` or `{ index = 0x607A, sub = 0 }`.
 #[derive(Debug)]
 pub(crate) struct RawEntry {
     pub span: Span,
@@ -97,21 +130,49 @@ pub(crate) struct RawEntry {
     pub sub: u8,
 }
 
-#[derive(Debug)]
-pub(crate) struct RawSdo {
-    pub span: Span,
-    pub index: u16,
-    pub sub: u8,
-    pub value: Spanned<SdoValue>,
-    pub type_name: Option<Spanned<String>>,
-    pub startup: RawStartup,
+table! { "a PDO entry",
+    row EntryTable {
+        index: u16 [1..=u16::MAX] = "0x607A",
+        sub: Option<u8>,
+    }
 }
 
-/// What is done in addition to writing; `None`: not in the file.
-#[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct RawStartup {
-    pub verify: Option<bool>,
-    pub skip_equal: Option<bool>,
+impl Read for RawEntry {
+    const LIST: &'static str = "a list of objects";
+
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        let span = value.span();
+        let DeValue::String(text) = value.get_ref() else {
+            let EntryTable { index, sub, .. } = EntryTable::read(value, key, p)?;
+            let sub = sub.unwrap_or(0);
+            return Some(Self { span, index, sub });
+        };
+        let (index, sub) = text.split_once(':').unwrap_or((text, "0"));
+        let index = unquoted(index).and_then(|i| u16::try_from(i).ok());
+        let (Some(index @ 1..), Some(sub)) = (index, Address::sub_of(sub)) else {
+            let hint = "write index and subindex as \"0x607A:00\"";
+            p.add_hint(span, "not an object", hint);
+            return None;
+        };
+        Some(Self { span, index, sub })
+    }
+}
+
+table! { "`sdo`",
+    row RawSdo {
+        index: u16 [1..=u16::MAX] = "0x6065",
+        sub: Option<u8>,
+        value: Spanned<SdoValue> = "2000",
+        type_name: Key<String> as "type",
+        verify: Option<bool>,
+        skip_equal: Option<bool>,
+    }
+}
+
+impl RawSdo {
+    pub fn address(&self) -> (u16, u8) {
+        (self.index, self.sub.unwrap_or(0))
+    }
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -123,259 +184,88 @@ pub(crate) enum SdoValue {
     Bytes(Vec<u8>),
 }
 
-type Value<'d> = &'d Spanned<DeValue<'d>>;
-
-/// Reports unknown tables and keys of the whole file.
-pub(crate) fn names(document: &Spanned<DeTable<'_>>, p: &mut Problems<'_>) {
-    let mut f = Fields::new(document.get_ref(), 0..0, "the machine file");
-    for known in ["repeat", "enable", "bus", "device", "stop", "step"] {
-        let _ = f.get(known);
+impl Read for SdoValue {
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        Some(match value.get_ref() {
+            DeValue::Integer(_) => Self::Integer(i64::read(value, key, p)?),
+            DeValue::Float(_) => Self::Float(f64::read(value, key, p)?),
+            DeValue::Boolean(b) => Self::Boolean(*b),
+            DeValue::Array(_) => Self::Bytes(Vec::read(value, key, p)?),
+            _ => Self::Text(String::read(value, key, p)?),
+        })
     }
-    f.done(p);
 }
 
-pub(crate) fn read(document: &Spanned<DeTable<'_>>, p: &mut Problems<'_>) -> RawMachine {
-    let mut f = Fields::new(document.get_ref(), 0..0, "the machine file");
-    let mut machine = RawMachine {
-        repeat: optional!(p, f, "repeat", integer(1, 1_000_000)),
-        enable: optional!(p, f, "enable", boolean),
-        ..RawMachine::default()
-    };
-    let bus = f.need("bus", "[bus]\ncycle = \"1ms\"");
-    if let Some(bus) = bus.and_then(|v| fields::table(p, v, "[bus]")) {
-        machine.bus = read_bus(bus, p);
+table! { "`startup`",
+    table RawStartup {
+        verify: Option<bool>,
+        skip_equal: Option<bool>,
     }
-    let devices = f.need(
-        "device",
-        "[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"",
-    );
-    for (value, span) in tables(p, devices, "[[device]]") {
-        let Some(fields) = fields::table(p, value, "[[device]]") else {
-            continue;
-        };
-        machine.devices.push(read_device(fields, span, p));
-    }
-    if let Some(value) = f.get("stop")
-        && let Some(fields) = fields::table(p, value, "[stop]")
-    {
-        machine.stop = stop::read(fields, p);
-    }
-    let steps = f.get("step");
-    for (value, span) in tables(p, steps, "[[step]]") {
-        let Some(fields) = fields::table(p, value, "[[step]]") else {
-            continue;
-        };
-        machine.steps.extend(step::read(fields, span, p));
-    }
-    f.done(p);
-    machine
 }
 
-/// Returns the tables of an array of tables.
-fn tables<'d>(
-    p: &mut Problems<'_>,
-    value: Option<Value<'d>>,
-    wanted: &str,
-) -> Vec<(Value<'d>, Span)> {
-    let elements = value.and_then(|v| fields::array(p, v, &format!("{wanted} with two brackets")));
-    elements
-        .unwrap_or_default()
-        .into_iter()
-        .map(|v| (v, v.span()))
-        .collect()
+table! { "[device.sim]",
+    table RawSim {
+        after: Key<String>,
+        port: Key<u8> [1..=3],
+        cable: Key<Ns> [0..=MS],
+        drift_ppm: Key<f64>,
+        offset: Key<Ns>,
+        jitter: Key<Ns> [0..=MS],
+        bit_rate: Key<u32>,
+        sync: Key<Ns>,
+        node: Vec<RawNode>,
+        track: Option<RawTrack>,
+    }
 }
 
-fn read_bus(mut f: Fields<'_>, p: &mut Problems<'_>) -> RawBus {
-    let cycle = f.need("cycle", "cycle = \"1ms\"");
-    let mut bus = RawBus {
-        nic: optional!(p, f, "nic", string),
-        cycle: cycle.and_then(|v| fields::duration(p, v)),
-        lost_frames: optional!(p, f, "lost_frames", integer(1, 1000)),
-        cpu: optional!(p, f, "cpu", integer(0, 1023)),
-        priority: optional!(p, f, "priority", integer(1, 99)),
-        spin: f.get("spin").and_then(|v| spin(p, v)),
-        idle: optional!(p, f, "idle", string),
-        op_timeout: optional!(p, f, "op_timeout", duration),
-        enable_timeout: optional!(p, f, "enable_timeout", duration),
-        watchdog: optional!(p, f, "watchdog", duration),
-        clock_window: optional!(p, f, "clock_window", duration),
-        exchange: optional!(p, f, "exchange", string),
-        link: optional!(p, f, "link", string),
-        written: Vec::new(),
-    };
-    bus.written = f.written(p);
-    f.done(p);
-    bus
+/// The stop methods of an axis.
+pub(crate) const STOP_METHODS: [(&str, StopMethod); 3] = [
+    ("quick-stop", StopMethod::QuickStop),
+    ("ramp", StopMethod::Ramp),
+    ("no-power", StopMethod::DisableVoltage),
+];
+
+/// The stop methods that a drive carries out by itself.
+pub(crate) const STOPS_BY_DRIVE: [(&str, StopMethod); 2] = [
+    ("quick-stop", StopMethod::QuickStop),
+    ("no-power", StopMethod::DisableVoltage),
+];
+
+const OUTSIDE: [(&str, GroupStopScope); 2] = [
+    ("stop", GroupStopScope::Stop),
+    ("continue", GroupStopScope::Continue),
+];
+
+table! { "[stop]",
+    table RawStop {
+        others: Key<StopMethod> [STOP_METHODS],
+        bus_lost: Key<StopMethod> [STOPS_BY_DRIVE],
+        emergency: Option<Conditions>,
+        groups: Vec<RawGroup> as "group",
+    }
 }
 
-/// Reads `"auto"`, a duration, or a plain 0.
-fn spin(p: &mut Problems<'_>, value: Value<'_>) -> Option<Spanned<Option<u64>>> {
-    match value.get_ref() {
-        DeValue::String(s) if s == "auto" => Some(Spanned::new(value.span(), None)),
-        DeValue::Integer(i) if i.as_str() == "0" => Some(Spanned::new(value.span(), Some(0))),
-        _ => {
-            let time = fields::duration(p, value)?;
-            Some(Spanned::new(time.span(), Some(time.into_inner())))
+table! { "[[stop.group]]",
+    table RawGroup {
+        name: Key<String> = "\"gantry\"",
+        axes: Option<Names> = "[\"x\", \"y\"]",
+        devices: Option<Names>,
+        others: Key<StopMethod> [STOP_METHODS],
+        outside: Key<GroupStopScope> [OUTSIDE],
+    }
+}
+
+/// Names of devices, at least one.
+#[derive(Debug)]
+pub(crate) struct Names(pub Vec<Spanned<String>>);
+
+impl Read for Names {
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        let names = Vec::read(value, key, p)?;
+        if names.is_empty() {
+            let hint = "write a list such as [\"x\", \"y\"]";
+            p.add_hint(value.span(), "nothing is named here", hint);
         }
+        Some(Self(names))
     }
-}
-
-fn read_device(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawDevice {
-    let name = f.need("name", "name = \"x\"");
-    let esi = f.need("esi", "esi = \"esi/EPOS4.xml\"");
-    let placed = ["position", "alias", "id"]
-        .into_iter()
-        .any(|key| f.get(key).is_some());
-    let mut device = RawDevice {
-        span,
-        placed,
-        name: name.and_then(|v| fields::string(p, v)),
-        esi: esi.and_then(|v| fields::string(p, v)),
-        position: optional!(p, f, "position", integer(0, u16::MAX)),
-        alias: optional!(p, f, "alias", integer(1, u16::MAX)),
-        id: optional!(p, f, "id", integer(1, u16::MAX)),
-        type_name: optional!(p, f, "type", string),
-        vendor: optional!(p, f, "vendor", integer(0, u32::MAX)),
-        product: optional!(p, f, "product", integer(0, u32::MAX)),
-        revision: optional!(p, f, "revision", integer(0, u32::MAX)),
-        identity: optional!(p, f, "identity", string),
-        serial: optional!(p, f, "serial", integer(0, u32::MAX)),
-        mode: optional!(p, f, "mode", string),
-        dc: optional!(p, f, "dc", string),
-        modules: f.get("modules").and_then(|v| read_modules(v, p)),
-        assignment: optional!(p, f, "assignment", string),
-        rx: None,
-        tx: None,
-        sdo: Vec::new(),
-        startup: RawStartup::default(),
-        axis: None,
-        sim: None,
-    };
-    if let Some(mut pdo) = f.get("pdo").and_then(|v| fields::table(p, v, "`pdo`")) {
-        device.rx = pdo.get("rx").and_then(|v| read_entries(v, p));
-        device.tx = pdo.get("tx").and_then(|v| read_entries(v, p));
-        pdo.done(p);
-    }
-    if let Some(value) = f.get("startup")
-        && let Some(mut startup) = fields::table(p, value, "`startup`")
-    {
-        device.startup = read_startup(&mut startup, p);
-        startup.done(p);
-    }
-    let sdos = f
-        .get("sdo")
-        .and_then(|v| fields::array(p, v, "a list of SDOs"));
-    for value in sdos.unwrap_or_default() {
-        let Some(fields) = fields::table(p, value, "`sdo`") else {
-            continue;
-        };
-        device.sdo.extend(read_sdo(fields, value.span(), p));
-    }
-    if let Some(value) = f.get("axis") {
-        let fields = fields::table(p, value, "[device.axis]");
-        device.axis = fields.map(|f| axis::read(f, value.span(), p));
-    }
-    if let Some(value) = f.get("sim") {
-        let fields = fields::table(p, value, "[device.sim]");
-        device.sim = fields.map(|f| sim::read(f, value.span(), p));
-    }
-    f.done(p);
-    device
-}
-
-/// Reads one name per slot.
-fn read_modules(value: Value<'_>, p: &mut Problems<'_>) -> Option<Spanned<Vec<String>>> {
-    let names = fields::array(p, value, "a list of modules, one a slot, \"-\" for none")?;
-    let names = names.into_iter().map(|v| fields::string(p, v));
-    let names: Option<Vec<_>> = names.map(|name| name.map(Spanned::into_inner)).collect();
-    Some(Spanned::new(value.span(), names?))
-}
-
-/// Reads objects as `"0x607A:00"`, `"0x607A"` or `{ index = 0x607A, sub = 0 }`.
-pub(crate) fn read_entries(
-    value: Value<'_>,
-    p: &mut Problems<'_>,
-) -> Option<Spanned<Vec<RawEntry>>> {
-    let all = value.span();
-    let mut entries = Vec::new();
-    for value in fields::array(p, value, "a list of objects")? {
-        let span = value.span();
-        let DeValue::String(text) = value.get_ref() else {
-            let Some(mut f) = fields::table(p, value, "a PDO entry") else {
-                continue;
-            };
-            let index = f.need("index", "index = 0x607A");
-            let index = index.and_then(|v| fields::integer(p, v, 1, u16::MAX));
-            let sub = optional!(p, f, "sub", integer(0, u8::MAX));
-            f.done(p);
-            if let Some(index) = index {
-                let sub = sub.map_or(0, Spanned::into_inner);
-                entries.push(RawEntry {
-                    span,
-                    index: index.into_inner(),
-                    sub,
-                });
-            }
-            continue;
-        };
-        let (index, sub) = text.split_once(':').unwrap_or((text, "0"));
-        let sub = Address::sub_of(sub);
-        let index = fields::unquoted(index)
-            .and_then(|i| u16::try_from(i).ok())
-            .filter(|i| *i > 0);
-        match (index, sub) {
-            (Some(index), Some(sub)) => entries.push(RawEntry { span, index, sub }),
-            _ => p.add_hint(
-                span,
-                "not an object",
-                "write index and subindex as \"0x607A:00\"",
-            ),
-        }
-    }
-    Some(Spanned::new(all, entries))
-}
-
-fn read_startup(f: &mut Fields<'_>, p: &mut Problems<'_>) -> RawStartup {
-    RawStartup {
-        verify: optional!(p, f, "verify", boolean).map(Spanned::into_inner),
-        skip_equal: optional!(p, f, "skip_equal", boolean).map(Spanned::into_inner),
-    }
-}
-
-fn read_sdo(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> Option<RawSdo> {
-    let index = f.need("index", "index = 0x6065");
-    let index = index.and_then(|v| fields::integer(p, v, 1, u16::MAX));
-    let sub = optional!(p, f, "sub", integer(0, u8::MAX));
-    let type_name = optional!(p, f, "type", string);
-    let startup = read_startup(&mut f, p);
-    let value = f.need("value", "value = 2000").and_then(|v| {
-        let read = match v.get_ref() {
-            DeValue::Integer(_) => {
-                SdoValue::Integer(fields::integer(p, v, i64::MIN, i64::MAX)?.into_inner())
-            }
-            DeValue::Float(_) => SdoValue::Float(fields::number(p, v)?.into_inner()),
-            DeValue::Boolean(b) => SdoValue::Boolean(*b),
-            DeValue::Array(_) => {
-                let bytes = fields::array(p, v, "a list of bytes")?;
-                let bytes = bytes.into_iter().map(|b| fields::integer(p, b, 0, u8::MAX));
-                SdoValue::Bytes(
-                    bytes
-                        .map(|b| b.map(Spanned::into_inner))
-                        .collect::<Option<_>>()?,
-                )
-            }
-            _ => SdoValue::Text(fields::string(p, v)?.into_inner()),
-        };
-        Some(Spanned::new(v.span(), read))
-    });
-    f.done(p);
-    let sub = sub.map_or(0, Spanned::into_inner);
-    Some(RawSdo {
-        span,
-        index: index?.into_inner(),
-        sub,
-        value: value?,
-        type_name,
-        startup,
-    })
 }

@@ -7,12 +7,17 @@ use toml::Spanned;
 
 use super::ProgramChecker;
 use super::target::TargetKind;
+use crate::config::fields::KeyExt;
 use crate::config::problem::{Problems, unreadable};
+use crate::config::raw::{RawGear, RawWave};
 use crate::config::{Action, AxisSetup, TableFile};
 use crate::file;
 
 /// The maximum length of a table in bytes.
 const MAX_TABLE_BYTES: u64 = 64 << 20;
+
+/// The default smoothing of a gear that follows actual positions, in ns.
+const SMOOTHING_NS: u64 = 10_000_000;
 
 impl ProgramChecker<'_> {
     /// Returns an axis that follows positions in at least one of its modes.
@@ -35,24 +40,54 @@ impl ProgramChecker<'_> {
         None
     }
 
+    pub(super) fn gear(
+        &self,
+        name: &Spanned<String>,
+        raw: &RawGear,
+        p: &mut Problems<'_>,
+    ) -> Option<Action> {
+        let axis = self.positioned(name, "gear", p)?.0;
+        let to = raw.to.as_ref()?;
+        let master = self.axis(to, p)?.0;
+        if axis == master {
+            let message = format!("`{}` cannot follow itself", name.get_ref());
+            p.add(to.span(), message);
+            return None;
+        }
+        if let Some(ratio) = raw.ratio.as_ref().filter(|ratio| *ratio.get_ref() == 0.0) {
+            p.add(ratio.span(), "with a `ratio` of 0 nothing is followed");
+            return None;
+        }
+        let actual = raw.actual.value().unwrap_or(false);
+        // Actual positions are whole counts, so they need smoothing.
+        let smoothing_ns = if actual { SMOOTHING_NS } else { 0 };
+        Some(Action::Gear {
+            axis,
+            master,
+            actual,
+            ratio: raw.ratio.value().unwrap_or(1.0),
+            offset: raw.offset.value(),
+            smoothing_ns: raw.smoothing.value().unwrap_or(smoothing_ns),
+        })
+    }
+
     pub(super) fn wave(
         &self,
         square: bool,
         name: &Spanned<String>,
-        amplitude: &Spanned<f64>,
-        frequency: &Spanned<f64>,
-        periods: u32,
+        raw: &RawWave,
         p: &mut Problems<'_>,
     ) -> Option<Action> {
         let verb = if square { "square" } else { "sine" };
         let (index, axis) = self.positioned(name, verb, p)?;
+        let (amplitude, frequency) = (raw.amplitude.as_ref()?, raw.frequency.as_ref()?);
         let shape = if square { Shape::Square } else { Shape::Sine };
         let limits = axis.config.limits.motion();
         let wave = Wave::new(
             shape,
             *amplitude.get_ref(),
             *frequency.get_ref(),
-            periods,
+            raw.periods.value()?,
             self.cycle_s,
         );
         let checked = wave.and_then(|wave| {

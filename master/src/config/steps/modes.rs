@@ -7,14 +7,10 @@ use toml::Spanned;
 use super::ProgramChecker;
 use crate::config::Action;
 use crate::config::problem::{Problems, Span, list};
+use crate::config::raw::RawAxes;
 
 impl ProgramChecker<'_> {
-    pub(super) fn home(
-        &self,
-        names: Option<Vec<Spanned<String>>>,
-        at: &Span,
-        p: &mut Problems<'_>,
-    ) -> Option<Action> {
+    pub(super) fn home(&self, names: RawAxes, at: &Span, p: &mut Problems<'_>) -> Option<Action> {
         let homes = |index: &usize| {
             let axis = self.devices[*index].axis.ok();
             axis.is_some_and(|axis| axis.homing.is_some())

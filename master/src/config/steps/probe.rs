@@ -4,8 +4,8 @@ use ecaxis_axis::{Edge, Probe};
 use toml::Spanned;
 
 use super::ProgramChecker;
-use super::target::{TargetKind, fraction, within};
-use crate::config::axis::control::one_of;
+use super::target::{TargetKind, within};
+use crate::config::fields::KeyExt;
 use crate::config::problem::Problems;
 use crate::config::raw::RawProbe;
 use crate::config::{Action, DeviceConfig};
@@ -27,21 +27,19 @@ const fn position_object(probe: Probe, edge: Edge) -> u16 {
 }
 
 impl ProgramChecker<'_> {
-    pub(super) fn probe(&self, raw: &RawProbe, p: &mut Problems<'_>) -> Option<Action> {
-        let (speed, ramp) = (
-            fraction(raw.speed.clone(), "speed", p),
-            fraction(raw.ramp.clone(), "ramp", p),
-        );
-        let edges = [("rising", Edge::Positive), ("falling", Edge::Negative)];
-        let edge = match &raw.edge {
-            None => Some(Edge::Positive),
-            Some(word) => known(word, &edges, p),
-        };
-        let probe = match raw.input.as_ref().map(|n| *n.get_ref()) {
+    pub(super) fn probe(
+        &self,
+        name: &Spanned<String>,
+        raw: &RawProbe,
+        (speed, ramp): (Option<f64>, Option<f64>),
+        p: &mut Problems<'_>,
+    ) -> Option<Action> {
+        let edge = raw.edge.value().unwrap_or(Edge::Positive);
+        let probe = match raw.input.value() {
             Some(2) => Probe::Second,
             _ => Probe::First,
         };
-        let (index, axis) = self.axis(&raw.axis, p)?;
+        let (index, axis) = self.axis(name, p)?;
         let (what, value) = match (&raw.to, &raw.by) {
             (Some(to), _) => (TargetKind::Position, to),
             (None, Some(by)) => (TargetKind::Way, by),
@@ -49,19 +47,19 @@ impl ProgramChecker<'_> {
             (None, None) => return None,
         };
         if !self.any_mode(index, |mode| TargetKind::Position.possible(mode, axis)) {
-            let (_, hint) = TargetKind::Position.impossible(raw.axis.get_ref(), axis);
+            let (_, hint) = TargetKind::Position.impossible(name.get_ref(), axis);
             let message = format!(
                 "`probe` is nothing that `{}` does in mode \"{}\"",
-                raw.axis.get_ref(),
+                name.get_ref(),
                 axis.mode
             );
-            p.add_hint(raw.axis.span(), message, hint);
+            p.add_hint(name.span(), message, hint);
             return None;
         }
         let inside = within(value, what, axis, p);
-        let (speed, ramp, edge) = (speed?, ramp?, edge?);
+        let (speed, ramp) = (speed?, ramp?);
         if let Some(device) = self.devices[index].device {
-            mapped(device, &raw.axis, probe, edge, p)?;
+            mapped(device, name, probe, edge, p)?;
         }
         inside.then(|| Action::Probe {
             axis: index,
@@ -73,11 +71,6 @@ impl ProgramChecker<'_> {
             ramp,
         })
     }
-}
-
-fn known(word: &Spanned<String>, edges: &[(&str, Edge)], p: &mut Problems<'_>) -> Option<Edge> {
-    let all: Vec<(&str, Option<Edge>)> = edges.iter().map(|(name, e)| (*name, Some(*e))).collect();
-    one_of(Some(word), &all, "edge", p).flatten()
 }
 
 /// Reports probe objects missing from the process data or from the drive.

@@ -3,32 +3,23 @@
 use toml::Spanned;
 
 use super::ProgramChecker;
-use crate::config::axis::control::one_of;
-use crate::config::axis::control::{STOP_METHODS, STOPS_BY_DRIVE};
+use crate::config::fields::KeyExt;
 use crate::config::problem::{Problems, suggestion};
 use crate::config::raw::{RawGroup, RawStop};
 use crate::config::{GroupStopScope, StopGroup, StopSetup};
 use ecaxis_axis::StopMethod;
 
-const OUTSIDE: [(&str, GroupStopScope); 2] = [
-    ("stop", GroupStopScope::Stop),
-    ("continue", GroupStopScope::Continue),
-];
-
 impl ProgramChecker<'_> {
     /// Returns the stop settings. Mistakes are reported and replaced by defaults.
     pub(super) fn stop(&mut self, raw: &RawStop, p: &mut Problems<'_>) -> StopSetup {
-        let others = match &raw.others {
-            Some(_) => one_of(raw.others.as_ref(), &STOP_METHODS, "others", p).unwrap_or_default(),
-            None => StopMethod::Ramp,
-        };
+        let others = raw.others.value().unwrap_or(StopMethod::Ramp);
         let mut groups: Vec<StopGroup> = Vec::new();
         for (index, group) in raw.groups.iter().enumerate() {
             let group = self.group(group, &raw.groups[..index], &groups, others, p);
             groups.push(group);
         }
         let mut emergency = Vec::new();
-        for raw in &raw.emergency {
+        for raw in raw.emergency.iter().flat_map(|conditions| &conditions.0) {
             let Some(condition) = self.condition(raw, p) else {
                 continue;
             };
@@ -47,8 +38,7 @@ impl ProgramChecker<'_> {
         }
         StopSetup {
             others,
-            bus_lost: one_of(raw.bus_lost.as_ref(), &STOPS_BY_DRIVE, "bus_lost", p)
-                .unwrap_or_default(),
+            bus_lost: raw.bus_lost.value().unwrap_or_default(),
             emergency,
             groups,
         }
@@ -81,20 +71,15 @@ impl ProgramChecker<'_> {
                 .as_ref()
                 .map_or_else(String::new, |n| n.get_ref().clone()),
             devices: Vec::new(),
-            others: match &raw.others {
-                Some(_) => {
-                    one_of(raw.others.as_ref(), &STOP_METHODS, "others", p).unwrap_or_default()
-                }
-                None => others,
-            },
-            outside: one_of(raw.outside.as_ref(), &OUTSIDE, "outside", p).unwrap_or_default(),
+            others: raw.others.value().unwrap_or(others),
+            outside: raw.outside.value().unwrap_or_default(),
         };
-        for name in &raw.axes {
+        for name in raw.axes.iter().flat_map(|names| &names.0) {
             if let Some((device, _)) = self.axis(name, p) {
                 self.join(&mut group, name, device, groups, p);
             }
         }
-        for name in &raw.devices {
+        for name in raw.devices.iter().flat_map(|names| &names.0) {
             let Some(device) = self.devices.iter().position(|d| d.name == name.get_ref()) else {
                 let hint = suggestion(
                     name.get_ref(),

@@ -5,20 +5,21 @@ use toml::Spanned;
 use super::ProgramChecker;
 use crate::config::AxisSetup;
 use crate::config::axis::too_long;
+use crate::config::fields::Key;
 use crate::config::problem::{Problems, Span};
-use crate::config::raw::RawTarget;
+use crate::config::raw::Named;
 use ecaxis_axis::Mode;
 
 impl ProgramChecker<'_> {
     pub(super) fn targets(
         &self,
-        targets: Vec<RawTarget>,
+        targets: Named<f64>,
         what: TargetKind,
         p: &mut Problems<'_>,
     ) -> Option<Vec<(usize, f64)>> {
         let count = targets.len();
         let mut resolved = Vec::with_capacity(count);
-        for RawTarget { axis: name, value } in targets {
+        for (name, value) in targets {
             let Some((index, axis)) = self.axis(&name, p) else {
                 continue;
             };
@@ -66,11 +67,7 @@ impl ProgramChecker<'_> {
     }
 }
 
-pub(super) fn fraction(
-    value: Option<Spanned<f64>>,
-    what: &str,
-    p: &mut Problems<'_>,
-) -> Option<f64> {
+pub(super) fn fraction(value: &Key<f64>, what: &str, p: &mut Problems<'_>) -> Option<f64> {
     let Some(value) = value else { return Some(1.0) };
     let n = *value.get_ref();
     if n > 0.0 && n <= 1.0 {
@@ -99,6 +96,10 @@ pub(super) enum TargetKind {
 }
 
 impl TargetKind {
+    pub(super) fn of_move(relative: bool) -> Self {
+        if relative { Self::Way } else { Self::Position }
+    }
+
     fn verb(self) -> &'static str {
         match self {
             Self::Position | Self::SetPoint => "move",
