@@ -19,7 +19,7 @@ use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 use ecaxis_esi::address;
 
 use crate::clock;
-use crate::config::{AdoptedUnits, LimitConflict, Machine, UnitProblem};
+use crate::config::{AdoptedUnits, LimitConflict, MAX_SUBDEVICES, Machine, UnitProblem};
 use crate::datagram::DatagramClient;
 use crate::mailbox::worker::EmergencySink;
 use crate::mailbox::{CoeClient, DatagramError, SdoError};
@@ -43,8 +43,6 @@ pub use al::{AlState, StateError};
 use device::StartupPhase;
 pub use device::{SdoOutcome, write_startup_sdo};
 
-/// The maximum number of SubDevices in ethercrab's group; a power of two.
-pub(crate) const MAX_SUBDEVICES: usize = 512;
 /// The size of ethercrab's own process image, which is not used.
 const MAX_PDI: usize = 1;
 

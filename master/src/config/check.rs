@@ -12,10 +12,8 @@ use super::problem::{Problems, Span};
 use super::raw::{RawBus, RawDevice, RawMachine};
 use super::sim;
 use super::steps::{self, ResolvedDevice};
-use crate::bringup::MAX_SUBDEVICES;
-use crate::rt::spin::Spin;
 
-use super::{Bus, DeviceConfig, Locator, Machine, Nic, Signal, signal};
+use super::{Bus, DeviceConfig, Locator, MAX_SUBDEVICES, Machine, Nic, Signal, Spin, signal};
 
 /// Returns `None` only if a problem has been reported.
 pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Option<Machine> {

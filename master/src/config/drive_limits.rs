@@ -9,6 +9,7 @@ use ecaxis_esi as esi;
 
 use super::problem::Problems;
 use super::raw::RawSdo;
+use super::units::rounded;
 use super::{AxisSetup, UnitSource};
 use crate::mailbox::NamedObject;
 
@@ -116,9 +117,9 @@ impl AxisSetup {
                 None => count != i64::from(full),
             };
             if exceeds {
-                let at = short(at);
+                let at = rounded(at);
                 let end = end.map_or("is not set".to_owned(), |end| {
-                    format!("goes to {} {unit}", short(end))
+                    format!("goes to {} {unit}", rounded(end))
                 });
                 let text = format!("= {count} is {at} {unit}, `limits.position` {end}");
                 found.push(LimitConflict {
@@ -156,8 +157,8 @@ impl AxisSetup {
             sub: 0,
             text: format!(
                 "= {raw} {shown} allows {} {name}/s, `limits.velocity` is {} {name}/s{doubt}",
-                short(most),
-                short(limit),
+                rounded(most),
+                rounded(limit),
             ),
             certain,
         })
@@ -178,8 +179,8 @@ impl AxisSetup {
             sub: 0,
             text: format!(
                 "= {raw} {unit} allows {} {name}/s², `limits.acceleration` is {} {name}/s²{doubt}",
-                short(most),
-                short(limit),
+                rounded(most),
+                rounded(limit),
             ),
             certain,
         })
@@ -195,8 +196,8 @@ impl AxisSetup {
             sub: 0,
             text: format!(
                 "= {window} is {} {name}, `limits.following_error` is {} {name}: the drive faults first",
-                short(most),
-                short(limit),
+                rounded(most),
+                rounded(limit),
             ),
             certain: true,
         })
@@ -213,8 +214,8 @@ impl AxisSetup {
             sub: 0,
             text: format!(
                 "= {raw} ‰ of rated torque allows {} {unit}, `limits.torque` is {} {unit}",
-                short(torque.shown(most)),
-                short(torque.shown(limit)),
+                rounded(torque.shown(most)),
+                rounded(torque.shown(limit)),
                 unit = torque.unit,
             ),
             certain: true,
@@ -225,11 +226,6 @@ impl AxisSetup {
 /// Returns `true` if the excess is larger than a rounding error.
 fn exceeds(limit: f64, most: f64) -> bool {
     limit > most * (1.0 + 1e-6)
-}
-
-fn short(value: f64) -> String {
-    let rounded = (value * 1e6).round() / 1e6;
-    if rounded.is_finite() { rounded } else { value }.to_string()
 }
 
 fn number(bytes: &[u8], signed: bool) -> i64 {

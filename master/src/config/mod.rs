@@ -4,8 +4,8 @@
 //! |---|---|
 //! | `problem.rs` | a mistake with its place in the file; "did you mean" |
 //! | `duration.rs` | `"250us"` |
-//! | `fields.rs` | typed values from TOML tables |
-//! | `raw/` | the file as written |
+//! | `fields.rs` | `table!`: a table's keys, types, ranges and examples in one place |
+//! | `raw/` | the file as written: its tables |
 //! | `check.rs` | raw → [`Machine`]: bus, names, positions |
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
 //! | `sdo.rs` | values of start-up SDOs as bytes |
@@ -17,17 +17,18 @@
 //! | `travel.rs` | switches and ends along a simulated axis |
 //! | `units.rs` | names of position units |
 //! | `gateway.rs` | the network behind a simulated gateway |
-//! | `steps.rs` | the program; `[stop]` in `steps/stop.rs` |
+//! | `steps.rs` | checks of the program; `[stop]` in `steps/stop.rs` |
+//! | `program.rs` | the program, and its steps as text |
 //!
 //! All mistakes are collected, so that one check reports every mistake of a file.
 
+use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 mod axis;
 mod check;
 mod device;
-mod display;
 #[cfg(test)]
 mod documented;
 pub(crate) mod drive_limits;
@@ -37,6 +38,7 @@ pub mod duration;
 mod fields;
 mod gateway;
 mod problem;
+mod program;
 mod raw;
 mod sdo;
 mod signal;
@@ -54,12 +56,10 @@ pub(crate) use device::further_axis;
 pub use drive_limits::LimitConflict;
 pub use drive_units::{AdoptedUnits, UnitProblem};
 pub use problem::{ConfigError, Problem, nearest};
-pub use signal::{AxisRef, InputRef, NameError, OutputRef};
+pub use program::{Action, Condition, GroupStopScope, Step, StopGroup, StopSetup, TableFile};
+pub use signal::{AxisRef, InputRef, NameError, NumericFormat, OutputRef, Signal};
 pub use startup::{Startup, StartupOptions};
 
-pub use crate::rt::exchange::ExchangeMode as Exchange;
-
-use ecaxis_axis::StopMethod;
 use ecaxis_esi as esi;
 
 use fields::Read;
@@ -67,8 +67,9 @@ use raw::RawMachine;
 
 use crate::esi_library::RevisionMatch;
 use crate::file;
-use crate::link::SocketKind;
-use crate::rt::spin::Spin;
+
+/// The maximum number of SubDevices on a bus; a power of two, as ethercrab's group needs.
+pub(crate) const MAX_SUBDEVICES: usize = 512;
 
 /// A machine: the content of the machine file and everything derived from its ESI files.
 #[derive(Debug, Clone)]
@@ -156,6 +157,55 @@ impl Default for Bus {
     }
 }
 
+/// The cycle in which answers are evaluated.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Exchange {
+    /// The cycle that sent the frames; the thread waits for the answers.
+    #[default]
+    SameCycle,
+    /// The cycle after it: the answers have arrived by then, and the thread does not wait.
+    Pipelined,
+}
+
+/// How long before a release the real-time thread is awake.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Spin {
+    /// Adapts to the measured wake-up lateness.
+    #[default]
+    Auto,
+    /// A fixed time in ns; 0 means sleep only.
+    For(u64),
+}
+
+/// How frames are received from a network interface.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum SocketKind {
+    /// From mapped memory: `ring::RingLink`.
+    #[default]
+    Ring,
+    /// By system calls: `packet::PacketLink`.
+    Packet,
+}
+
+impl SocketKind {
+    pub const ALL: &[Self] = &[Self::Ring, Self::Packet];
+
+    /// Returns the name in the machine file.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Ring => "ring",
+            Self::Packet => "packet",
+        }
+    }
+}
+
+impl fmt::Display for SocketKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Nic {
     /// The simulated bus, with the same ESI files.
@@ -196,8 +246,8 @@ pub enum Locator {
     Id(u16),
 }
 
-impl std::fmt::Display for Locator {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+impl fmt::Display for Locator {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Position(n) => write!(f, "position {n}"),
             Self::Alias(n) => write!(f, "alias {n}"),
@@ -284,8 +334,8 @@ impl TorqueUnit {
     }
 }
 
-impl std::fmt::Display for TorqueUnit {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+impl fmt::Display for TorqueUnit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.sign())
     }
 }
@@ -305,177 +355,6 @@ pub enum UnitSource {
     Nothing,
 }
 
-/// One step of the program.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Step {
-    /// The step number: `2`, or `2.1` for the first step inside the second.
-    pub number: String,
-    /// The line in the machine file.
-    pub line: u32,
-    pub action: Action,
-}
-
-/// The action of a step. Axes are indices into [`Machine::devices`]. Targets are pairs of such an
-/// index and a value in user units.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Action {
-    Enable {
-        axes: Vec<usize>,
-    },
-    /// Decelerate, then remove power.
-    Disable {
-        axes: Vec<usize>,
-    },
-    /// Acknowledge trips and reset drive faults.
-    Reset {
-        axes: Vec<usize>,
-    },
-    /// Homing by the drive.
-    Home {
-        axes: Vec<usize>,
-    },
-    /// Decelerate and hold position.
-    Stop {
-        axes: Vec<usize>,
-    },
-    /// Move and wait until every axis is in target.
-    Move {
-        /// `true` if targets are relative to the position at the start of the step.
-        relative: bool,
-        targets: Vec<(usize, f64)>,
-        /// The fraction of each axis's velocity limit.
-        speed: f64,
-        /// The fraction of each axis's acceleration limit.
-        ramp: f64,
-        /// `true` for jerk-limited motion from rest in which all axes arrive in the same cycle.
-        together: bool,
-    },
-    /// Move until the touch probe's input has an edge. The step fails without an edge.
-    Probe {
-        axis: usize,
-        probe: ecaxis_axis::Probe,
-        edge: ecaxis_axis::Edge,
-        /// `true` if the end of the move is relative to the present position.
-        relative: bool,
-        target: f64,
-        /// The fractions, as in [`Action::Move`].
-        speed: f64,
-        ramp: f64,
-    },
-    /// Move all axes along a straight line, jerk-limited; they arrive in the same cycle.
-    Line {
-        relative: bool,
-        targets: Vec<(usize, f64)>,
-        /// The fraction of each axis's velocity limit.
-        speed: f64,
-        /// The fraction of each axis's acceleration and jerk limits.
-        ramp: f64,
-    },
-    /// Move in a wave around the present position.
-    Wave {
-        axis: usize,
-        wave: ecaxis_axis::setpoint::Wave,
-    },
-    /// Move to the table's first position, then play the table.
-    Table {
-        axis: usize,
-        /// The index into [`Machine::tables`].
-        table: usize,
-        /// The fractions for the move to the first position, as in [`Action::Move`].
-        speed: f64,
-        ramp: f64,
-    },
-    /// Make one axis follow another until its next motion.
-    Gear {
-        axis: usize,
-        master: usize,
-        /// `true` to follow the master's actual position instead of its set-point.
-        actual: bool,
-        /// The number of follower units per master unit.
-        ratio: f64,
-        /// The follower's position at master position 0. `None`: the present relation stays.
-        offset: Option<f64>,
-        smoothing_ns: u64,
-    },
-    /// Reach the velocities and keep moving.
-    Velocity {
-        targets: Vec<(usize, f64)>,
-        /// The fraction of each axis's acceleration limit.
-        ramp: f64,
-    },
-    /// Apply torques in percent of rated torque.
-    Torque {
-        targets: Vec<(usize, f64)>,
-        /// The time of the ramp to the new torque.
-        ramp_ns: u64,
-    },
-    /// Switch modes of operation, even in motion.
-    Mode {
-        targets: Vec<(usize, ecaxis_axis::Mode)>,
-    },
-    Dwell {
-        ns: u64,
-    },
-    /// Wait until all conditions hold in the same cycle.
-    Wait {
-        conditions: Vec<Condition>,
-        timeout_ns: u64,
-    },
-    /// Set outputs: indices into [`Machine::outputs`], and values.
-    Set {
-        values: Vec<(usize, f64)>,
-    },
-    Repeat {
-        times: u32,
-        steps: Vec<Step>,
-    },
-}
-
-/// How the machine stops.
-#[derive(Debug, Clone, PartialEq)]
-pub struct StopSetup {
-    /// The stop method of the other axes after a fault or trip, unless their group has its own.
-    pub others: StopMethod,
-    /// The stop method of axes without valid inputs. Axes that still answer stop by set-points.
-    pub bus_lost: StopMethod,
-    /// The conditions for an emergency stop; one is enough.
-    pub emergency: Vec<Condition>,
-    /// The groups of SubDevices that stop together. Devices without a group form one more group.
-    pub groups: Vec<StopGroup>,
-}
-
-impl Default for StopSetup {
-    fn default() -> Self {
-        Self {
-            others: StopMethod::Ramp,
-            bus_lost: StopMethod::QuickStop,
-            emergency: Vec::new(),
-            groups: Vec::new(),
-        }
-    }
-}
-
-/// SubDevices that stop together.
-#[derive(Debug, Clone, PartialEq)]
-pub struct StopGroup {
-    pub name: String,
-    /// The indices into [`Machine::devices`], with and without an axis. A device is in one group
-    /// only.
-    pub devices: Vec<usize>,
-    /// The stop method of its other axes after a fault or trip.
-    pub others: StopMethod,
-    pub outside: GroupStopScope,
-}
-
-/// What the machine does when a group stops.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum GroupStopScope {
-    /// The machine stops as well, within the limits of its axes.
-    #[default]
-    Stop,
-    Continue,
-}
-
 impl Machine {
     /// Returns the group's name in the machine file; empty for group 0, which has no name.
     #[must_use]
@@ -493,73 +372,6 @@ impl Machine {
         let mut groups = self.stop.groups.iter();
         let named = groups.position(|group| group.devices.contains(&device));
         named.map_or(0, |index| index + 1)
-    }
-}
-
-/// A table of set-points and its file.
-#[derive(Debug, Clone, PartialEq)]
-pub struct TableFile {
-    pub path: PathBuf,
-    pub table: ecaxis_axis::setpoint::Table,
-}
-
-/// A condition on an input. All given bounds must hold.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Condition {
-    /// The index into [`Machine::inputs`].
-    pub input: usize,
-    pub equal: Option<f64>,
-    pub above: Option<f64>,
-    pub below: Option<f64>,
-}
-
-impl Condition {
-    #[must_use]
-    pub fn holds(&self, value: f64) -> bool {
-        self.equal.is_none_or(|n| value == n)
-            && self.above.is_none_or(|n| value > n)
-            && self.below.is_none_or(|n| value < n)
-    }
-}
-
-/// Process data that the program reads or sets.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Signal {
-    /// The index into [`Machine::devices`].
-    pub device: usize,
-    /// The name with its device's name: `io.Input 3`.
-    pub name: String,
-    pub field: esi::layout::Field,
-}
-
-/// The number format of a signal's bits.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum NumericFormat {
-    Unsigned,
-    Signed,
-    /// IEEE 754, 32 bits.
-    Real,
-}
-
-impl Signal {
-    #[must_use]
-    pub fn kind(&self) -> NumericFormat {
-        match self.field.data_type.as_str() {
-            "REAL" if self.field.bit_len == 32 => NumericFormat::Real,
-            "SINT" | "INT" | "INT24" | "DINT" | "INT40" | "INT48" | "INT56" | "LINT"
-            | "INTEGER8" | "INTEGER16" | "INTEGER32" | "INTEGER64" => NumericFormat::Signed,
-            _ => NumericFormat::Unsigned,
-        }
-    }
-
-    /// Returns the lowest and highest value, and whether only integers are possible.
-    fn range(&self) -> (f64, f64, bool) {
-        let steps = f64::from(self.field.bit_len).exp2();
-        match self.kind() {
-            NumericFormat::Real => (f64::from(f32::MIN), f64::from(f32::MAX), false),
-            NumericFormat::Signed => (-steps / 2.0, steps / 2.0 - 1.0, true),
-            NumericFormat::Unsigned => (0.0, steps - 1.0, true),
-        }
     }
 }
 

@@ -8,7 +8,48 @@ use toml::Spanned;
 use super::problem::{Problems, suggestion};
 use super::raw::RawSignal;
 use super::steps::ResolvedDevice;
-use super::{DeviceConfig, Machine, Signal, further_axis};
+use super::{DeviceConfig, Machine, further_axis};
+
+/// Process data that the program reads or sets.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Signal {
+    /// The index into [`Machine::devices`].
+    pub device: usize,
+    /// The name with its device's name: `io.Input 3`.
+    pub name: String,
+    pub field: Field,
+}
+
+/// The number format of a signal's bits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NumericFormat {
+    Unsigned,
+    Signed,
+    /// IEEE 754, 32 bits.
+    Real,
+}
+
+impl Signal {
+    #[must_use]
+    pub fn kind(&self) -> NumericFormat {
+        match self.field.data_type.as_str() {
+            "REAL" if self.field.bit_len == 32 => NumericFormat::Real,
+            "SINT" | "INT" | "INT24" | "DINT" | "INT40" | "INT48" | "INT56" | "LINT"
+            | "INTEGER8" | "INTEGER16" | "INTEGER32" | "INTEGER64" => NumericFormat::Signed,
+            _ => NumericFormat::Unsigned,
+        }
+    }
+
+    /// Returns the lowest and highest value, and whether only integers are possible.
+    pub(super) fn range(&self) -> (f64, f64, bool) {
+        let steps = f64::from(self.field.bit_len).exp2();
+        match self.kind() {
+            NumericFormat::Real => (f64::from(f32::MIN), f64::from(f32::MAX), false),
+            NumericFormat::Signed => (-steps / 2.0, steps / 2.0 - 1.0, true),
+            NumericFormat::Unsigned => (0.0, steps - 1.0, true),
+        }
+    }
+}
 
 /// Objects that only the axes write (CiA 402, ETG.6010).
 const AXIS_OUTPUTS: [u16; 11] = [

@@ -262,7 +262,6 @@ fn axis_converts_torques_in_nm_and_a() {
 
 #[test]
 fn bus_spin_is_automatic_or_fixed() {
-    use crate::rt::spin::Spin;
     for (said, spin) in [
         ("repeat = 2", Spin::Auto),
         ("spin = \"auto\"", Spin::Auto),

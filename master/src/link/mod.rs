@@ -27,6 +27,7 @@ pub mod source_address;
 pub mod tee;
 
 pub use crate::clock::Nanos;
+pub use crate::config::SocketKind;
 pub use filter::LinkStats;
 pub use interface::{NicWarning, OpenError};
 pub use lock::open_exclusive;
@@ -78,41 +79,11 @@ pub trait Link: fmt::Debug + Send {
     }
 }
 
-/// How frames are received from a network interface.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum SocketKind {
-    /// From mapped memory: [`ring::RingLink`].
-    #[default]
-    Ring,
-    /// By system calls: [`packet::PacketLink`].
-    Packet,
-}
-
-impl SocketKind {
-    pub const ALL: &[Self] = &[Self::Ring, Self::Packet];
-
-    /// Returns the name in the machine file.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Ring => "ring",
-            Self::Packet => "packet",
-        }
-    }
-}
-
-impl fmt::Display for SocketKind {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
 /// Opens a network interface and returns warnings about settings that disturb the cycle. If no ring
 /// is available, a plain socket is used, with a warning. Blocks and allocates.
 ///
 /// # Errors
 /// The reason why the interface cannot be used.
-/// Why the interface cannot be used.
 pub fn open(
     nic: &str,
     back_end: SocketKind,

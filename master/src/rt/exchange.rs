@@ -20,6 +20,7 @@ use super::image::plan::frames as frames_of;
 use super::image::{Access, ImagePlan};
 use super::phase::ClockPlan;
 use crate::clock::Nanos;
+pub use crate::config::Exchange as ExchangeMode;
 use crate::link::pdu_loop::ETHERCAT;
 use crate::link::{Link, LinkError};
 
@@ -40,7 +41,7 @@ use frame::{
 use frame_set::FrameSet;
 pub use poll_schedule::LONGEST_LOOK;
 use poll_schedule::{PollSchedule, PollTarget};
-pub use result::{CycleResult, Evidence, ExchangeDevice, ExchangeMode, GroupResult, Received};
+pub use result::{CycleResult, Evidence, ExchangeDevice, GroupResult, Received};
 use slots::DatagramSlots;
 
 /// After a wrong working counter each device has its own datagram, until this many cycles in a row

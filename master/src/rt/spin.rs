@@ -2,6 +2,7 @@
 
 use super::exchange::ExchangeMode;
 use crate::clock::Nanos;
+pub use crate::config::Spin;
 
 /// Spinning begins at least this long before the release. It never begins earlier than `LONGEST` or
 /// a share of the cycle.
@@ -24,16 +25,6 @@ const FIRST: Nanos = 100_000;
 /// in balance when one wake-up in a thousand is late.
 const RISE: Nanos = 10_000;
 const FALL: Nanos = RISE / 999;
-
-/// How long before a release the thread is awake.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Spin {
-    /// Adapts to the measured wake-up lateness.
-    #[default]
-    Auto,
-    /// A fixed time; 0 means sleep only.
-    For(Nanos),
-}
 
 impl Spin {
     /// Returns the upper bound of the spin time.

@@ -10,9 +10,7 @@ use super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Writte
 use super::gateway::RawNode;
 use super::problem::{Problems, Span};
 use super::travel::RawTrack;
-use super::{Exchange, GroupStopScope};
-use crate::link::SocketKind;
-use crate::rt::spin::Spin;
+use super::{Exchange, GroupStopScope, SocketKind, Spin};
 
 mod axis;
 mod step;

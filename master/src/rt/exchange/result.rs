@@ -1,5 +1,6 @@
 //! What an exchange reports of a cycle.
 
+use super::ExchangeMode;
 use crate::clock::Nanos;
 
 /// A SubDevice in the exchange.
@@ -77,16 +78,6 @@ pub struct CycleResult {
     pub al_status: Option<(u8, u16)>,
     /// The delay from the planned release of these frames until they were sent.
     pub sent_late: Nanos,
-}
-
-/// The cycle in which answers are evaluated.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum ExchangeMode {
-    /// The cycle that sent the frames; the thread waits for the answers.
-    #[default]
-    SameCycle,
-    /// The cycle after it: the answers have arrived by then, and the thread does not wait.
-    Pipelined,
 }
 
 impl ExchangeMode {

@@ -1,8 +1,208 @@
-//! Steps as text, for `explain`, progress and errors.
+//! The program of a machine, its stop settings, and their text for `explain`, progress and errors.
 
-use ecaxis_axis::Edge;
+use std::path::PathBuf;
 
-use super::{Action, Condition, Machine, duration};
+use ecaxis_axis::{Edge, StopMethod};
+
+use super::units::rounded;
+use super::{Machine, duration};
+
+/// One step of the program.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Step {
+    /// The step number: `2`, or `2.1` for the first step inside the second.
+    pub number: String,
+    /// The line in the machine file.
+    pub line: u32,
+    pub action: Action,
+}
+
+/// The action of a step. Axes are indices into [`Machine::devices`]. Targets are pairs of such an
+/// index and a value in user units.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Action {
+    Enable {
+        axes: Vec<usize>,
+    },
+    /// Decelerate, then remove power.
+    Disable {
+        axes: Vec<usize>,
+    },
+    /// Acknowledge trips and reset drive faults.
+    Reset {
+        axes: Vec<usize>,
+    },
+    /// Homing by the drive.
+    Home {
+        axes: Vec<usize>,
+    },
+    /// Decelerate and hold position.
+    Stop {
+        axes: Vec<usize>,
+    },
+    /// Move and wait until every axis is in target.
+    Move {
+        /// `true` if targets are relative to the position at the start of the step.
+        relative: bool,
+        targets: Vec<(usize, f64)>,
+        /// The fraction of each axis's velocity limit.
+        speed: f64,
+        /// The fraction of each axis's acceleration limit.
+        ramp: f64,
+        /// `true` for jerk-limited motion from rest in which all axes arrive in the same cycle.
+        together: bool,
+    },
+    /// Move until the touch probe's input has an edge. The step fails without an edge.
+    Probe {
+        axis: usize,
+        probe: ecaxis_axis::Probe,
+        edge: Edge,
+        /// `true` if the end of the move is relative to the present position.
+        relative: bool,
+        target: f64,
+        /// The fractions, as in [`Action::Move`].
+        speed: f64,
+        ramp: f64,
+    },
+    /// Move all axes along a straight line, jerk-limited; they arrive in the same cycle.
+    Line {
+        relative: bool,
+        targets: Vec<(usize, f64)>,
+        /// The fraction of each axis's velocity limit.
+        speed: f64,
+        /// The fraction of each axis's acceleration and jerk limits.
+        ramp: f64,
+    },
+    /// Move in a wave around the present position.
+    Wave {
+        axis: usize,
+        wave: ecaxis_axis::setpoint::Wave,
+    },
+    /// Move to the table's first position, then play the table.
+    Table {
+        axis: usize,
+        /// The index into [`Machine::tables`].
+        table: usize,
+        /// The fractions for the move to the first position, as in [`Action::Move`].
+        speed: f64,
+        ramp: f64,
+    },
+    /// Make one axis follow another until its next motion.
+    Gear {
+        axis: usize,
+        master: usize,
+        /// `true` to follow the master's actual position instead of its set-point.
+        actual: bool,
+        /// The number of follower units per master unit.
+        ratio: f64,
+        /// The follower's position at master position 0. `None`: the present relation stays.
+        offset: Option<f64>,
+        smoothing_ns: u64,
+    },
+    /// Reach the velocities and keep moving.
+    Velocity {
+        targets: Vec<(usize, f64)>,
+        /// The fraction of each axis's acceleration limit.
+        ramp: f64,
+    },
+    /// Apply torques in percent of rated torque.
+    Torque {
+        targets: Vec<(usize, f64)>,
+        /// The time of the ramp to the new torque.
+        ramp_ns: u64,
+    },
+    /// Switch modes of operation, even in motion.
+    Mode {
+        targets: Vec<(usize, ecaxis_axis::Mode)>,
+    },
+    Dwell {
+        ns: u64,
+    },
+    /// Wait until all conditions hold in the same cycle.
+    Wait {
+        conditions: Vec<Condition>,
+        timeout_ns: u64,
+    },
+    /// Set outputs: indices into [`Machine::outputs`], and values.
+    Set {
+        values: Vec<(usize, f64)>,
+    },
+    Repeat {
+        times: u32,
+        steps: Vec<Step>,
+    },
+}
+
+/// How the machine stops.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StopSetup {
+    /// The stop method of the other axes after a fault or trip, unless their group has its own.
+    pub others: StopMethod,
+    /// The stop method of axes without valid inputs. Axes that still answer stop by set-points.
+    pub bus_lost: StopMethod,
+    /// The conditions for an emergency stop; one is enough.
+    pub emergency: Vec<Condition>,
+    /// The groups of SubDevices that stop together. Devices without a group form one more group.
+    pub groups: Vec<StopGroup>,
+}
+
+impl Default for StopSetup {
+    fn default() -> Self {
+        Self {
+            others: StopMethod::Ramp,
+            bus_lost: StopMethod::QuickStop,
+            emergency: Vec::new(),
+            groups: Vec::new(),
+        }
+    }
+}
+
+/// SubDevices that stop together.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StopGroup {
+    pub name: String,
+    /// The indices into [`Machine::devices`], with and without an axis. A device is in one group
+    /// only.
+    pub devices: Vec<usize>,
+    /// The stop method of its other axes after a fault or trip.
+    pub others: StopMethod,
+    pub outside: GroupStopScope,
+}
+
+/// What the machine does when a group stops.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum GroupStopScope {
+    /// The machine stops as well, within the limits of its axes.
+    #[default]
+    Stop,
+    Continue,
+}
+
+/// A table of set-points and its file.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TableFile {
+    pub path: PathBuf,
+    pub table: ecaxis_axis::setpoint::Table,
+}
+
+/// A condition on an input. All given bounds must hold.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Condition {
+    /// The index into [`Machine::inputs`].
+    pub input: usize,
+    pub equal: Option<f64>,
+    pub above: Option<f64>,
+    pub below: Option<f64>,
+}
+
+impl Condition {
+    #[must_use]
+    pub fn holds(&self, value: f64) -> bool {
+        self.equal.is_none_or(|n| value == n)
+            && self.above.is_none_or(|n| value > n)
+            && self.below.is_none_or(|n| value < n)
+    }
+}
 
 impl Machine {
     /// Returns a step as text: `move x → 50 mm at 50 % of the velocity …`.
@@ -172,10 +372,6 @@ impl Machine {
     }
 }
 
-fn rounded(x: f64) -> f64 {
-    (x * 1e6).round() / 1e6
-}
-
 /// The placeholder of the axis's torque unit.
 const TORQUE: &str = "torque";
 
@@ -186,5 +382,5 @@ fn short(x: f64) -> f64 {
 
 /// Returns a fraction in percent, without digits that come from rounding.
 fn percent(fraction: f64) -> f64 {
-    (fraction * 1e8).round() / 1e6
+    rounded(fraction * 100.0)
 }
