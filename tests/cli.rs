@@ -375,7 +375,7 @@ impl Files {
 }
 
 #[test]
-fn firmware_overwrites_only_recordings() {
+fn firmware_overwrites_only_with_force() {
     let files = Files::new();
     let (notes, program) = (files.at("notes.txt"), files.at("new.bin"));
     let sample = [
@@ -396,7 +396,11 @@ fn firmware_overwrites_only_recordings() {
         "--virtual",
         "--record",
     ];
-    let refused = ["--record", "is not a recording", "= help: name a new file"];
+    let refused = [
+        "--record",
+        "exists already",
+        "= help: name another file, or overwrite it with `--force`",
+    ];
     files.keeps("notes.txt", &[&info[..], &[&notes]].concat(), &refused);
     let update = [
         "firmware",
@@ -407,7 +411,7 @@ fn firmware_overwrites_only_recordings() {
         "--sim",
         "--virtual",
     ];
-    let line = [&update[..], &["--yes", "--record", &program]].concat();
+    let line = [&update[..], &["--yes", "--force", "--record", &program]].concat();
     files.keeps(
         "new.bin",
         &line,
@@ -425,8 +429,7 @@ fn firmware_overwrites_only_recordings() {
         &notes,
     ];
     files.keeps("notes.txt", &bare, &refused);
-    // An old recording may be overwritten.
-    files.records("ok.pcapng", &[]);
+    files.records("ok.pcapng", &["--force"]);
     // Outputs for the simulated bus are protected as well.
     files.keeps(
         "notes.txt",
@@ -436,7 +439,7 @@ fn firmware_overwrites_only_recordings() {
 }
 
 #[test]
-fn reports_overwrite_only_reports() {
+fn reports_overwrite_only_with_force() {
     let files = Files::new();
     files.records("night2.pcapng", &[]);
     let (ok, night, notes) = (
@@ -447,12 +450,16 @@ fn reports_overwrite_only_reports() {
     let recording = [
         "--html",
         "is a recording to read",
-        "= help: name a new file",
+        "= help: name another file",
     ];
-    files.keeps("ok.pcapng", &["analyze", &ok, "--html", &ok], &recording);
+    files.keeps(
+        "ok.pcapng",
+        &["analyze", &ok, "--force", "--html", &ok],
+        &recording,
+    );
     // A shell pattern expands to several names instead of one.
     let line = ["analyze", "--html", &ok, &night];
-    files.keeps("ok.pcapng", &line, &["--html", "is not a report (HTML)"]);
+    files.keeps("ok.pcapng", &line, &["--html", "exists already"]);
     std::fs::hard_link(&ok, files.at("hard")).expect("linked");
     std::os::unix::fs::symlink(&ok, files.at("soft")).expect("linked");
     for link in ["hard", "soft"] {
@@ -465,11 +472,11 @@ fn reports_overwrite_only_reports() {
     files.keeps(
         "notes.txt",
         &["analyze", &ok, "--html", &notes],
-        &["is not a report"],
+        &["exists already"],
     );
     let page = files.at("report.html");
-    for _ in 0..2 {
-        let output = ecaxis(&["analyze", &ok, "--html", &page]);
+    for force in [&[][..], &["--force"]] {
+        let output = ecaxis(&[&["analyze", &ok, "--html", &page], force].concat());
         assert!(output.status.success(), "{output:?}");
         assert!(files.read("report.html").starts_with(b"<!DOCTYPE html>"));
     }
@@ -481,29 +488,23 @@ fn reports_overwrite_only_reports() {
         "--fault-report",
         &notes,
     ];
-    files.keeps(
-        "notes.txt",
-        &story,
-        &["--fault-report", "is not a fault report"],
-    );
+    files.keeps("notes.txt", &story, &["--fault-report", "exists already"]);
     // Figures and report of a bench are checked before the measurement.
     let both = [
         "bench",
         "--sim",
         "--seconds",
         "1",
+        "--force",
         "--html",
         &page,
         "--save",
         &page,
     ];
     files.keeps("report.html", &both, &["--save"]);
-    for (option, what) in [
-        ("--save", "is not a file of figures (JSON)"),
-        ("--html", "is not a report (HTML)"),
-    ] {
+    for option in ["--save", "--html"] {
         let line = ["bench", "--sim", "--seconds", "1", option, &notes];
-        files.keeps("notes.txt", &line, &[option, what]);
+        files.keeps("notes.txt", &line, &[option, "exists already"]);
     }
 }
 

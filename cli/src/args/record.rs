@@ -1,27 +1,28 @@
-//! Targets of recordings. A recording never overwrites a file of another kind.
+//! Targets of recordings.
 
 use std::path::Path;
 
 use ecaxis_master::config::Machine;
 use ecaxis_master::link::capture;
 
-use crate::args::files::{RECORDING, TargetFile, existing, may_replace};
-use crate::hints;
+use crate::args::files::check_output;
 use crate::hints::Failure;
 
 /// Fails if a run must not write its frames to `target`.
 pub(crate) fn check(
     target: &Path,
+    force: bool,
     machine: &Machine,
     faults: Option<&Path>,
 ) -> Result<(), Failure> {
-    check_distinct(target, Some(machine), faults, None)
+    check_distinct(target, force, Some(machine), faults, None)
 }
 
 /// Fails if frames must not be written to `target`. `input` is a file that is read, with its
 /// description.
 pub(crate) fn check_distinct(
     target: &Path,
+    force: bool,
     machine: Option<&Machine>,
     faults: Option<&Path>,
     input: Option<(&Path, &str)>,
@@ -34,19 +35,14 @@ pub(crate) fn check_distinct(
     let inputs = files
         .chain(faults.map(|path| (path, "the fault script")))
         .chain(input);
-    may_replace("--record", target, &RECORDING, inputs)
+    check_output("--record", target, force, inputs)
 }
 
 /// Fails if the parts of a limited recording would overwrite another file.
-pub(crate) fn check_parts(target: &Path) -> Result<(), Failure> {
+pub(crate) fn check_parts(target: &Path, force: bool) -> Result<(), Failure> {
     let parts = capture::parts_of(target).unwrap_or_default();
-    for part in parts {
-        if let Ok(TargetFile::Taken(what)) = existing(&part, &RECORDING) {
-            let message = format!("--record-limit: {} {what}", part.display());
-            return Err(Failure::new(hints::WRONG, message).hint(RECORDING.instead));
-        }
-    }
-    Ok(())
+    let mut parts = parts.iter();
+    parts.try_for_each(|part| check_output("--record-limit", part, force, []))
 }
 
 /// The minimum size: the first of four parts should hold the bring-up of a long bus.
@@ -81,69 +77,28 @@ pub(crate) fn size(text: &str) -> Result<u64, String> {
 
 #[cfg(test)]
 mod tests {
-    use std::fs;
-
     use super::*;
 
     #[test]
-    fn recording_replaces_only_recordings() {
-        let folder = tempfile::tempdir().unwrap();
+    fn recording_never_overwrites_an_input() {
         let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
-        let copy = |name: &str| {
-            let to = folder.path().join(name);
-            fs::create_dir_all(to.parent().unwrap()).unwrap();
-            fs::copy(configs.join(name), &to).unwrap();
-            to
-        };
-        let demo = copy("demo.toml");
-        let esi = copy("esi/EPOS4.xml");
-        copy("esi/IDX.xml");
-        let machine = ecaxis_master::config::load(&demo).unwrap();
-        let file = |name: &str, bytes: &[u8]| {
-            let path = folder.path().join(name);
-            fs::write(&path, bytes).unwrap();
-            path
-        };
-        let faults = file("faults.toml", b"");
+        let machine = ecaxis_master::config::load(&configs.join("demo.toml")).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let faults = folder.path().join("faults.toml");
+        std::fs::write(&faults, "").unwrap();
         let link = folder.path().join("link");
-        std::os::unix::fs::symlink(&demo, &link).unwrap();
-        let dangling = folder.path().join("dangling");
-        std::os::unix::fs::symlink(folder.path().join("new"), &dangling).unwrap();
-
-        let check = |path: &Path| check(path, &machine, Some(&faults));
-        let new = folder.path().join("new.pcapng");
-        for good in [
-            new.clone(),
-            dangling.clone(),
-            file("empty", b""),
-            file("old.pcapng", b"\n\r\r\n and more"),
-            "/dev/null".into(),
-        ] {
-            assert_eq!(check(&good), Ok(()), "{}", good.display());
-        }
-        assert!(!new.exists());
-        assert!(!dangling.exists() && dangling.is_symlink());
+        std::os::unix::fs::symlink(&machine.path, &link).unwrap();
         for (bad, what) in [
-            (demo.clone(), "the machine file"),
+            (configs.join("demo.toml"), "the machine file"),
             (link, "the machine file"),
-            (esi.clone(), "an ESI file"),
+            (configs.join("esi/EPOS4.xml"), "an ESI file"),
             (faults.clone(), "the fault script"),
-            (folder.path().to_owned(), "is a folder"),
-            (file("notes.txt", b"dear diary"), "is not a recording"),
-            (file("short", b"\n\r"), "is not a recording"),
-            (folder.path().join("no/such/folder"), "cannot write"),
         ] {
-            let failure = check(&bad).unwrap_err();
-            assert_eq!(failure.code, hints::WRONG);
+            let failure = check(&bad, true, &machine, Some(&faults)).unwrap_err();
             assert!(failure.message.contains(what), "{failure:?}");
-            assert!(!failure.hints.is_empty());
         }
-        for (copy, name) in [(demo, "demo.toml"), (esi, "esi/EPOS4.xml")] {
-            assert_eq!(
-                fs::read(copy).unwrap(),
-                fs::read(configs.join(name)).unwrap()
-            );
-        }
+        let new = folder.path().join("new.pcapng");
+        assert_eq!(check(&new, false, &machine, Some(&faults)), Ok(()));
     }
 
     #[test]
@@ -171,15 +126,14 @@ mod tests {
     }
 
     #[test]
-    fn check_parts_rejects_other_files() {
+    fn check_parts_finds_numbered_files() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.pcapng");
-        assert_eq!(check_parts(&path), Ok(()));
-        fs::write(folder.path().join("run.0001.pcapng"), "\n\r\r\n").unwrap();
-        fs::write(folder.path().join("run.notes.pcapng"), "no part").unwrap();
-        assert_eq!(check_parts(&path), Ok(()));
-        fs::write(folder.path().join("run.0002.pcapng"), "notes").unwrap();
-        let failure = check_parts(&path).unwrap_err();
+        std::fs::write(folder.path().join("run.notes.pcapng"), "no part").unwrap();
+        assert_eq!(check_parts(&path, false), Ok(()));
+        std::fs::write(folder.path().join("run.0002.pcapng"), "part").unwrap();
+        let failure = check_parts(&path, false).unwrap_err();
         assert!(failure.message.contains("run.0002.pcapng"), "{failure:?}");
+        assert_eq!(check_parts(&path, true), Ok(()));
     }
 }

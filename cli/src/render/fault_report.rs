@@ -62,20 +62,11 @@ fn paragraph(text: &str, indent: usize) -> String {
     out
 }
 
-/// The start of the second paragraph of every page.
-const ENDED_WITH: &str = "The run ended with:";
-
-/// True if a file with this beginning is a fault report page: first the cause, then the error.
-pub(crate) fn is_page(head: &str) -> bool {
-    let second = head.split_once("\n\n").map(|(_, rest)| rest);
-    second.is_some_and(|rest| rest.starts_with(ENDED_WITH))
-}
-
 /// Formats the full page. The first line names the device and the cause.
 pub(crate) fn page(story: &FaultReport, hints: &[String]) -> String {
     let mut text = paragraph(&story.headline, 0);
     text += "\n";
-    text += &paragraph(&format!("{ENDED_WITH} {}", story.error), 0);
+    text += &paragraph(&format!("The run ended with: {}", story.error), 0);
     let mut when = format!(
         "{}, cycle {}",
         story.machine,

@@ -16,8 +16,7 @@ use ecaxis_tools::bench::plan::{Baseline, Plan, Target, exchange_name};
 use ecaxis_tools::bench::run::{self, BenchError, BenchObserver};
 use ecaxis_tools::bench::{fixture, host, html, text, veth};
 
-use crate::args::files;
-use crate::args::files::unwritable;
+use crate::args::files::{check_output, unwritable};
 use crate::args::signals;
 use crate::hints;
 use crate::hints::Failure;
@@ -113,6 +112,9 @@ pub(crate) struct Args {
     /// Write all figures as JSON to this file
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
+    /// Overwrite existing output files
+    #[arg(long)]
+    force: bool,
     #[command(flatten)]
     pub verbosity: crate::args::Verbosity,
 }
@@ -192,14 +194,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let message = format!("there is no CPU {}; this computer has {online}", plan.cpu);
         return Err(Failure::new(hints::WRONG, message));
     }
-    for (option, path, kind) in [
-        ("--html", &args.html, &files::PAGE),
-        ("--save", &args.save, &files::FIGURES),
-    ] {
+    for (option, path) in [("--html", &args.html), ("--save", &args.save)] {
         let machine = args.machine.iter();
         let inputs = machine.map(|file| (file.as_path(), "the machine file"));
         if let Some(path) = path {
-            files::may_replace(option, path, kind, inputs)?;
+            check_output(option, path, args.force, inputs)?;
         }
     }
     if args.html.is_some() && args.html == args.save {

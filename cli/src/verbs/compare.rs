@@ -10,7 +10,7 @@ use ecaxis_tools::scan::{self, Scan};
 use serde_json::{Value, json};
 
 use crate::args::bus::{self, Bus};
-use crate::args::files::{BackupPolicy, replace};
+use crate::args::files::{back_up, replace};
 use crate::hints;
 use crate::hints::Failure;
 use crate::render::page;
@@ -228,13 +228,12 @@ fn rewrite(
         comparison,
     };
     let applied = apply::apply(file, &text, machine, actual).map_err(|e| refused(file, &e))?;
-    let kept = replace(file, &applied.text, BackupPolicy::Kept)?;
+    let kept = back_up(file)?;
+    replace(file, &applied.text)?;
     for reported in &applied.reported {
         crate::render::note(&format!("  {reported}"));
     }
-    if let Some(kept) = kept {
-        crate::render::note(&format!("the old text is in {}", kept.display()));
-    }
+    crate::render::note(&format!("the old text is in {}", kept.display()));
     let shown = file.display();
     crate::render::note(&format!(
         "{shown} matches the bus now; run `ecaxis check {shown}`"

@@ -11,7 +11,7 @@ use ecaxis_master::session::{self, Options, Outcome, Summary};
 use ecaxis_sim::FaultScript;
 use serde_json::{Value, json};
 
-use crate::args::files;
+use crate::args::files::check_output;
 use crate::args::record;
 use crate::args::signals;
 use crate::hints;
@@ -93,6 +93,9 @@ pub(crate) struct Args {
     /// Write no fault report
     #[arg(long, alias = "no-story", conflicts_with = "fault_report")]
     no_fault_report: bool,
+    /// Overwrite existing output files
+    #[arg(long)]
+    force: bool,
     #[command(flatten)]
     pub verbosity: crate::args::Verbosity,
 }
@@ -262,9 +265,9 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
     let script = args.faults.as_deref();
     let faults = script.map(|path| faults(path, machine)).transpose()?;
     if let Some(path) = &args.record {
-        record::check(path, machine, script)?;
+        record::check(path, args.force, machine, script)?;
         if args.record_limit.is_some() {
-            record::check_parts(path)?;
+            record::check_parts(path, args.force)?;
         }
     }
     if let Some(path) = &args.fault_report {
@@ -278,8 +281,9 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
                 "name the page, such as `report.txt`; the JSON data are written next to it",
             ));
         }
-        files::may_replace("--fault-report", path, &files::STORY, [])?;
-        files::may_replace("--fault-report", &data, &files::STORY_DATA, [])?;
+        for path in [path, &data] {
+            check_output("--fault-report", path, args.force, [])?;
+        }
     }
     let seed = args.seed.or(faults.as_ref().and_then(|f| f.seed));
     let defaults = Options::default();

@@ -13,9 +13,7 @@ use ecaxis_master::sys::rt_thread;
 use ecaxis_sim::{SecondPort, Segment, ServeStats, Server};
 use serde_json::{Value, json};
 
-use crate::args::files;
-use crate::args::files::unwritable;
-use crate::args::files::write_new;
+use crate::args::files::{check_output, unwritable, write_new};
 use crate::args::signals;
 use crate::args::trace::Trace;
 use crate::hints;
@@ -66,6 +64,9 @@ pub(crate) struct Args {
     /// other files
     #[arg(long, value_name = "FOLDER")]
     sii: Option<PathBuf>,
+    /// Overwrite an existing trace
+    #[arg(long)]
+    force: bool,
     /// Print the statistics as JSON
     #[arg(long)]
     json: bool,
@@ -126,7 +127,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if let Some(folder) = &args.sii {
         write_images(&segment, folder)?;
     }
-    let mut trace = args.trace.as_deref().map(trace).transpose()?;
+    let trace = args.trace.as_deref();
+    let mut trace = trace
+        .map(|path| create_trace(path, args.force))
+        .transpose()?;
     if on_signal.is_some() {
         let pid = std::process::id();
         note(&format!("`kill -USR1 {pid}` begins the fault script"));
@@ -164,9 +168,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     })
 }
 
-/// Creates the trace file; overwrites only an earlier trace.
-fn trace(path: &Path) -> Result<Trace, Failure> {
-    files::may_replace("--trace", path, &files::TRACE, [])?;
+fn create_trace(path: &Path, force: bool) -> Result<Trace, Failure> {
+    check_output("--trace", path, force, [])?;
     let file = std::fs::File::create(path).and_then(Trace::new);
     file.map_err(|error| unwritable(path, &error))
 }

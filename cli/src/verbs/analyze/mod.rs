@@ -6,8 +6,7 @@ use ecaxis_master::text::pluralize;
 use ecaxis_master::{config, recording};
 use ecaxis_tools::analyze::{self as analysis, Context, DeviceReport};
 
-use crate::args::files;
-use crate::args::files::unwritable;
+use crate::args::files::{check_output, unwritable};
 use crate::hints;
 use crate::hints::Failure;
 use crate::render::note;
@@ -53,6 +52,9 @@ pub(crate) struct Args {
     /// Write an HTML report with plots of the axes to this file
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
+    /// Overwrite an existing report
+    #[arg(long)]
+    force: bool,
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
@@ -62,7 +64,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let esi = args.esi.iter().map(|file| (file, "the ESI file"));
         let inputs = recordings.chain(machine).chain(esi);
         let inputs = inputs.map(|(file, what)| (file.as_path(), what));
-        files::may_replace("--html", path, &files::PAGE, inputs)?;
+        check_output("--html", path, args.force, inputs)?;
     }
     let (known, expected) = known(args)?;
     let mut parts = Vec::new();

@@ -38,6 +38,9 @@ pub(super) struct DeviceArgs {
     /// Record all frames to this pcapng file
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
+    /// Overwrite existing output files
+    #[arg(long)]
+    force: bool,
 }
 
 pub(super) struct Target {
@@ -104,7 +107,13 @@ impl DeviceArgs {
             _ => None,
         };
         if let Some(path) = &self.record {
-            record::check_distinct(path, machine.as_ref(), self.faults.as_deref(), input)?;
+            record::check_distinct(
+                path,
+                self.force,
+                machine.as_ref(),
+                self.faults.as_deref(),
+                input,
+            )?;
         }
         let mut options = Options {
             clock: if self.virtual_time {

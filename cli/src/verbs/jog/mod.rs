@@ -100,6 +100,9 @@ pub(crate) struct Args {
     /// Record all frames to this pcapng file
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
+    /// Overwrite existing output files
+    #[arg(long)]
+    force: bool,
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
@@ -154,7 +157,7 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
     let script = args.faults.as_deref();
     let faults = script.map(|path| run::faults(path, machine)).transpose()?;
     if let Some(path) = &args.record {
-        record::check(path, machine, script)?;
+        record::check(path, args.force, machine, script)?;
     }
     let defaults = Options::default();
     Ok(Options {

@@ -7,7 +7,7 @@ use ecaxis_tools::scan::write::{self, MARK, OutputPath};
 
 use super::ScanResult;
 use crate::args::bus;
-use crate::args::files::{BackupPolicy, replace};
+use crate::args::files::replace;
 use crate::hints;
 use crate::hints::Failure;
 use crate::render::note;
@@ -30,7 +30,7 @@ pub(super) fn machine_file(seen: &ScanResult, path: &Path, library: bool) -> Res
         folder: path.parent().unwrap_or(Path::new("")),
     };
     let text = write::machine_file(&seen.scan, &seen.described, place);
-    replace(path, &text, BackupPolicy::Lost)?;
+    replace(path, &text)?;
     let devices = seen.scan.devices.len();
     let axes = text.matches("[device.axis]").count();
     let plural = |n: usize| if n == 1 { "" } else { "s" };
