@@ -15,9 +15,10 @@ use common::{axes, faults, load, machine, virtual_time};
 use ecaxis_axis::Command;
 use ecaxis_master::clock::{self, Clock, Nanos};
 use ecaxis_master::config::{AxisRef, Machine};
-use ecaxis_master::link::capture::{Dir, Recorder, WriterMode};
+use ecaxis_master::link::capture::{Recorder, WriterMode};
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
 use ecaxis_master::mailbox::DeviceMailbox;
+use ecaxis_master::recording::Direction;
 use ecaxis_master::rt::controller::{Controller, CycleContext};
 use ecaxis_master::rt::cycle::{Engine, EngineReport};
 use ecaxis_master::session::{Options, Prepared, Progress, RunBuilder, RunError};
@@ -109,8 +110,8 @@ fn recording_in_the_cycle_allocates_nothing() {
     COUNT.set(0);
     METERED.set(true);
     for at in 0..1_000 {
-        recorder.frame(Dir::Out, at, &frame[..128]);
-        recorder.frame(Dir::In, at, &frame);
+        recorder.frame(Direction::Out, at, &frame[..128]);
+        recorder.frame(Direction::In, at, &frame);
     }
     METERED.set(false);
     let counted = COUNT.get();

@@ -13,8 +13,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use ecaxis_master::config::Exchange;
-use ecaxis_master::link::capture::{Recorder, WriterMode};
-use ecaxis_master::link::tee::CapturingLink;
+use ecaxis_master::link::capture::{CapturingLink, Recorder, WriterMode};
 use ecaxis_master::link::{self, Link, SocketKind};
 use ecaxis_master::rt::spin::Spin;
 use ecaxis_sim::frame::{self, Command};

@@ -7,7 +7,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use ecaxis_master::config;
 use ecaxis_master::link::OpenError;
-use ecaxis_master::link::packet::PacketLink;
+use ecaxis_master::link::SocketKind;
+use ecaxis_master::link::nic::NicLink;
 use ecaxis_master::session;
 use ecaxis_master::sys::rt_thread;
 use ecaxis_sim::{SecondPort, Segment, ServeStats, Server};
@@ -110,7 +111,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     // Report an interface that cannot be opened before announcing the bus.
     for nic in &nics {
-        match PacketLink::open(nic) {
+        match NicLink::open(nic, SocketKind::Packet) {
             Ok(_) => {}
             Err(
                 e @ (OpenError::Down { .. } | OpenError::NoCarrier { .. } | OpenError::Mtu { .. }),

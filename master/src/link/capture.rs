@@ -1,6 +1,6 @@
-//! Records all frames in a pcapng file.
+//! Records all frames of a link in a pcapng file.
 //!
-//! One side is called from the cycle, the other writes the file. With [`WriterMode::Background`] a
+//! [`Recorder`] has two sides: one is called from the cycle, the other writes the file. With [`WriterMode::Background`] a
 //! ring of bytes connects the cycle to a writer thread, and a counter counts the frames that do not
 //! fit. [`WriterMode::Inline`] writes in the calling thread and loses nothing, which is acceptable
 //! in virtual time.
@@ -18,7 +18,9 @@ use std::time::Duration;
 
 use rtrb::{Consumer, Producer, RingBuffer};
 
-use super::{MAX_FRAME, Nanos};
+use super::{Link, LinkError, LinkStats, MAX_FRAME, Nanos};
+use crate::clock;
+use crate::recording::Direction;
 
 mod file;
 
@@ -36,22 +38,6 @@ pub enum WriterMode {
     Inline,
     /// A thread writes the file; the caller never blocks and frames may be dropped, counted.
     Background,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Dir {
-    Out,
-    In,
-}
-
-impl Dir {
-    /// Returns bits 0–1 of pcapng's `epb_flags`.
-    fn flag(self) -> u32 {
-        match self {
-            Self::In => 1,
-            Self::Out => 2,
-        }
-    }
 }
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -103,7 +89,7 @@ impl Recorder {
 
     /// Records one frame. `at` is nanoseconds since 1970. RT with [`WriterMode::Background`]: never
     /// blocks or allocates; O(bytes). Write errors are returned by [`Recorder::finish`].
-    pub fn frame(&mut self, dir: Dir, at: Nanos, frame: &[u8]) {
+    pub fn frame(&mut self, dir: Direction, at: Nanos, frame: &[u8]) {
         let len = match u16::try_from(frame.len()) {
             Ok(len) if frame.len() <= MAX_FRAME => len,
             _ => {
@@ -126,7 +112,7 @@ impl Recorder {
                     return;
                 }
                 let mut head = [0; HEADER];
-                head[0] = u8::from(dir == Dir::In);
+                head[0] = u8::from(dir == Direction::In);
                 head[1..3].copy_from_slice(&len.to_le_bytes());
                 head[3..].copy_from_slice(&at.to_le_bytes());
                 // Both fit: only this side fills the ring.
@@ -199,7 +185,11 @@ fn write_all(mut ring: Consumer<u8>, mut file: RotatingWriter) -> io::Result<u64
             if ring.pop_entire_slice(&mut head).is_err() {
                 break;
             }
-            let dir = if head[0] == 0 { Dir::Out } else { Dir::In };
+            let dir = if head[0] == 0 {
+                Direction::Out
+            } else {
+                Direction::In
+            };
             let len = usize::from(u16::from_le_bytes([head[1], head[2]])).min(MAX_FRAME);
             let mut at = [0; 8];
             at.copy_from_slice(&head[3..]);
@@ -225,16 +215,81 @@ fn write_all(mut ring: Consumer<u8>, mut file: RotatingWriter) -> io::Result<u64
     }
 }
 
+/// Records all frames that pass through.
+#[derive(Debug)]
+pub struct CapturingLink {
+    inner: Box<dyn Link>,
+    recorder: Recorder,
+    /// Added to the clock's time to get nanoseconds since 1970.
+    epoch: Nanos,
+}
+
+impl CapturingLink {
+    #[must_use]
+    pub fn new(inner: Box<dyn Link>, recorder: Recorder, epoch: Nanos) -> Self {
+        Self {
+            inner,
+            recorder,
+            epoch,
+        }
+    }
+}
+
+impl Link for CapturingLink {
+    fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
+        self.recorder
+            .frame(Direction::Out, clock::now() + self.epoch, frame);
+        self.inner.send(frame)
+    }
+
+    fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+        let received = self.inner.recv(buf)?;
+        if let Some(len) = received {
+            self.recorder
+                .frame(Direction::In, clock::now() + self.epoch, &buf[..len]);
+        }
+        Ok(received)
+    }
+
+    fn next_arrival(&self) -> Option<Nanos> {
+        self.inner.next_arrival()
+    }
+
+    fn main_devices(&self) -> u64 {
+        self.inner.main_devices()
+    }
+
+    fn stats(&mut self) -> LinkStats {
+        self.inner.stats()
+    }
+
+    fn exhausted_reason(&self) -> Option<&'static str> {
+        self.inner.exhausted_reason()
+    }
+
+    fn notices(&mut self) -> Vec<String> {
+        self.inner.notices()
+    }
+
+    fn finish(self: Box<Self>) -> io::Result<Option<RecordStats>> {
+        self.recorder.finish().map(Some)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use pcap_file::pcapng::blocks::enhanced_packet::EnhancedPacketOption;
     use pcap_file::pcapng::{Block, PcapNgReader};
 
-    fn sample() -> Vec<(Dir, Nanos, Vec<u8>)> {
+    fn sample() -> Vec<(Direction, Nanos, Vec<u8>)> {
         (0..500_u32)
             .map(|i| {
-                let dir = if i % 2 == 0 { Dir::Out } else { Dir::In };
+                let dir = if i % 2 == 0 {
+                    Direction::Out
+                } else {
+                    Direction::In
+                };
                 let at = 1_700_000_000_000_000_123 + u64::from(i) * 1_000_001;
                 let len = 60 + (i as usize * 37) % (MAX_FRAME - 59);
                 (dir, at, (0..len).map(|b| (b % 251) as u8).collect())
@@ -279,7 +334,7 @@ mod tests {
                 EnhancedPacketOption::Flags(flags) => Some(*flags),
                 _ => None,
             });
-            assert_eq!(flags, Some(dir.flag()));
+            assert_eq!(flags, Some(file::flag(dir)));
             seen += 1;
         }
         assert_eq!(seen, 500);
@@ -307,9 +362,9 @@ mod tests {
         let frame = [0x5a; MAX_FRAME];
         let sent = 20_000;
         for at in 0..sent {
-            recorder.frame(Dir::Out, at, &frame);
+            recorder.frame(Direction::Out, at, &frame);
         }
-        recorder.frame(Dir::Out, sent, &[0; MAX_FRAME + 1]);
+        recorder.frame(Direction::Out, sent, &[0; MAX_FRAME + 1]);
         let stats = recorder.finish().unwrap();
         assert!(stats.dropped >= 1);
         assert_eq!(stats.written + stats.dropped, sent + 1);
@@ -320,7 +375,7 @@ mod tests {
         let full = Path::new("/dev/full");
         let mut recorder = Recorder::create(full, WriterMode::Background, None).unwrap();
         for at in 0..2000 {
-            recorder.frame(Dir::In, at, &[0; 1000]);
+            recorder.frame(Direction::In, at, &[0; 1000]);
         }
         assert!(recorder.finish().is_err());
     }

@@ -1,13 +1,13 @@
 //! Transports for Ethernet frames. Nothing here knows EtherCAT beyond its frame header.
 //!
 //! - [`interface`]: the requirements on a network interface;
-//! - [`ring`], [`packet`]: a network interface, through mapped memory or a plain socket;
+//! - [`nic`]: a network interface, through mapped memory or a plain socket;
 //! - [`lock`]: one program per interface;
 //! - [`filter`]: selects the frames of an interface that belong to this program;
-//! - [`sim`]: the simulated bus in this process;
+//! - [`sim`]: the simulated bus in this process, with its frames in a [`FrameQueue`];
 //! - [`source_address`]: a separate source address, for use while a machine runs on the same
 //!   interface;
-//! - [`tee`], [`capture`]: record the frames of any link;
+//! - [`capture`]: records the frames of any link;
 //! - [`replay`]: a recording in place of a bus;
 //! - [`pdu_loop`]: connects ethercrab to a link.
 
@@ -16,21 +16,22 @@ use std::time::{Duration, Instant};
 
 pub mod capture;
 pub mod filter;
+mod frame_queue;
 pub mod interface;
 pub mod lock;
-pub mod packet;
+pub mod nic;
 pub mod pdu_loop;
 pub mod replay;
-pub mod ring;
 pub mod sim;
 pub mod source_address;
-pub mod tee;
 
 pub use crate::clock::Nanos;
 pub use crate::config::SocketKind;
 pub use filter::LinkStats;
+pub use frame_queue::FrameQueue;
 pub use interface::{NicWarning, OpenError};
 pub use lock::open_exclusive;
+use nic::NicLink;
 
 /// Largest frame without FCS.
 pub const MAX_FRAME: usize = 1514;
@@ -89,20 +90,16 @@ pub fn open(
     back_end: SocketKind,
 ) -> Result<(Box<dyn Link>, Vec<NicWarning>), OpenError> {
     let mut concerns = interface::concerns(nic);
-    let link: Box<dyn Link> = match back_end {
-        SocketKind::Ring => match ring::RingLink::open(nic) {
-            Ok(link) => Box::new(link),
-            Err(OpenError::NoRing { nic, source }) => {
-                let link = packet::PacketLink::open(&nic)?;
-                let reason = source.to_string();
-                concerns.push(NicWarning::NoRing { nic, reason });
-                Box::new(link)
-            }
-            Err(error) => return Err(error),
-        },
-        SocketKind::Packet => Box::new(packet::PacketLink::open(nic)?),
-    };
-    Ok((link, concerns))
+    let link = NicLink::open(nic, back_end).or_else(|error| match error {
+        OpenError::NoRing { nic, source } => {
+            let link = NicLink::open(&nic, SocketKind::Packet);
+            let reason = source.to_string();
+            concerns.push(NicWarning::NoRing { nic, reason });
+            link
+        }
+        error => Err(error),
+    })?;
+    Ok((Box::new(link), concerns))
 }
 
 /// The listening time before anything is sent. The slowest cycles take some tens of milliseconds.

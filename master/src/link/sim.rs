@@ -3,17 +3,11 @@
 use ecaxis_sim::{FrameOutcome, Segment};
 
 use super::filter::{LinkStats, ReceivedFrame, classify_frame};
-use super::{Link, LinkError, MAX_FRAME, Nanos};
+use super::{FrameQueue, Link, LinkError, MAX_FRAME, Nanos};
 use crate::clock;
 
 /// The maximum of frames in flight.
 const IN_FLIGHT: usize = 64;
-
-#[derive(Debug, Clone)]
-struct PendingFrame {
-    len: usize,
-    frame: [u8; MAX_FRAME],
-}
 
 /// Carries frames through a [`Segment`] and returns them at their arrival time. The fault script
 /// may make them late, reordered or duplicated.
@@ -22,10 +16,7 @@ pub struct SimLink {
     segment: Segment,
     /// The clock's time at the segment's time zero.
     start: Nanos,
-    slots: Vec<PendingFrame>,
-    free: Vec<usize>,
-    /// Arrival time and slot of returning frames, the next one last.
-    under_way: Vec<(Nanos, usize)>,
+    queue: FrameQueue,
     stats: LinkStats,
 }
 
@@ -33,16 +24,10 @@ impl SimLink {
     /// Creates the link. The segment's time starts now.
     #[must_use]
     pub fn new(segment: Segment) -> Self {
-        let empty = PendingFrame {
-            len: 0,
-            frame: [0; MAX_FRAME],
-        };
         Self {
             segment,
             start: clock::now(),
-            slots: vec![empty; IN_FLIGHT],
-            free: (0..IN_FLIGHT).collect(),
-            under_way: Vec::with_capacity(IN_FLIGHT),
+            queue: FrameQueue::new(IN_FLIGHT),
             stats: LinkStats::default(),
         }
     }
@@ -56,39 +41,21 @@ impl SimLink {
     pub fn segment_mut(&mut self) -> &mut Segment {
         &mut self.segment
     }
-
-    /// Adds a returning frame. Every slot is either free or in flight, so neither list exceeds its
-    /// capacity.
-    fn arrives(&mut self, at: Nanos, slot: usize) {
-        let at = at.saturating_add(self.start);
-        let place = self.under_way.partition_point(|(other, _)| *other > at);
-        self.under_way.insert(place, (at, slot));
-    }
 }
 
 impl Link for SimLink {
     fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
-        if frame.len() > MAX_FRAME {
-            return Err(LinkError::TooLong(frame.len()));
-        }
-        let Some(n) = self.free.pop() else {
-            return Err(LinkError::Send(rustix::io::Errno::NOBUFS));
-        };
         let now = clock::now().saturating_sub(self.start);
-        let slot = &mut self.slots[n];
-        slot.len = frame.len();
-        slot.frame[..frame.len()].copy_from_slice(frame);
-        match self.segment.transit(&mut slot.frame[..frame.len()], now) {
-            FrameOutcome::Lost => self.free.push(n),
-            FrameOutcome::Back { at, again, .. } => {
-                self.arrives(at, n);
-                // A copy without a free slot is lost.
-                if let Some(at) = again
-                    && let Some(copy) = self.free.pop()
-                {
-                    self.slots[copy] = self.slots[n].clone();
-                    self.arrives(at, copy);
-                }
+        let slot = self.queue.store(frame)?;
+        if let FrameOutcome::Back { at, again, .. } = self.segment.transit(slot.frame(), now) {
+            let copy = again.map(|at| (at, slot.clone()));
+            self.queue.push(at.saturating_add(self.start));
+            // A copy without a free slot is lost.
+            if let Some((at, copy)) = copy
+                && let Some(slot) = self.queue.vacant()
+            {
+                *slot = copy;
+                self.queue.push(at.saturating_add(self.start));
             }
         }
         if let Some((_, frame)) = self.segment.take_overheard() {
@@ -107,16 +74,7 @@ impl Link for SimLink {
     }
 
     fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
-        if self.next_arrival().is_none_or(|at| at > clock::now()) {
-            return Ok(None);
-        }
-        let Some((_, n)) = self.under_way.pop() else {
-            return Ok(None);
-        };
-        self.free.push(n);
-        let slot = &self.slots[n];
-        buf[..slot.len].copy_from_slice(&slot.frame[..slot.len]);
-        Ok(Some(slot.len))
+        Ok(self.queue.receive(clock::now(), buf))
     }
 
     fn main_devices(&self) -> u64 {
@@ -128,7 +86,7 @@ impl Link for SimLink {
     }
 
     fn next_arrival(&self) -> Option<Nanos> {
-        self.under_way.last().map(|(at, _)| *at)
+        self.queue.next_due()
     }
 }
 

@@ -16,10 +16,9 @@ use super::{Options, RunError};
 use crate::clock::{self, Clock};
 use crate::config::sim::{self, bus_order};
 use crate::config::{DeviceConfig, Locator, Machine, Nic};
-use crate::link::capture::{Recorder, WriterMode};
+use crate::link::capture::{CapturingLink, Recorder, WriterMode};
 use crate::link::replay::Replay;
 use crate::link::sim::SimLink;
-use crate::link::tee::CapturingLink;
 use crate::link::{self, Link, NicWarning, OpenError};
 use crate::recording;
 

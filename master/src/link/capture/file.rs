@@ -5,8 +5,8 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
-use super::Dir;
 use crate::link::{MAX_FRAME, Nanos};
+use crate::recording::Direction;
 
 /// The maximum number of parts of a recording with a limit.
 const PARTS: u64 = 4;
@@ -88,7 +88,7 @@ impl RotatingWriter {
         })
     }
 
-    pub fn packet(&mut self, dir: Dir, at: Nanos, frame: &[u8]) -> io::Result<()> {
+    pub fn packet(&mut self, dir: Direction, at: Nanos, frame: &[u8]) -> io::Result<()> {
         let room = |each| self.file.bytes + BLOCK_MOST <= each;
         if !self.each.is_none_or(room) {
             self.turn()?;
@@ -130,64 +130,61 @@ struct Pcapng<W> {
 const SECTION: u32 = 0x0a0d_0d0a;
 /// Bytes of the longest block.
 const BLOCK_MOST: u64 = 48 + MAX_FRAME as u64;
-const LINKTYPE_ETHERNET: u16 = 1;
-const EPB_FLAGS: u16 = 2;
-const IF_TSRESOL: u16 = 9;
+
+/// The section header of unknown length, then the description of an Ethernet interface with
+/// if_tsresol (9) = 10^-9 and the end of its options.
+const HEAD: [u32; 15] = [
+    SECTION,
+    28,
+    0x1a2b_3c4d,
+    1,
+    u32::MAX,
+    u32::MAX,
+    28, // one block
+    1,
+    32,
+    1,
+    0,
+    0x0001_0009,
+    9,
+    0,
+    32,
+];
+
+/// Returns bits 0 and 1 of `epb_flags`.
+pub(super) fn flag(direction: Direction) -> u32 {
+    match direction {
+        Direction::In => 1,
+        Direction::Out => 2,
+    }
+}
 
 impl<W: Write> Pcapng<W> {
     fn new(mut out: W) -> io::Result<Self> {
-        let mut head = Vec::with_capacity(64);
-        // Section header; the length of the section is unknown (-1).
-        for word in [SECTION, 28, 0x1a2b_3c4d, 1, u32::MAX, u32::MAX, 28_u32] {
-            head.extend(word.to_le_bytes());
-        }
-        // Interface description with if_tsresol = 10^-9 and the end of its options.
-        for word in [1_u32, 32] {
-            head.extend(word.to_le_bytes());
-        }
-        head.extend(LINKTYPE_ETHERNET.to_le_bytes());
-        head.extend([0, 0]);
-        head.extend(0_u32.to_le_bytes());
-        head.extend(IF_TSRESOL.to_le_bytes());
-        head.extend([1, 0, 9, 0, 0, 0]);
-        head.extend(0_u32.to_le_bytes());
-        head.extend(32_u32.to_le_bytes());
-        out.write_all(&head)?;
+        out.write_all(&HEAD.map(u32::to_le_bytes).concat())?;
         Ok(Self {
             out,
             block: Vec::with_capacity(48 + MAX_FRAME),
             written: 0,
-            bytes: head.len() as u64,
+            bytes: size_of_val(&HEAD) as u64,
         })
     }
 
-    fn packet(&mut self, dir: Dir, at: Nanos, frame: &[u8]) -> io::Result<()> {
-        let too_long = || io::Error::from(io::ErrorKind::InvalidInput);
-        let len = u32::try_from(frame.len()).map_err(|_| too_long())?;
-        let padding = frame.len().next_multiple_of(4) - frame.len();
+    fn packet(&mut self, direction: Direction, at: Nanos, frame: &[u8]) -> io::Result<()> {
+        let len = u32::try_from(frame.len()).map_err(|_| io::ErrorKind::InvalidInput)?;
         // 28 bytes before the data, 12 bytes of options and 4 bytes after the data.
-        let total = u32::try_from(44 + frame.len() + padding).map_err(|_| too_long())?;
-        let [t0, t1, t2, t3, t4, t5, t6, t7] = at.to_le_bytes();
-
-        let mut head = [0; 28];
-        head[0..4].copy_from_slice(&6_u32.to_le_bytes());
-        head[4..8].copy_from_slice(&total.to_le_bytes());
-        head[12..16].copy_from_slice(&[t4, t5, t6, t7]);
-        head[16..20].copy_from_slice(&[t0, t1, t2, t3]);
-        head[20..24].copy_from_slice(&len.to_le_bytes());
-        head[24..28].copy_from_slice(&len.to_le_bytes());
-
-        let mut tail = [0; 16];
-        tail[0..2].copy_from_slice(&EPB_FLAGS.to_le_bytes());
-        tail[2..4].copy_from_slice(&4_u16.to_le_bytes());
-        tail[4..8].copy_from_slice(&dir.flag().to_le_bytes());
-        tail[12..16].copy_from_slice(&total.to_le_bytes());
-
+        let total = 44 + len.next_multiple_of(4);
+        let (high, low) = ((at >> 32) as u32, at as u32);
         self.block.clear();
-        self.block.extend_from_slice(&head);
-        self.block.extend_from_slice(frame);
-        self.block.extend_from_slice(&[0; 3][..padding]);
-        self.block.extend_from_slice(&tail);
+        for word in [6, total, 0, high, low, len, len] {
+            self.block.extend(word.to_le_bytes());
+        }
+        self.block.extend(frame);
+        self.block.resize(self.block.len().next_multiple_of(4), 0);
+        // The option epb_flags (2) of 4 bytes, and the end of the options.
+        for word in [0x0004_0002, flag(direction), 0, total] {
+            self.block.extend(word.to_le_bytes());
+        }
         self.out.write_all(&self.block)?;
         self.written += 1;
         self.bytes += self.block.len() as u64;
@@ -219,7 +216,7 @@ mod tests {
             let mut recorder = Recorder::create(&path, mode, Some(LIMIT)).unwrap();
             let frames = 3_000;
             for at in 0..frames {
-                recorder.frame(Dir::Out, at, &[0x5a; 200]);
+                recorder.frame(Direction::Out, at, &[0x5a; 200]);
             }
             let stats = recorder.finish().unwrap();
             assert_eq!((stats.written, stats.dropped), (frames, 0));

@@ -1,13 +1,14 @@
-//! An interface through an AF_PACKET socket whose received frames are stored in mapped memory.
-//! Polling for a frame costs a memory read instead of a system call.
+//! An interface through an AF_PACKET socket.
 //!
-//! The ring has version 2 (TPACKET_V2), which releases each frame at once. Version 3 releases whole
-//! blocks of frames, when they are full or after a timer of at least one millisecond. Frames are
-//! sent one by one: a transmit ring would need a system call each as well.
+//! With [`SocketKind::Ring`], received frames are stored in mapped memory: polling for a frame costs
+//! a memory read instead of a system call. The ring has version 2 (TPACKET_V2), which releases each
+//! frame at once. Version 3 releases whole blocks of frames, when they are full or after a timer of
+//! at least one millisecond. Frames are sent one by one: a transmit ring would need a system call
+//! each as well.
 
-use super::filter::{LinkStats, classify_frame};
+use super::filter::{LinkStats, ReceivedFrame, RejectReason, classify_frame};
 use super::interface::{self, OpenError};
-use super::{Link, LinkError, MAX_FRAME};
+use super::{Link, LinkError, MAX_FRAME, SocketKind};
 use crate::sys::packet::PacketSocket;
 use crate::sys::ring::Ring;
 
@@ -22,27 +23,35 @@ const PASSED_OVER: usize = 32;
 
 /// One interface, receiving EtherCAT frames only.
 #[derive(Debug)]
-pub struct RingLink {
+pub struct NicLink {
     // Declared before the socket, so that it is dropped first.
-    ring: Ring,
+    ring: Option<Ring>,
     socket: PacketSocket,
     stats: LinkStats,
 }
 
-impl RingLink {
+impl NicLink {
     /// Opens the interface. Blocks and allocates.
     ///
     /// # Errors
-    /// [`OpenError::NoRing`] if the kernel provides no ring; plain sockets may still work.
-    pub fn open(nic: &str) -> Result<Self, OpenError> {
+    /// [`OpenError::NoRing`] if the kernel provides no ring; [`SocketKind::Packet`] may still work.
+    pub fn open(nic: &str, kind: SocketKind) -> Result<Self, OpenError> {
         let index = interface::check(nic)?;
         let socket = interface::socket(nic)?;
-        let ring = socket
-            .receive_ring(SLOTS, SLOT)
-            .map_err(|source| OpenError::NoRing {
-                nic: nic.to_owned(),
-                source,
-            })?;
+        let ring = match kind {
+            SocketKind::Ring => {
+                let ring = socket.receive_ring(SLOTS, SLOT);
+                Some(ring.map_err(|source| OpenError::NoRing {
+                    nic: nic.to_owned(),
+                    source,
+                })?)
+            }
+            SocketKind::Packet => {
+                // VLAN tags are visible only with this option, which all current kernels support.
+                let _ = socket.set(libc::PACKET_AUXDATA, 1);
+                None
+            }
+        };
         interface::bind(nic, &socket, index)?;
         Ok(Self {
             ring,
@@ -52,7 +61,7 @@ impl RingLink {
     }
 }
 
-impl Link for RingLink {
+impl Link for NicLink {
     fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
         if frame.len() > MAX_FRAME {
             return Err(LinkError::TooLong(frame.len()));
@@ -62,21 +71,14 @@ impl Link for RingLink {
 
     fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
         for _ in 0..PASSED_OVER {
-            let Some(slot) = self.ring.front() else {
-                return Ok(None);
+            let taken = match &mut self.ring {
+                Some(ring) => from_ring(ring, buf),
+                None => from_socket(&self.socket, buf).map_err(LinkError::Receive)?,
             };
-            let seen = header::parse(slot);
-            let judged = seen.and_then(|seen| classify_frame(&seen).map(|()| seen.frame));
-            let taken = judged.map(|frame| {
-                // `classify_frame` rejects longer frames.
-                let len = frame.len().min(buf.len());
-                buf[..len].copy_from_slice(&frame[..len]);
-                len
-            });
-            self.ring.release();
             match taken {
-                Ok(len) => return Ok(Some(len)),
-                Err(refused) => self.stats.count(refused),
+                Some(Ok(len)) => return Ok(Some(len)),
+                Some(Err(refused)) => self.stats.count(refused),
+                None => return Ok(None),
             }
         }
         Ok(None)
@@ -90,6 +92,37 @@ impl Link for RingLink {
         interface::add_drops(&self.socket, &mut self.stats);
         self.stats
     }
+}
+
+/// Copies the frame in the next slot. RT: no system call.
+fn from_ring(ring: &mut Ring, buf: &mut [u8; MAX_FRAME]) -> Option<Result<usize, RejectReason>> {
+    let seen = header::parse(ring.front()?);
+    let judged = seen.and_then(|seen| classify_frame(&seen).map(|()| seen.frame));
+    let taken = judged.map(|frame| {
+        // `classify_frame` rejects longer frames.
+        let len = frame.len().min(buf.len());
+        buf[..len].copy_from_slice(&frame[..len]);
+        len
+    });
+    ring.release();
+    Some(taken)
+}
+
+/// Receives the next frame with one system call.
+fn from_socket(
+    socket: &PacketSocket,
+    buf: &mut [u8; MAX_FRAME],
+) -> rustix::io::Result<Option<Result<usize, RejectReason>>> {
+    let received = socket.receive(&mut buf[..])?;
+    Ok(received.map(|received| {
+        classify_frame(&ReceivedFrame {
+            frame: &buf[..received.len],
+            wire_len: received.wire_len,
+            status: received.status,
+            packet_type: received.packet_type,
+        })
+        .map(|()| received.len)
+    }))
 }
 
 /// The header of a slot: `tpacket2_hdr`, then `sockaddr_ll`, aligned to 16 bytes
@@ -138,7 +171,6 @@ mod header {
 mod tests {
     use proptest::prelude::*;
 
-    use super::super::filter::RejectReason;
     use super::super::filter::tests::answer;
     use super::*;
 
