@@ -10,8 +10,9 @@ use ecaxis_master::link::{self, SocketKind};
 use ecaxis_master::rt::exchange::ExchangeMode;
 use ecaxis_master::rt::spin::{Spin, SpinWindow};
 use ecaxis_master::sys::rt_thread::{self, CpuWakeGuard};
+use ecaxis_tools::bench::bus::{Bus, FaultInjection, Options, ReplyDelay};
 use ecaxis_tools::bench::exchange::Exchanges;
-use ecaxis_tools::bench::reflector::{Reflector, ReplyTiming};
+use ecaxis_tools::bench::segment::Segment;
 use ecaxis_tools::bench::veth::VethPair;
 
 const PRIORITY: u8 = 80;
@@ -23,13 +24,6 @@ const DATA: u16 = 230;
 fn main() {
     let said = std::env::args().skip(1).find_map(|a| a.parse().ok());
     let round_ms: u32 = said.unwrap_or(1_000);
-    let pair = match VethPair::new() {
-        Ok(pair) => pair,
-        Err(error) => {
-            println!("skipped: a veth pair needs root: {error}");
-            return;
-        }
-    };
     let (_held, mut denied) = CpuWakeGuard::take(None);
     denied.extend(rt_thread::become_realtime(PRIORITY, Some(1)));
     for denied in denied {
@@ -37,12 +31,22 @@ fn main() {
     }
     for cycle in [1_000_000_u64, 250_000, 125_000] {
         let rate = 1_000_000_000 / cycle;
-        let pace = ReplyTiming {
-            hold: HOLD_NS,
-            // The thread wakes up well before the next frame.
-            rest: cycle / 3,
+        let pair = match VethPair::new() {
+            Ok(pair) => pair,
+            Err(error) => {
+                println!("skipped: a veth pair needs root: {error}");
+                return;
+            }
         };
-        let reflector = Reflector::start(&pair.b, pace, Some(0)).expect("the other end answers");
+        let options = Options {
+            hold: ReplyDelay::Fixed(HOLD_NS),
+            cycle_ns: cycle,
+            mischief: FaultInjection::default(),
+            priority: PRIORITY - 20,
+            cpu: Some(0),
+            slack_ns: cycle / 2,
+        };
+        let bus = Bus::on(&pair, Segment::new([], 0), options).expect("the other end answers");
         let cycles = u32::try_from(u64::from(round_ms) * rate / 1_000).unwrap_or(1_000);
         let mut results = vec![Exchanges::default(); SocketKind::ALL.len()];
         for round in 0..ROUNDS {
@@ -80,6 +84,6 @@ fn main() {
                 result.lost,
             );
         }
-        println!("{} frames answered", reflector.finish());
+        println!("{} frames answered", bus.counts().replies);
     }
 }

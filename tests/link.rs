@@ -11,7 +11,8 @@ use std::time::{Duration, Instant};
 
 use ecaxis_master::link::{self, Link, LinkError, LinkStats, MAX_FRAME, NicWarning, SocketKind};
 use ecaxis_master::sys::packet::{PacketSocket, interface_index};
-use ecaxis_tools::bench::reflector::{Reflector, ReplyTiming};
+use ecaxis_tools::bench::bus::{Bus, FaultInjection, Options, ReplyDelay};
+use ecaxis_tools::bench::segment::Segment;
 use ecaxis_tools::bench::veth::VethPair;
 use wire::over_a_pair;
 
@@ -29,15 +30,30 @@ fn open(nic: &str, back_end: SocketKind) -> Box<dyn Link> {
     link
 }
 
-/// Returns a frame of ecaxis with `len` bytes of datagrams; the first byte is `first`.
+/// Returns a frame of ecaxis with `len` bytes of datagrams; the index of the first is `first`.
 fn frame(len: u16, first: u8) -> Vec<u8> {
     let mut frame = vec![0xff; 6];
     frame.extend([0x10, 0x10, 0x10, 0x10, 0x00, 0x20]);
     frame.extend(ETHERCAT.to_be_bytes());
     frame.extend((0x1000 | len).to_le_bytes());
     frame.resize(frame.len() + usize::from(len), 0x5a);
-    frame[16] = first;
+    // A datagram that no SubDevice processes.
+    frame[16..18].copy_from_slice(&[0, first]);
+    frame[22..24].copy_from_slice(&(len - 12).to_le_bytes());
     frame
+}
+
+/// Answers every frame at once and unchanged.
+fn reflect(pair: &VethPair) -> Bus {
+    let options = Options {
+        hold: ReplyDelay::Fixed(0),
+        cycle_ns: 100_000,
+        mischief: FaultInjection::default(),
+        priority: 1,
+        cpu: None,
+        slack_ns: 0,
+    };
+    Bus::on(pair, Segment::new([], 0), options).expect("answers")
 }
 
 /// Returns the next frame, or `None` after a timeout.
@@ -65,7 +81,7 @@ fn intruder(nic: &str) -> PacketSocket {
 #[test]
 fn frames_of_every_length_return_over_both_socket_kinds() {
     over_a_pair(|pair| {
-        let _reflector = Reflector::start(&pair.b, ReplyTiming::default(), None).expect("answers");
+        let _bus = reflect(&pair);
         let lengths = [12_u16, 44, 45, 100, 486, 1000, 1498];
         let mut all = Vec::new();
         for back_end in SocketKind::ALL {
@@ -119,7 +135,7 @@ fn foreign_frames_are_counted_and_skipped() {
             inject(&frame(44, 0)[..14]);
             inject(&frame(44, 7));
             let got = receive(link.as_mut()).expect("the last one is ours");
-            assert_eq!(got[16], 7, "{back_end}");
+            assert_eq!(got[17], 7, "{back_end}");
             let expected = LinkStats {
                 tagged: 2,
                 foreign: 3,
@@ -204,14 +220,14 @@ fn overflow(pair: &VethPair, back_end: SocketKind) {
     assert_eq!(seen + dropped, 400);
     // Reception continues afterwards.
     intruder.send(&frame(44, 9)).expect("sent");
-    assert_eq!(receive(link.as_mut()).expect("a frame")[16], 9);
+    assert_eq!(receive(link.as_mut()).expect("a frame")[17], 9);
     assert_eq!(link.stats().dropped, dropped);
 }
 
 #[test]
 fn an_interface_that_is_down_is_an_error_until_it_is_up_again() {
     over_a_pair(|pair| {
-        let _reflector = Reflector::start(&pair.b, ReplyTiming::default(), None).expect("answers");
+        let _bus = reflect(&pair);
         for back_end in SocketKind::ALL {
             let mut link = open(&pair.a, *back_end);
             let mut buf = [0; MAX_FRAME];
@@ -233,7 +249,7 @@ fn an_interface_that_is_down_is_an_error_until_it_is_up_again() {
                 let _ = link.send(&frame(44, 2));
                 std::thread::sleep(Duration::from_millis(1));
                 match link.recv(&mut buf) {
-                    Ok(Some(_)) => break buf[16],
+                    Ok(Some(_)) => break buf[17],
                     _ => assert!(start.elapsed() < PATIENCE, "{back_end}"),
                 }
             };

@@ -1,22 +1,25 @@
-//! Answers cyclic frames like a bus, from the peer interface and on another CPU. Each reply is
-//! delayed by the time on the wire. The thread spins only while a frame is due.
+//! Answers cyclic frames like a bus. Each reply is delayed by the time on the wire.
+//!
+//! - [`Bus`]: from the peer interface and on another CPU; spins only while a frame is due;
+//! - [`InProcess`]: on the thread of the cycle, without an interface: measures the work of a cycle,
+//!   but no exchange.
 
 use std::io;
 use std::num::NonZeroU64;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 
 use serde::Serialize;
 
-use super::reply_queue::ReplyQueue;
-use super::segment::{Seen, Segment, wire_ns};
+use super::segment::Segment;
 use super::veth::{self, VethPair};
 use ecaxis_master::clock::{self, Clock, Nanos};
-use ecaxis_master::link::{self, Link, MAX_FRAME, SocketKind};
+use ecaxis_master::link::{self, FrameQueue, Link, LinkError, MAX_FRAME, SocketKind};
 use ecaxis_master::sys::process;
 use ecaxis_master::sys::rt_thread;
+use ecaxis_sim::frame::{Kind, wire_time};
 
 /// The maximum time in ns that sleeping ends early; at most a quarter of a cycle.
 const LONGEST_MARGIN: Nanos = 150_000;
@@ -26,6 +29,9 @@ const BACK_TO_BACK: Nanos = 10_000;
 const IDLE: Nanos = 50_000;
 /// A frame read or sent later than this in ns was delayed by this computer, not by the bus.
 const HELD_UP: Nanos = 10_000;
+
+/// The capacity for delayed replies.
+const MAX_REPLIES: usize = 32;
 
 /// The delay of a reply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -82,31 +88,25 @@ impl Counts {
     /// Returns the increments since `before`.
     #[must_use]
     pub fn since(&self, before: &Self) -> Self {
-        Self {
-            frames: self.frames - before.frames,
-            replies: self.replies - before.replies,
-            malformed: self.malformed - before.malformed,
-            foreign: self.foreign - before.foreign,
-            dropped: self.dropped - before.dropped,
-            delayed: self.delayed - before.delayed,
-            not_sent: self.not_sent - before.not_sent,
-            held_up: self.held_up - before.held_up,
-            too_late: self.too_late - before.too_late,
-        }
+        self.zip(before, |now, before| now - before)
     }
 
     #[must_use]
     pub fn plus(&self, other: &Self) -> Self {
+        self.zip(other, |one, other| one + other)
+    }
+
+    fn zip(&self, other: &Self, f: fn(u64, u64) -> u64) -> Self {
         Self {
-            frames: self.frames + other.frames,
-            replies: self.replies + other.replies,
-            malformed: self.malformed + other.malformed,
-            foreign: self.foreign + other.foreign,
-            dropped: self.dropped + other.dropped,
-            delayed: self.delayed + other.delayed,
-            not_sent: self.not_sent + other.not_sent,
-            held_up: self.held_up + other.held_up,
-            too_late: self.too_late + other.too_late,
+            frames: f(self.frames, other.frames),
+            replies: f(self.replies, other.replies),
+            malformed: f(self.malformed, other.malformed),
+            foreign: f(self.foreign, other.foreign),
+            dropped: f(self.dropped, other.dropped),
+            delayed: f(self.delayed, other.delayed),
+            not_sent: f(self.not_sent, other.not_sent),
+            held_up: f(self.held_up, other.held_up),
+            too_late: f(self.too_late, other.too_late),
         }
     }
 }
@@ -114,41 +114,12 @@ impl Counts {
 #[derive(Debug, Default)]
 struct Shared {
     stop: AtomicBool,
-    counts: [AtomicU64; 9],
+    counts: Mutex<Counts>,
 }
 
 impl Shared {
-    fn publish(&self, c: &Counts) {
-        let values = [
-            c.frames,
-            c.replies,
-            c.malformed,
-            c.foreign,
-            c.dropped,
-            c.delayed,
-            c.not_sent,
-            c.held_up,
-            c.too_late,
-        ];
-        for (to, value) in self.counts.iter().zip(values) {
-            to.store(value, Ordering::Relaxed);
-        }
-    }
-
-    fn counts(&self) -> Counts {
-        let [a, b, c, d, e, f, g, h, i] = &self.counts;
-        let get = |n: &AtomicU64| n.load(Ordering::Relaxed);
-        Counts {
-            frames: get(a),
-            replies: get(b),
-            malformed: get(c),
-            foreign: get(d),
-            dropped: get(e),
-            delayed: get(f),
-            not_sent: get(g),
-            held_up: get(h),
-            too_late: get(i),
-        }
+    fn publish(&self, counts: &Counts) {
+        *self.counts.lock().unwrap_or_else(PoisonError::into_inner) = *counts;
     }
 }
 
@@ -238,7 +209,8 @@ impl Bus {
 
     #[must_use]
     pub fn counts(&self) -> Counts {
-        self.shared.counts()
+        let counts = self.shared.counts.lock();
+        *counts.unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -257,7 +229,7 @@ struct Worker<'a> {
     options: Options,
     shared: &'a Shared,
     counts: Counts,
-    held: ReplyQueue,
+    held: FrameQueue,
     /// The buffer for a frame if the queue is full.
     spare: [u8; MAX_FRAME],
     /// The time when the wire is free for the next frame.
@@ -273,7 +245,7 @@ impl<'a> Worker<'a> {
             options,
             shared,
             counts: Counts::default(),
-            held: ReplyQueue::new(),
+            held: FrameQueue::new(MAX_REPLIES),
             spare: [0; MAX_FRAME],
             free: 0,
             looked: clock::now(),
@@ -324,7 +296,7 @@ impl<'a> Worker<'a> {
 
     /// Takes a frame if one has arrived. `now` is the time before the poll.
     fn take(&mut self, now: Nanos) -> bool {
-        let mut place = self.held.place();
+        let mut place = self.held.vacant();
         let buf = place
             .as_mut()
             .map_or(&mut self.spare, |slot| &mut slot.bytes);
@@ -332,12 +304,12 @@ impl<'a> Worker<'a> {
             return false;
         };
         match self.segment.answer(&mut buf[..len], now) {
-            Seen::Answered => {}
-            Seen::Malformed => {
+            Kind::EtherCat => {}
+            Kind::Malformed => {
                 self.counts.malformed += 1;
                 return false;
             }
-            Seen::Foreign => {
+            Kind::Foreign => {
                 self.counts.foreign += 1;
                 return false;
             }
@@ -353,7 +325,7 @@ impl<'a> Worker<'a> {
             ReplyDelay::Fixed(hold) => now + hold,
             ReplyDelay::Wire => {
                 let start = now.max(self.free);
-                self.free = start + wire_ns(len);
+                self.free = start + wire_time(len);
                 start + self.segment.wire_ns(len)
             }
         };
@@ -363,10 +335,10 @@ impl<'a> Worker<'a> {
             self.counts.delayed += 1;
             due += longer;
         }
-        if let Some(slot) = self.held.place() {
+        if let Some(slot) = self.held.vacant() {
             slot.len = len;
             slot.unseen = now.saturating_sub(self.looked);
-            self.held.hold(due);
+            self.held.push(due);
         } else {
             self.counts.not_sent += 1;
         }
@@ -375,7 +347,7 @@ impl<'a> Worker<'a> {
     }
 
     fn send(&mut self, now: Nanos) {
-        while let Some((due, reply)) = self.held.take_due(now) {
+        while let Some((due, reply)) = self.held.pop_due(now) {
             let late = reply.unseen.saturating_add(now - due);
             match self.link.send(&reply.bytes[..reply.len]) {
                 Ok(()) => self.counts.replies += 1,
@@ -389,5 +361,47 @@ impl<'a> Worker<'a> {
 
     fn publish(&self) {
         self.shared.publish(&self.counts);
+    }
+}
+
+/// A link to a [`Segment`] on the same thread.
+#[derive(Debug)]
+pub struct InProcess {
+    segment: Segment,
+    hold: ReplyDelay,
+    held: FrameQueue,
+}
+
+impl InProcess {
+    #[must_use]
+    pub fn new(segment: Segment, hold: ReplyDelay) -> Self {
+        Self {
+            segment,
+            hold,
+            held: FrameQueue::new(MAX_REPLIES),
+        }
+    }
+}
+
+impl Link for InProcess {
+    fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
+        let now = clock::now();
+        let hold = match self.hold {
+            ReplyDelay::Fixed(hold) => hold,
+            ReplyDelay::Wire => self.segment.wire_ns(frame.len()),
+        };
+        let slot = self.held.store(frame)?;
+        if self.segment.answer(slot.frame(), now) == Kind::EtherCat {
+            self.held.push(now + hold);
+        }
+        Ok(())
+    }
+
+    fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+        Ok(self.held.receive(clock::now(), buf))
+    }
+
+    fn next_arrival(&self) -> Option<Nanos> {
+        self.held.next_due()
     }
 }

@@ -3,11 +3,11 @@
 use std::io;
 
 use ecaxis_master::clock::{self, Clock, Nanos};
-use ecaxis_master::link::pdu_loop::ETHERCAT;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
 use ecaxis_master::rt::spin::SpinWindow;
 use ecaxis_master::rt::stats::LatencyHistogram;
 use ecaxis_master::sys::process::ThreadUsage;
+use ecaxis_sim::frame::FrameBuilder;
 
 /// The result of a link over all rounds.
 #[derive(Debug, Clone, Default)]
@@ -94,17 +94,13 @@ impl Exchanges {
     }
 }
 
-/// Ethernet header and EtherCAT header in bytes.
-const HEADERS: usize = 16;
+/// Ethernet header, EtherCAT header and datagram header in bytes.
+const HEADERS: usize = 26;
 
-/// Returns a test frame with `data` bytes instead of datagrams; at least 44, so that it needs no
-/// padding.
-fn frame(data: u16) -> Vec<u8> {
-    let data = data.clamp(44, 1498);
-    let mut frame = vec![0xff; 6];
-    frame.extend([0x10, 0x10, 0x10, 0x10, 0x00, 0x20]);
-    frame.extend(ETHERCAT);
-    frame.extend((0x1000 | data).to_le_bytes());
-    frame.resize(HEADERS + usize::from(data), 0);
-    frame
+/// Returns a frame with one datagram of `bytes` with header and working counter, which no SubDevice
+/// processes; at least 44, so that it needs no padding.
+fn frame(bytes: u16) -> Vec<u8> {
+    let data = vec![0; usize::from(bytes.clamp(44, 1498)) - 12];
+    let frame = FrameBuilder::from_source([0x10, 0x10, 0x10, 0x10, 0x00, 0x20]);
+    frame.datagram(0, 0, 0, &data).build()
 }

@@ -2,9 +2,8 @@
 //! real cycle of a machine. May block and allocate.
 //!
 //! - [`veth`]: a pair of connected virtual interfaces;
-//! - [`reflector`]: answers every frame unchanged after a fixed time;
-//! - [`segment`]: drives as seen by cyclic frames; [`bus`] answers with them from another CPU,
-//!   [`in_process`] on the same thread;
+//! - [`segment`]: drives as seen by cyclic frames; [`bus`] answers with them, from another CPU or on
+//!   the same thread;
 //! - [`fixture`]: a machine of such axes, built from the parts of the real cycle;
 //! - [`measure`]: runs and measures it; [`kernel`]: the kernel's counters of a CPU;
 //! - [`wakeup`]: wake-up latency by the cycle's clock and by cyclictest;
@@ -19,14 +18,11 @@ pub mod exchange;
 pub mod fixture;
 pub mod host;
 pub mod html;
-pub mod in_process;
 pub mod kernel;
 pub mod machine;
 pub mod measure;
 pub mod peer;
 pub mod plan;
-pub mod reflector;
-mod reply_queue;
 pub mod report;
 pub mod run;
 pub mod segment;

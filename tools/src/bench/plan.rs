@@ -82,7 +82,7 @@ impl Plan {
             ReplyDelay::Fixed(hold) => hold,
             ReplyDelay::Wire => {
                 let devices = self.axes as u64 * super::segment::NANOS_PER_DEVICE;
-                super::segment::wire_ns(FRAME + self.bytes()) + devices
+                ecaxis_sim::frame::wire_time(FRAME + self.bytes()) + devices
             }
         };
         let time = match exchange {

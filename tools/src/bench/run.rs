@@ -5,10 +5,9 @@ use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::bus::{Bus, Options};
+use super::bus::{Bus, InProcess, Options};
 use super::fixture::{self, RigError, Setup};
 use super::host::{self, Hog};
-use super::in_process::InProcess;
 use super::kernel::CpuCounters;
 use super::measure::{self, Measured, Thread, TurnError};
 use super::peer;

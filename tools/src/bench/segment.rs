@@ -3,25 +3,17 @@
 
 use ecaxis_ecat::registers;
 use ecaxis_master::clock::Nanos;
-use ecaxis_master::link::pdu_loop::ETHERCAT;
+use ecaxis_sim::frame::{self, Command, Datagram, Kind, wire_time};
 
 /// The process data of a drive in bytes per direction.
 pub const DRIVE_BYTES: usize = 12;
 /// The station address of the first drive, which is the reference clock.
 pub const FIRST_STATION: u16 = 0x1001;
 
-const HEADERS: usize = 16;
-const DATAGRAM_HEADER: usize = 10;
-const WKC: usize = 2;
 /// Set by the first SubDevice in the source address of a frame.
 const LOCALLY_ADMINISTERED: u8 = 0x02;
 const OP: u8 = 0x08;
 
-/// Bytes of a frame on the wire that a socket does not see: preamble, FCS, gap.
-const WIRE_OVERHEAD: u64 = 24;
-const SHORTEST_FRAME: u64 = 60;
-/// Time per byte in ns at 100 Mbit/s.
-const NANOS_PER_BYTE: u64 = 80;
 /// The forwarding delay of one SubDevice and its cable in ns, both directions.
 pub const NANOS_PER_DEVICE: u64 = 1_000;
 
@@ -100,17 +92,6 @@ impl Drive {
     }
 }
 
-/// The result for a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Seen {
-    /// Answered in place.
-    Answered,
-    /// Inconsistent datagrams; unchanged.
-    Malformed,
-    /// Not EtherCAT.
-    Foreign,
-}
-
 /// A line of drives.
 #[derive(Debug, Clone)]
 pub struct Segment {
@@ -142,7 +123,7 @@ impl Segment {
     /// 100 Mbit/s.
     #[must_use]
     pub fn wire_ns(&self, frame: usize) -> Nanos {
-        wire_ns(frame) + self.drives.len() as u64 * NANOS_PER_DEVICE
+        wire_time(frame) + self.drives.len() as u64 * NANOS_PER_DEVICE
     }
 
     /// Returns the system time of the reference clock.
@@ -152,52 +133,43 @@ impl Segment {
         now.wrapping_add_signed(i64::try_from(drift).unwrap_or(0))
     }
 
-    /// Answers a frame in place as it passes at `now`.
-    pub fn answer(&mut self, frame: &mut [u8], now: Nanos) -> Seen {
-        if frame.get(12..14) != Some(&ETHERCAT[..]) {
-            return Seen::Foreign;
-        }
-        if !well_formed(frame) {
-            return Seen::Malformed;
-        }
-        frame[6] |= LOCALLY_ADMINISTERED;
-        let mut at = HEADERS;
-        loop {
-            let len = length(frame, at);
-            let end = at + DATAGRAM_HEADER + len;
-            let more = frame[at + 7] & 0x80 != 0;
-            self.pass(&mut frame[at..end + WKC], now);
-            if !more {
-                return Seen::Answered;
+    /// Answers an EtherCAT frame in place as it passes at `now`; others stay unchanged.
+    pub fn answer(&mut self, frame: &mut [u8], now: Nanos) -> Kind {
+        let kind = frame::kind(frame);
+        if kind == Kind::EtherCat {
+            frame[6] |= LOCALLY_ADMINISTERED;
+            let mut next = frame::next(frame, None);
+            while let Some(datagram) = next {
+                let add = self.pass(frame, &datagram, now);
+                datagram.add_wkc(frame, add);
+                next = frame::next(frame, Some(&datagram));
             }
-            at = end + WKC;
         }
+        kind
     }
 
-    /// Processes one datagram.
-    fn pass(&mut self, datagram: &mut [u8], now: Nanos) {
-        let (header, rest) = datagram.split_at_mut(DATAGRAM_HEADER);
-        let (data, wkc) = rest.split_at_mut(rest.len() - WKC);
-        let adp = u16::from_le_bytes([header[2], header[3]]);
-        let ado = u16::from_le_bytes([header[4], header[5]]);
+    /// Processes one datagram. Returns its working counter increment.
+    fn pass(&mut self, frame: &mut [u8], datagram: &Datagram, now: Nanos) -> u16 {
+        let (adp, ado) = (datagram.adp(frame), datagram.ado(frame));
+        let logical = datagram.logical(frame);
         let devices = self.devices();
         let station = adp
             .checked_sub(FIRST_STATION)
             .filter(|device| *device < devices);
-        let add = match header[0] {
-            // FPRD
-            4 if station.is_some() => {
+        let data = &mut frame[datagram.data.clone()];
+        match datagram.command {
+            Command::Fprd if station.is_some() => {
                 read_register(ado, data);
                 1
             }
-            // BRD: the address counts the devices; the data of all are OR-ed.
-            7 => {
-                header[2..4].copy_from_slice(&adp.wrapping_add(devices).to_le_bytes());
+            // The address counts the devices; the data of all are OR-ed.
+            Command::Brd if devices > 0 => {
                 read_register(ado, data);
+                datagram.set_adp(frame, adp.wrapping_add(devices));
                 devices
             }
-            // FRMW: read from the reference clock, written to all others.
-            14 if station == Some(0) => {
+            // Read from the reference clock, written to all others.
+            Command::Frmw if station == Some(0) => {
                 if ado == registers::DC_SYSTEM_TIME {
                     let time = self.system_time(now).to_le_bytes();
                     let len = data.len().min(time.len());
@@ -205,16 +177,15 @@ impl Segment {
                 }
                 devices
             }
-            command @ 10..=12 => self.logical(command, u32::from(ado) << 16 | u32::from(adp), data),
+            Command::Lrd => self.logical(true, false, logical, data),
+            Command::Lwr => self.logical(false, true, logical, data),
+            Command::Lrw => self.logical(true, true, logical, data),
             _ => 0,
-        };
-        let sum = u16::from_le_bytes([wkc[0], wkc[1]]).wrapping_add(add);
-        wkc.copy_from_slice(&sum.to_le_bytes());
+        }
     }
 
-    /// Processes LRD, LWR, LRW (10 to 12). Returns their working counter increment.
-    fn logical(&mut self, command: u8, start: u32, data: &mut [u8]) -> u16 {
-        let (reads, writes) = (command != 11, command != 10);
+    /// Processes LRD, LWR, LRW. Returns their working counter increment.
+    fn logical(&mut self, reads: bool, writes: bool, start: u32, data: &mut [u8]) -> u16 {
         let mut sum = 0;
         for drive in &mut self.drives {
             let at = drive.logical.checked_sub(start).map(|at| at as usize);
@@ -237,47 +208,11 @@ impl Segment {
     }
 }
 
-/// Returns the time of a frame on the wire in ns, including preamble and gap.
-#[must_use]
-pub fn wire_ns(frame: usize) -> Nanos {
-    ((frame as u64).max(SHORTEST_FRAME) + WIRE_OVERHEAD) * NANOS_PER_BYTE
-}
-
 /// Returns the AL status of a device in Op; all other registers read as zero.
 fn read_register(ado: u16, data: &mut [u8]) {
     data.fill(0);
     if let (registers::AL_STATUS, Some(status)) = (ado, data.first_mut()) {
         *status = OP;
-    }
-}
-
-/// Returns the data length of the datagram at this offset.
-fn length(frame: &[u8], at: usize) -> usize {
-    usize::from(u16::from_le_bytes([frame[at + 6], frame[at + 7] & 0x07]))
-}
-
-/// True if all datagrams lie within the frame and the last one is marked as last.
-fn well_formed(frame: &[u8]) -> bool {
-    let Some(&[low, high]) = frame.get(14..HEADERS) else {
-        return false;
-    };
-    let end = HEADERS + usize::from(u16::from_le_bytes([low, high & 0x07]));
-    if high >> 4 != 1 || end > frame.len() {
-        return false;
-    }
-    let mut at = HEADERS;
-    loop {
-        if at + DATAGRAM_HEADER > end {
-            return false;
-        }
-        let next = at + DATAGRAM_HEADER + length(frame, at) + WKC;
-        if next > end {
-            return false;
-        }
-        if frame[at + 7] & 0x80 == 0 {
-            return true;
-        }
-        at = next;
     }
 }
 
