@@ -347,13 +347,10 @@ pub fn virtual_machine() -> Machine {
     m
 }
 
-/// Encodes one stored block (RFC 1951, 3.2.4).
 fn gzip(text: &[u8]) -> Vec<u8> {
-    let len = u16::try_from(text.len()).unwrap();
-    let mut bytes = vec![0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 3, 1];
-    bytes.extend(len.to_le_bytes());
-    bytes.extend((!len).to_le_bytes());
-    bytes.extend(text);
+    let mut bytes = Vec::new();
+    let mut packer = flate2::read::GzEncoder::new(text, flate2::Compression::fast());
+    std::io::Read::read_to_end(&mut packer, &mut bytes).unwrap();
     bytes
 }
 

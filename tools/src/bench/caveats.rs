@@ -1,6 +1,5 @@
 //! Remarks on figures that need caution.
 
-use super::host;
 use super::plan::{Plan, Target};
 use super::report::{FEW, Variant, losses};
 
@@ -22,7 +21,7 @@ pub fn of(plan: &Plan, variants: &[Variant]) -> Vec<String> {
             "there is one CPU only: the bus and the cycle take turns on it, and no time is meaningful".to_owned(),
         );
     }
-    if host::is_virtual() {
+    if crate::doctor::is_virtual() {
         remarks.push(
             "this is a virtual machine: p99.9 and max are as much the hypervisor's as this program's; compare within the table only".to_owned(),
         );

@@ -1,6 +1,5 @@
 //! The computer that runs a bench.
 
-use std::fs;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
@@ -11,12 +10,6 @@ use super::plan::Plan;
 use super::report::Fact;
 use crate::doctor::{self, Host, Measurements, RunProfile, Severity};
 use ecaxis_master::sys::rt_thread::pin;
-
-fn read(path: &str) -> Option<String> {
-    let text = fs::read_to_string(path).ok()?;
-    let text = text.trim();
-    (!text.is_empty()).then(|| text.to_owned())
-}
 
 /// Returns the CPU for the cycle, isolated if possible, and the CPU for all other work. Both are
 /// CPUs that this process may use.
@@ -30,11 +23,12 @@ pub fn cpus() -> (usize, Option<usize>) {
                 .collect()
         },
     );
-    let isolated = read("/sys/devices/system/cpu/isolated").map_or_else(Vec::new, |l| list(&l));
+    let isolated = Host::here().cpus("sys/devices/system/cpu/isolated");
+    let isolated = isolated.unwrap_or_default();
     let last = allowed.iter().rev();
     let cycle = last
         .clone()
-        .find(|cpu| isolated.contains(cpu))
+        .find(|cpu| isolated.contains(**cpu))
         .or(allowed.last())
         .copied()
         .unwrap_or(0);
@@ -45,34 +39,14 @@ pub fn cpus() -> (usize, Option<usize>) {
 /// Returns the online CPUs in the kernel's notation if `cpu` is not one of them.
 #[must_use]
 pub fn without(cpu: usize) -> Option<String> {
-    let online = read("/sys/devices/system/cpu/online")?;
-    (!list(&online).contains(&cpu)).then_some(online)
-}
-
-/// Parses the kernel's notation `0,2-4`.
-fn list(text: &str) -> Vec<usize> {
-    let mut cpus = Vec::new();
-    for part in text.split(',') {
-        let (first, last) = part.split_once('-').unwrap_or((part, part));
-        if let (Ok(first), Ok(last)) = (first.trim().parse(), last.trim().parse::<usize>()) {
-            cpus.extend(first..=last.min(CpuSet::MAX_CPU));
-        }
-    }
-    cpus
-}
-
-/// True on a virtual machine.
-#[must_use]
-pub fn is_virtual() -> bool {
-    let info = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let flags = info.lines().find(|line| line.starts_with("flags"));
-    flags.is_some_and(|flags| flags.split_whitespace().any(|flag| flag == "hypervisor"))
+    let online = Host::here().cpus("sys/devices/system/cpu/online")?;
+    (!online.contains(cpu)).then(|| online.to_string())
 }
 
 /// Returns facts about the computer and the findings of `ecaxis doctor`, which explain the figures.
 #[must_use]
 pub fn examined(plan: &Plan) -> (Vec<Fact>, Vec<String>) {
-    let info = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let info = Host::here().text("proc/cpuinfo").unwrap_or_default();
     let model = info.lines().find_map(|line| {
         let (name, value) = line.split_once(':')?;
         (name.trim() == "model name").then(|| value.trim().to_owned())
@@ -96,7 +70,7 @@ pub fn examined(plan: &Plan) -> (Vec<Fact>, Vec<String>) {
     for fact in report.facts {
         add(fact.name, Some(fact.value));
     }
-    let load = read("/proc/loadavg");
+    let load = Host::here().text("proc/loadavg");
     add(
         "load at the end",
         load.and_then(|l| Some(l.split_whitespace().next()?.to_owned())),
@@ -156,13 +130,6 @@ impl Drop for Hog {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn list_parses_kernel_lists() {
-        assert_eq!(list("0,2-4"), [0, 2, 3, 4]);
-        assert!(list("").is_empty());
-        assert!(list("x,3-1,5-").is_empty());
-    }
 
     #[test]
     fn examined_returns_facts_about_this_computer() {

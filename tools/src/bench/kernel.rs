@@ -1,9 +1,10 @@
 //! The kernel's counters of a CPU: time used by others, and interrupts.
 
 use std::collections::BTreeMap;
-use std::fs;
 
 use serde::Serialize;
+
+use crate::doctor::Host;
 
 /// `USER_HZ`, the unit of /proc/stat; 100 on every Linux.
 const TICKS_PER_SECOND: u64 = 100;
@@ -11,7 +12,7 @@ const NANOS_PER_TICK: u64 = 1_000_000_000 / TICKS_PER_SECOND;
 /// The maximum number of interrupt sources reported.
 const MAX_REPORTED: usize = 4;
 
-/// Counters of one CPU since boot.
+/// Counters of one CPU, or of all, since boot.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct CpuCounters {
     steal: u64,
@@ -38,15 +39,15 @@ pub struct Interrupt {
 }
 
 impl CpuCounters {
-    /// Returns the present counters; empty if the kernel does not provide them.
+    /// Returns the present counters of a CPU or of all; empty if the kernel does not provide them.
     #[must_use]
-    pub fn now(cpu: usize) -> Self {
-        let read = |path| fs::read_to_string(path).unwrap_or_default();
-        Self::parse(cpu, &read("/proc/stat"), &read("/proc/interrupts"))
+    pub fn now(cpu: Option<usize>) -> Self {
+        let read = |path| Host::here().text(path).unwrap_or_default();
+        Self::parse(cpu, &read("proc/stat"), &read("proc/interrupts"))
     }
 
-    fn parse(cpu: usize, stat: &str, interrupts: &str) -> Self {
-        let name = format!("cpu{cpu}");
+    fn parse(cpu: Option<usize>, stat: &str, interrupts: &str) -> Self {
+        let name = cpu.map_or("cpu".to_owned(), |cpu| format!("cpu{cpu}"));
         let line = stat
             .lines()
             .map(|line| line.split_whitespace().collect::<Vec<_>>())
@@ -59,6 +60,11 @@ impl CpuCounters {
             interrupt_time: (ticks(6) + ticks(7)) * NANOS_PER_TICK,
             interrupts: counts(cpu, interrupts),
         }
+    }
+
+    /// Returns the increments since `before`; `None` if the counters are not visible here.
+    pub(crate) fn visible_since(&self, before: &Self) -> Option<CpuTimeDelta> {
+        (*self != Self::default()).then(|| self.since(before))
     }
 
     /// Returns the increments since `before`.
@@ -103,24 +109,28 @@ impl CpuTimeDelta {
 }
 
 /// Returns counts by device name, or by short name if there is no device.
-fn counts(cpu: usize, text: &str) -> BTreeMap<String, u64> {
+fn counts(cpu: Option<usize>, text: &str) -> BTreeMap<String, u64> {
     let mut lines = text.lines();
     let head: Vec<&str> = lines
         .next()
         .unwrap_or_default()
         .split_whitespace()
         .collect();
-    let name = format!("CPU{cpu}");
-    let Some(column) = head.iter().position(|cpu| *cpu == name) else {
-        return BTreeMap::new();
-    };
+    let named = |head: &str| cpu.is_none_or(|cpu| head == format!("CPU{cpu}"));
+    let columns: Vec<usize> = (0..head.len()).filter(|n| named(head[*n])).collect();
     let mut counts = BTreeMap::new();
     for line in lines {
         let Some((short, rest)) = line.split_once(':') else {
             continue;
         };
         let words: Vec<&str> = rest.split_whitespace().collect();
-        let Some(count) = words.get(column).and_then(|n| n.parse::<u64>().ok()) else {
+        let count = |n: &usize| words.get(*n)?.parse::<u64>().ok();
+        let Some(count) = columns
+            .iter()
+            .map(count)
+            .reduce(|a, b| Some(a? + b?))
+            .flatten()
+        else {
             continue;
         };
         let reported = words.get(head.len()..).unwrap_or_default();
@@ -145,7 +155,7 @@ mod tests {
 
     #[test]
     fn counters_read_one_cpu_from_both_files() {
-        let view = CpuCounters::parse(1, STAT, INTERRUPTS);
+        let view = CpuCounters::parse(Some(1), STAT, INTERRUPTS);
         assert_eq!(view.steal, 800_000_000);
         assert_eq!(view.interrupt_time, 1_300_000_000);
         let mut later = view.clone();
@@ -160,14 +170,17 @@ mod tests {
             .map(|i| (i.name.as_str(), i.count))
             .collect();
         assert_eq!(names, [("virtio1-req.0", 7), ("Local timer interrupts", 5)]);
+        let all = CpuCounters::parse(None, STAT, INTERRUPTS);
+        assert_eq!(all.steal, 90_000_000);
+        assert_eq!(all.interrupts["Local timer interrupts"], 14_621_212);
     }
 
     #[test]
     fn counters_of_a_missing_cpu_are_empty() {
-        let view = CpuCounters::parse(7, STAT, INTERRUPTS);
+        let view = CpuCounters::parse(Some(7), STAT, INTERRUPTS);
         assert_eq!(view, CpuCounters::default());
         assert_eq!(
-            CpuCounters::parse(0, "", "garbage\n: :\n"),
+            CpuCounters::parse(Some(0), "", "garbage\n: :\n"),
             CpuCounters::default()
         );
     }

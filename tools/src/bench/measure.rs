@@ -123,7 +123,7 @@ fn turn(parts: EngineConfig, thread: Thread, step: &AtomicU8) -> Measured {
     while step.load(Ordering::Acquire) == 0 && !engine.halted() {
         engine.cycle();
     }
-    let seen = thread.cpu.map(CpuCounters::now);
+    let seen = thread.cpu.map(|_| CpuCounters::now(thread.cpu));
     engine.reset_statistics();
     let (before, began) = (ThreadUsage::now(), clock::now());
     while step.load(Ordering::Acquire) == MEASURE && !engine.halted() {
@@ -135,7 +135,7 @@ fn turn(parts: EngineConfig, thread: Thread, step: &AtomicU8) -> Measured {
         _ => ThreadUsage::default(),
     };
     let taken = match (thread.cpu, seen) {
-        (Some(cpu), Some(before)) => Some(CpuCounters::now(cpu).since(&before)),
+        (Some(_), Some(before)) => Some(CpuCounters::now(thread.cpu).since(&before)),
         _ => None,
     };
     let remains = engine.finish();

@@ -225,7 +225,7 @@ impl<'a> Fixture<'a> {
         let plan = self.plan;
         let cycles = u64::try_from(plan.time.as_nanos() / u128::from(plan.cycle_ns.max(1)))
             .unwrap_or(u64::MAX);
-        let seen = CpuCounters::now(plan.cpu);
+        let seen = CpuCounters::now(Some(plan.cpu));
         let mut measured = match &kept.way {
             VariantKind::Cycle {
                 spin,
@@ -286,7 +286,7 @@ impl<'a> Fixture<'a> {
             }
         };
         if measured.taken.is_none() {
-            measured.taken = Some(CpuCounters::now(plan.cpu).since(&seen));
+            measured.taken = Some(CpuCounters::now(Some(plan.cpu)).since(&seen));
         }
         kept.measured.add(&measured);
         kept.rounds += 1;

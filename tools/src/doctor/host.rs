@@ -48,7 +48,7 @@ impl Host {
     }
 
     /// Returns the trimmed text. Invalid UTF-8 is replaced.
-    pub(super) fn text(&self, path: &str) -> Option<String> {
+    pub(crate) fn text(&self, path: &str) -> Option<String> {
         let bytes = self.bytes(path)?;
         Some(String::from_utf8_lossy(&bytes).trim().to_owned())
     }
@@ -57,7 +57,7 @@ impl Host {
         self.text(path)?.parse().ok()
     }
 
-    pub(super) fn cpus(&self, path: &str) -> Option<Cpus> {
+    pub(crate) fn cpus(&self, path: &str) -> Option<Cpus> {
         Cpus::parse(&self.text(path)?)
     }
 
@@ -109,7 +109,7 @@ impl Host {
 
 /// A set of CPUs in the kernel's notation: `0-3,7`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(super) struct Cpus(BTreeSet<usize>);
+pub(crate) struct Cpus(BTreeSet<usize>);
 
 impl Cpus {
     /// Parses the kernel's notation; otherwise `None`.

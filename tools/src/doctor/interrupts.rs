@@ -47,34 +47,6 @@ fn lines(text: &str) -> (Vec<usize>, Vec<Line<'_>>) {
     (cpus, lines)
 }
 
-/// Returns the number of all interrupts that a CPU has served, including non-device interrupts.
-pub(super) fn taken(host: &Host, cpu: Option<usize>) -> Option<u64> {
-    let text = host.text("proc/interrupts")?;
-    let (cpus, _) = lines(&text);
-    let column = cpu.map(|cpu| cpus.iter().position(|c| *c == cpu));
-    // The CPU has no column.
-    if column == Some(None) {
-        return None;
-    }
-    let count = |line: &str| {
-        let (_, rest) = line.split_once(':')?;
-        let counts = rest
-            .split_whitespace()
-            .take(cpus.len())
-            .map_while(|w| w.parse::<u64>().ok());
-        Some(match column.flatten() {
-            Some(column) => counts.into_iter().nth(column).unwrap_or(0),
-            None => counts.fold(0, u64::saturating_add),
-        })
-    };
-    Some(
-        text.lines()
-            .skip(1)
-            .filter_map(count)
-            .fold(0, u64::saturating_add),
-    )
-}
-
 fn served(host: &Host, number: u32) -> Option<Cpus> {
     let folder = format!("proc/irq/{number}");
     host.cpus(&format!("{folder}/effective_affinity_list"))
@@ -270,18 +242,6 @@ ERR:          0
             .map(|l| (l.number, l.name, l.counts[1]))
             .collect();
         assert_eq!(numbers, [(24, "ACPI:Ged", 10), (25, "enp3s0-TxRx-0", 4)]);
-    }
-
-    #[test]
-    fn taken_counts_the_interrupts_of_a_cpu() {
-        let folder = tempfile::tempdir().unwrap();
-        std::fs::create_dir(folder.path().join("proc")).unwrap();
-        std::fs::write(folder.path().join("proc/interrupts"), TABLE).unwrap();
-        let host = Host::at(folder.path());
-        assert_eq!(taken(&host, Some(0)), Some(104));
-        assert_eq!(taken(&host, Some(2)), Some(2014));
-        assert_eq!(taken(&host, Some(1)), None);
-        assert_eq!(taken(&host, None), Some(2118));
     }
 
     proptest! {

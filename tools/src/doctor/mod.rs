@@ -202,6 +202,11 @@ pub fn cycle_cpu(host: &Host, intent: &RunProfile) -> Option<usize> {
     intent.cpu.or_else(isolated)
 }
 
+/// True on a virtual machine.
+pub(crate) fn is_virtual() -> bool {
+    kernel::hypervisor(&Host::here()).is_some()
+}
+
 /// Runs all checks.
 #[must_use]
 pub fn examine(host: &Host, intent: &RunProfile, tried: Measurements) -> Report {

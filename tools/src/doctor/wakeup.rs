@@ -7,8 +7,8 @@ use std::thread;
 use serde::Serialize;
 
 use super::fix::Fix;
-use super::host::Host;
-use super::{ReportBuilder, Severity, interrupts};
+use super::{ReportBuilder, Severity};
+use crate::bench::kernel::CpuCounters;
 use ecaxis_master::clock::{self, Clock};
 use ecaxis_master::config::duration;
 use ecaxis_master::rt::exchange::ExchangeMode;
@@ -85,13 +85,12 @@ fn run(setup: Setup) -> WakeUp {
         .iter()
         .any(|d| matches!(d, RtSetupError::Affinity { .. }));
     let cpu = setup.cpu.filter(|_| affine);
-    let host = Host::here();
     let mut sleeping = Sampling::new(Spin::For(0), setup.cycle_ns);
     let mut spinning = Sampling::new(setup.spin, setup.cycle_ns);
     let end = clock::now() + u64::from(setup.seconds) * 1_000_000_000;
     while clock::now() < end {
-        sleeping.turn(&host, cpu, setup.cycle_ns);
-        spinning.turn(&host, cpu, setup.cycle_ns);
+        sleeping.turn(cpu, setup.cycle_ns);
+        spinning.turn(cpu, setup.cycle_ns);
     }
     drop(held);
     WakeUp {
@@ -123,8 +122,9 @@ impl Sampling {
         }
     }
 
-    fn turn(&mut self, host: &Host, cpu: Option<usize>, cycle: u64) {
-        let before = Interference::now(host, cpu);
+    fn turn(&mut self, cpu: Option<usize>, cycle: u64) {
+        let switches = || ThreadUsage::now().map_or(0, |used| used.involuntary_switches);
+        let (before, switches_before) = (CpuCounters::now(cpu), switches());
         let mut next = clock::now() + cycle;
         for _ in 0..(TURN_NS / cycle).max(4) {
             let slept = Clock::Real.sleep_until(next, self.margin.get());
@@ -136,46 +136,18 @@ impl Sampling {
             // Skip cycles that are already over.
             next += cycle * (1 + late / cycle);
         }
-        let after = Interference::now(host, cpu);
         let way = &mut self.way;
-        way.involuntary_switches += after.switches.saturating_sub(before.switches);
-        way.interrupts = more(way.interrupts, before.interrupts, after.interrupts);
-        way.stolen_ms = more(way.stolen_ms, before.stolen_ms, after.stolen_ms);
+        way.involuntary_switches += switches().saturating_sub(switches_before);
+        if let Some(taken) = CpuCounters::now(cpu).visible_since(&before) {
+            *way.interrupts.get_or_insert(0) += taken.interrupts;
+            *way.stolen_ms.get_or_insert(0) += taken.steal_ns / 1_000_000;
+        }
     }
 
     fn way(self) -> WaitMethod {
         WaitMethod {
             lateness: self.lateness.summary(),
             ..self.way
-        }
-    }
-}
-
-fn more(sum: Option<u64>, before: Option<u64>, after: Option<u64>) -> Option<u64> {
-    Some(sum.unwrap_or(0) + after?.saturating_sub(before?))
-}
-
-/// Counters of interference by the computer.
-#[derive(Debug)]
-struct Interference {
-    switches: u64,
-    interrupts: Option<u64>,
-    stolen_ms: Option<u64>,
-}
-
-impl Interference {
-    fn now(host: &Host, cpu: Option<usize>) -> Self {
-        let stat = host.text("proc/stat").unwrap_or_default();
-        let name = cpu.map_or("cpu".to_owned(), |cpu| format!("cpu{cpu}"));
-        let line = stat
-            .lines()
-            .find(|line| line.split_whitespace().next() == Some(&name));
-        // The eighth value after the name, in ticks of USER_HZ (100).
-        let ticks = line.and_then(|line| line.split_whitespace().nth(8)?.parse::<u64>().ok());
-        Self {
-            switches: ThreadUsage::now().map_or(0, |used| used.involuntary_switches),
-            interrupts: interrupts::taken(host, cpu),
-            stolen_ms: ticks.map(|ticks| ticks.saturating_mul(10)),
         }
     }
 }
