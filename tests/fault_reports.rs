@@ -317,12 +317,13 @@ fn a_failed_run_writes_its_report() {
     assert_eq!(json["cause"]["cause"], "out-of-reach");
     assert_eq!(json["cycles"].as_array().map(Vec::len), Some(200));
 
-    // The next report replaces this one, but no other file.
-    let again = run(&["--fault-report", page.to_str().expect("UTF-8")]);
-    assert_eq!(again.status.code(), Some(1));
+    // Only `--force` replaces the page, or a file in the place of the data.
+    let again = ["--fault-report", page.to_str().expect("UTF-8"), "--force"];
+    assert_eq!(run(&again).status.code(), Some(1));
+    assert_eq!(run(&again[..2]).status.code(), Some(2));
     std::fs::write(folder.path().join("package.json"), "{\"name\": 1}").expect("written");
     for (name, refused) in [
-        ("package.txt", "is not the data of a fault report"),
+        ("package.txt", "package.json exists already"),
         ("why.json", "is the file of the JSON data"),
     ] {
         let name = folder.path().join(name);

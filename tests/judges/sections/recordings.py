@@ -57,7 +57,7 @@ def recordings(bench):
         path = bench.folder / f"{name}.pcapng"
         command = [bench.program, "run", f"configs/{name}.toml", "--virtual", "--for", "3s"]
         done = subprocess.run(
-            [*map(str, command), "--record", str(path)], cwd=rig.ROOT, capture_output=True, text=True
+            [*map(str, command), "--force", "--record", str(path)], cwd=rig.ROOT, capture_output=True, text=True
         )
         report.need("the run succeeds", done.returncode == 0, done.stderr[-500:] if done.returncode else "")
         judge(bench, path, clocks)
