@@ -2,8 +2,8 @@
 
 use ecaxis_master::session::{Options, Progress};
 
-use super::common::{axes, load, machine, root, run, virtual_time};
 use super::recorded;
+use ecaxis_test_support::{axes, load, machine, root, run, virtual_time};
 
 fn moved(options: Options) -> (String, Vec<String>) {
     let (outcome, heard) = run(load("demo.toml"), options);

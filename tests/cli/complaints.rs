@@ -2,18 +2,15 @@
 
 use std::path::Path;
 
-use super::common::root;
-use super::{ecaxis, text};
+use ecaxis_test_support::{program, root};
 
 /// Runs a command line, split at blanks; `~` stands for a temporary folder. Returns exit code,
 /// stdout and stderr.
 fn ran(line: &str, folder: &Path) -> (i32, String, String) {
     let folder = folder.to_str().expect("UTF-8");
     let words: Vec<String> = line.split(' ').map(|w| w.replace('~', folder)).collect();
-    let words: Vec<&str> = words.iter().map(String::as_str).collect();
-    let output = ecaxis(&words);
-    let code = output.status.code().expect("an exit code");
-    (code, text(&output.stdout), text(&output.stderr))
+    let ran = program::run(words);
+    (ran.code, ran.out, ran.err)
 }
 
 #[test]

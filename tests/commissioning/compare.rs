@@ -2,7 +2,8 @@
 
 use serde_json::Value;
 
-use crate::bench::{Bench, reviewed};
+use ecaxis_test_support::assert_snapshot;
+use ecaxis_test_support::bench::Bench;
 
 /// A machine with every property that may differ.
 const MACHINE: &str = r#"# The machine at the window.
@@ -257,7 +258,7 @@ fn compare_names_and_applies_every_difference() {
         );
         assert_eq!(bench.read("machine.toml.old"), MACHINE, "{name}");
         let applied = bench.read("machine.toml");
-        reviewed(&format!("apply/{name}.toml"), &applied);
+        assert_snapshot(&format!("scan/apply/{name}.toml"), &applied);
         let check = bench.ecaxis(&["check", "machine.toml"]);
         assert_eq!(check.code, 0, "{name}: {}\n{applied}", check.err);
         let ran = bench.ecaxis(&compare);
@@ -395,39 +396,4 @@ fn compare_reports_another_machine() {
     assert_eq!(ran.code, 1);
     assert!(ran.err.contains("no ESI file describes it"), "{}", ran.err);
     assert_eq!(bench.read("machine.toml"), text);
-}
-
-/// While another MainDevice drives the bus, mailbox data are unavailable. `scan --write` and
-/// `compare` report them as unknown.
-#[test]
-fn unread_mailbox_data_are_reported_as_unknown() {
-    crate::wire::over_a_pair(|pair| {
-        let bench = bench();
-        // The terminal's controller keeps the state that another MainDevice requested.
-        let _served = crate::story::serve_file(&bench, &pair, "machine.toml");
-        crate::story::led_to_safe_op(&pair, 1);
-        let compare = ["compare", "machine.toml", "--nic", &pair.b];
-        let ran = bench.ecaxis(&compare);
-        assert_eq!(ran.code, 0, "{}", ran.err);
-        assert_eq!(ran.out, "as in the file, as far as it could be compared\n");
-        let ran = bench.ecaxis(&[&compare[..], &["--parameters"]].concat());
-        assert_eq!(ran.code, 1, "{}", ran.err);
-        assert_eq!(ran.out, "as in the file, as far as it could be compared\n");
-        assert!(
-            ran.err
-                .contains("not compared: the parameters: the devices were not asked")
-                && ran.err.contains("--intrude"),
-            "{}",
-            ran.err
-        );
-        let ran = bench.ecaxis(&[&compare[..], &["--parameters", "--json"]].concat());
-        let json: Value = serde_json::from_str(&ran.out).expect("JSON");
-        assert_eq!((ran.code, &json["equal"]), (1, &Value::Bool(false)));
-
-        let ran = bench.ecaxis(&["scan", &pair.b, "--write", "guessed.toml"]);
-        assert_eq!(ran.code, 0, "{}", ran.err);
-        let guessed = bench.read("guessed.toml");
-        assert!(guessed.contains("it was not asked"), "{guessed}");
-        assert!(!guessed.contains("the drive does not say"), "{guessed}");
-    });
 }

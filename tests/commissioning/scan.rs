@@ -2,7 +2,8 @@
 
 use serde_json::Value;
 
-use crate::bench::{Bench, fits, reviewed};
+use ecaxis_test_support::bench::Bench;
+use ecaxis_test_support::{assert_fits, assert_snapshot};
 
 fn bench() -> Bench {
     let bench = Bench::new();
@@ -23,8 +24,8 @@ fn scan_output_matches_the_snapshots() {
         ),
     ] {
         let out = bench.well(arguments);
-        fits(&out);
-        reviewed(name, &out);
+        assert_fits(&out);
+        assert_snapshot(&format!("scan/{name}"), &out);
     }
 }
 
@@ -228,7 +229,7 @@ position = 3
     let reported = bench.well(&arguments);
     assert!(reported.contains("4 devices"), "{reported}");
     let text = bench.read("machine.toml");
-    reviewed("modules.toml", &text);
+    assert_snapshot("scan/modules.toml", &text);
     bench.well(&["check", "machine.toml"]);
     // The file matches its own bus, and this bus has the newer firmware.
     let compared = bench.well(&["compare", "machine.toml", "--sim", "bench.toml"]);

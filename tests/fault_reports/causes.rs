@@ -159,8 +159,7 @@ fn a_group_without_reset_is_reported() {
     let text = one_moves() + GROUP;
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("machine.toml");
-    let esi = root().join("configs/esi");
-    std::fs::write(&file, text.replace("esi/", &format!("{}/", esi.display()))).expect("written");
+    std::fs::write(&file, with_our_esi(&text)).expect("written");
     let script = folder.path().join("faults.toml");
     // The drive is missing when the group stops, and is back when the run ends.
     let off = fault("power-off", "1.5s", "for = \"300ms\"\ndevice = 1");
@@ -174,13 +173,9 @@ fn a_group_without_reset_is_reported() {
         (off, "`a1` (position 1)"),
     ] {
         std::fs::write(&script, &faults).expect("written");
-        let output = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
-            .args(["run", "--virtual", "--sim", "--json", "--faults"])
-            .args([&script, &file])
-            .output()
-            .expect("the binary runs");
-        assert_eq!(output.status.code(), Some(1), "{faults}");
-        let json: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        let mut command = program::command();
+        command.args(["run", "--virtual", "--sim", "--json", "--faults"]);
+        let json = Ran::new(command.args([&script, &file])).exits(1).json();
         let headline = json["story"]["headline"].as_str().unwrap_or_default();
         assert!(headline.contains(expected), "{headline}; {faults}");
         let error = json["error"].as_str().unwrap_or_default();

@@ -8,7 +8,7 @@ use ecaxis_master::config::Machine;
 use ecaxis_master::session::{self, Options, Outcome};
 use ecaxis_master::supervise::jog::{JogEvent, Operator, OperatorInput, Presence, Request, View};
 
-use super::common::Heard;
+use ecaxis_test_support::Heard;
 
 /// One cycle.
 #[derive(Debug, Clone)]

@@ -4,9 +4,9 @@
 use ecaxis_axis::Mode;
 use ecaxis_master::supervise::jog::{Activity, JogEvent, OperatorInput, Presence, Request, View};
 
-use super::common::{axes, machine, virtual_time};
 use super::hands::{Seen, by_hand, gone, here, request};
 use super::{LET_GO_S, VERSATILE, once_enabled, within_limits};
+use ecaxis_test_support::{axes, machine, virtual_time};
 
 /// Jogs for a quarter of a second, sends one other request, then sends no requests.
 fn replaced_by(file: &str, instead: Request, presence: Presence) -> (f64, Vec<Seen>) {

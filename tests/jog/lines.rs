@@ -1,18 +1,17 @@
 //! `ecaxis jog --lines`: scripts on standard input, in virtual time.
 
 use std::io::Write;
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 
 use serde_json::Value;
 
-use super::common::root;
+use ecaxis_test_support::program;
 
 /// Returns exit code, standard output and standard error.
 fn script(lines: &str, more: &[&str]) -> (i32, String, String) {
-    let mut child = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
+    let mut child = program::command()
         .args(["jog", "configs/demo.toml", "--sim", "--lines", "--virtual"])
         .args(more)
-        .current_dir(root())
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())

@@ -1,34 +1,23 @@
 //! `ecaxis jog` in a terminal, driven through tmux, and without a terminal.
 
-#![allow(clippy::print_stdout, reason = "a skipped test says why")]
-
-use crate::common::wire::retry_if_host_stalled;
+use ecaxis_test_support::host::retry_if_host_stalled;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::Command;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use super::common::root;
-use super::common::script::comes_to_rest;
+use ecaxis_test_support::program::{ecaxis, run};
+use ecaxis_test_support::recordings::comes_to_rest;
+use ecaxis_test_support::{skip, tolerant_demo};
 
 /// A timeout much longer than any operation.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 #[test]
 fn jog_without_a_terminal_names_the_alternative() {
-    let output = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
-        .args(["jog", "configs/demo.toml", "--sim"])
-        .current_dir(root())
-        .stdin(Stdio::null())
-        .output()
-        .expect("the binary runs");
-    assert_eq!(output.status.code(), Some(2));
-    let text = String::from_utf8_lossy(&output.stderr);
-    assert!(
-        text.contains("not a terminal") && text.contains("--lines"),
-        "{text}"
-    );
-    assert!(output.stdout.is_empty());
+    let ran = run(["jog", "configs/demo.toml", "--sim"]);
+    ran.fails(2, &["not a terminal", "--lines"]);
+    assert_eq!(ran.out, "");
 }
 
 /// A tmux session of 80 × 24 with its own server.
@@ -44,25 +33,17 @@ impl Tmux {
 
     /// Same as `new`, with a shell command before.
     fn after(before: &str, arguments: &str) -> Option<Self> {
-        let there = Command::new("tmux").arg("-V").output().is_ok();
-        assert!(there || std::env::var_os("CI").is_none(), "no tmux on CI");
-        if !there {
-            println!("skipped: there is no tmux");
+        if Command::new("tmux").arg("-V").output().is_err() {
+            skip("there is no tmux");
             return None;
         }
         let folder = tempfile::tempdir().expect("a folder");
-        // A test computer under load stalls for longer than a machine tolerates.
-        let demo = std::fs::read_to_string(root().join("configs/demo.toml")).expect("our file");
-        let calm = demo.replace("lost_frames = 20", "watchdog = \"6s\"\nlost_frames = 1000");
-        let esi = root().join("configs/esi");
-        let calm = calm.replace("\"esi/", &format!("\"{}/", esi.display()));
-        assert!(calm.contains("watchdog"));
-        std::fs::write(folder.path().join("m.toml"), calm).expect("written");
+        std::fs::write(folder.path().join("m.toml"), tolerant_demo()).expect("written");
         let tmux = Self { folder };
         let script = format!(
             "{before} cd {}; stty -g > before; {} jog m.toml --sim {arguments}; echo $? > code; stty -g > after; echo all-is-done; cat",
             tmux.folder.path().display(),
-            env!("CARGO_BIN_EXE_ecaxis"),
+            ecaxis().display(),
         );
         tmux.ask(&[
             "-f",

@@ -9,14 +9,13 @@ use std::sync::mpsc::channel;
 use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll, Waker};
 
-use super::common::{faults, machine, run, run_badly, run_well, virtual_time};
-use super::record;
 use ecaxis_master::clock::Nanos;
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
 use ecaxis_master::rt::cycle::Engine;
 use ecaxis_master::session::{Options, RunBuilder, RunError, simulated_bus};
-use pcap_file::pcapng::{Block, PcapNgReader};
+use ecaxis_test_support::recordings::{FPWR, Frame, LRD, LRW, frames};
+use ecaxis_test_support::{faults, machine, recorded, run, run_badly, run_well, virtual_time};
 
 const COUNTS: f64 = 2000.0;
 /// The bytes of an axis of the project's EPOS4.xml in the image.
@@ -43,28 +42,14 @@ struct Answer {
     speed: f64,
 }
 
-/// Returns logical reads and writes of a frame by logical address, and writes of AL control.
-fn datagrams(frame: &[u8]) -> (Logical, Vec<(u16, u8)>) {
-    let (mut logical, mut al_control) = (BTreeMap::new(), Vec::new());
-    let mut at = 16;
-    while at + 12 <= frame.len() {
-        let len = usize::from(u16::from_le_bytes([frame[at + 6], frame[at + 7]]) & 0x7ff);
-        let data = frame[at + 10..at + 10 + len].to_vec();
-        let address = u32::from_le_bytes(frame[at + 2..at + 6].try_into().expect("four bytes"));
-        let wkc = u16::from_le_bytes([frame[at + 10 + len], frame[at + 11 + len]]);
-        match frame[at] {
-            10..=12 if wkc > 0 || frame[6] & 2 == 0 => {
-                logical.insert(address as usize, data);
-            }
-            5 if address >> 16 == 0x0120 => al_control.push(((address & 0xffff) as u16, data[0])),
-            _ => {}
-        }
-        if frame[at + 7] & 0x80 == 0 {
-            break;
-        }
-        at += 12 + len;
-    }
-    (logical, al_control)
+/// Returns logical reads and writes of a frame by logical address.
+fn logical(frame: &Frame) -> Logical {
+    let logical = frame
+        .datagrams
+        .iter()
+        .filter(|d| (LRD..=LRW).contains(&d.command) && (d.working_counter > 0 || frame.sent));
+    let by_address = logical.map(|d| (d.address as usize, d.data.clone()));
+    by_address.collect()
 }
 
 fn bytes(map: &Logical, axis: usize) -> Option<&[u8]> {
@@ -76,24 +61,22 @@ fn bytes(map: &Logical, axis: usize) -> Option<&[u8]> {
 /// Returns every cycle of the `axis`th device of the image, a drive of the project's EPOS4.xml in
 /// CSP.
 fn cycles(recording: &Path, axis: usize, mode: u8) -> Vec<Cycle> {
-    let file = std::fs::File::open(recording).expect("the recording");
-    let mut reader = PcapNgReader::new(file).expect("pcapng");
     let mut cycles: Vec<Cycle> = Vec::new();
     let mut left_op = false;
     let mut in_op = false;
-    while let Some(block) = reader.next_block() {
-        let Block::EnhancedPacket(packet) = block.expect("a block") else {
-            continue;
-        };
-        let sent = packet.data[6] & 0x02 == 0;
-        let (logical, al_control) = datagrams(&packet.data);
-        for (station, state) in al_control.into_iter().filter(|_| sent) {
-            if station == 0x1000 + axis as u16 {
-                in_op |= state & 0x0f == 8;
-                left_op = in_op && state & 0x0f != 8;
-            }
+    for frame in frames(recording) {
+        let sent = frame.sent;
+        let al_control = frame.datagrams.iter().filter(|d| {
+            let here = usize::from(d.station()) == 0x1000 + axis;
+            sent && here && d.command == FPWR && d.register() == 0x0120
+        });
+        for datagram in al_control {
+            let state = datagram.data[0];
+            in_op |= state & 0x0f == 8;
+            left_op = in_op && state & 0x0f != 8;
         }
-        let Some(data) = bytes(&logical, axis).filter(|_| packet.data[11] == 0x20) else {
+        let logical = logical(&frame);
+        let Some(data) = bytes(&logical, axis).filter(|_| frame.cyclic) else {
             continue;
         };
         let int = |at: usize| i32::from_le_bytes(data[at..at + 4].try_into().expect("four"));
@@ -194,7 +177,7 @@ fn a_missing_io_block_does_not_shorten_the_stop_of_a_drive() {
             + "[[step]]\nvelocity = { x = 45.0 }\n[[step]]\ndwell = \"10s\"\n";
         let folder = tempfile::tempdir().expect("a folder");
         let script = "[[fault]]\nkind = \"absent\"\ndevice = 1\nat = \"5s\"\n";
-        let (options, path) = record(faults(script), &folder);
+        let (options, path) = recorded(faults(script), folder.path());
         let (error, _) = run_badly(machine(&text), options);
         assert!(
             error.contains("`io`") && error.contains("no longer answers"),
@@ -216,7 +199,7 @@ fn a_missing_drive_does_not_shorten_the_stop_of_another() {
         + "[[step]]\nmove = { x = 200.0, y = 200.0 }\n";
     let folder = tempfile::tempdir().expect("a folder");
     let script = "[[fault]]\nkind = \"absent\"\ndevice = 1\nat = \"4s\"\n";
-    let (options, path) = record(faults(script), &folder);
+    let (options, path) = recorded(faults(script), folder.path());
     let (error, _) = run_badly(machine(&text), options);
     assert!(
         error.contains("`y`") && error.contains("no longer answers"),
@@ -238,7 +221,7 @@ fn a_long_quick_stop_ends_at_standstill() {
         + "[[step]]\nvelocity = { x = 45.0 }\n[[step]]\ndwell = \"20s\"\n\
            [stop]\nemergency = { x.\"0x6064\" = { above = 300000 } }\n";
     let folder = tempfile::tempdir().expect("a folder");
-    let (options, path) = record(virtual_time(), &folder);
+    let (options, path) = recorded(virtual_time(), folder.path());
     let (error, _) = run_badly(machine(&text), options);
     assert!(error.contains("emergency stop"), "{error}");
     let cycles = cycles(&path, 0, CSV);
@@ -263,7 +246,7 @@ fn no_axis_gains_speed_after_a_stop() {
         + "[[step]]\nmove = { a0 = 400.0 }\n";
     let folder = tempfile::tempdir().expect("a folder");
     let script = "[[fault]]\nkind = \"drive-fault\"\nat = \"700ms\"\ndevice = 1\ncode = 12832\n";
-    let (options, path) = record(faults(script), &folder);
+    let (options, path) = recorded(faults(script), folder.path());
     let (error, _) = run_badly(machine(&text), options);
     assert!(error.contains("`a1`"), "{error}");
     let other = cycles(&path, 1, CSP);
@@ -303,7 +286,7 @@ fn a_jerk_limited_stop_has_a_sufficient_time_out() {
             limit: Some(limit),
             ..virtual_time()
         };
-        let (options, path) = record(options, &folder);
+        let (options, path) = recorded(options, folder.path());
         run_well(machine(&text), options);
         let cycles = cycles(&path, 0, CSP);
         comes_to_rest(&cycles, 5.0);
@@ -414,7 +397,7 @@ fn late_replies_are_not_lost_replies() {
         + "[[step]]\nmove = { x = 200.0 }\n";
     let folder = tempfile::tempdir().expect("a folder");
     let script = "[[fault]]\nkind = \"frame-delay\"\nat = \"2.5s\"\nfor = \"10ms\"\nprobability = 1.0\ndelay = \"800us\"\n";
-    let (options, path) = record(faults(script), &folder);
+    let (options, path) = recorded(faults(script), folder.path());
     let summary = run_well(machine(&text), options);
     assert!(summary.counters.lost_frames >= 9, "{:?}", summary.counters);
     let (acceleration, _) = steepest(&cycles(&path, 0, CSP), 0.001);
@@ -441,7 +424,7 @@ fn csv_to_csp_during_two_bursts_keeps_the_limits() {
         // The change starts some time after the first velocity is reached, so the bursts cover
         // every phase.
         let folder = tempfile::tempdir().expect("a folder");
-        let (options, path) = record(virtual_time(), &folder);
+        let (options, path) = recorded(virtual_time(), folder.path());
         run_well(machine(&text), options);
         let quiet = cycles_by_mode(&path);
         let change = quiet.iter().rposition(|m| *m == 9).expect("CSV") as f64;
@@ -451,7 +434,7 @@ fn csv_to_csp_during_two_bursts_keeps_the_limits() {
             1e3 * start,
             1e3 * start + 5.0
         );
-        let (options, path) = record(faults(&script), &folder);
+        let (options, path) = recorded(faults(&script), folder.path());
         run_well(machine(&text), options);
         let (_, speed) = steepest_csp(&path);
         assert!(speed <= 3.0 * 20.0 + 1.5, "{place}: {speed} turns/s");
@@ -464,20 +447,11 @@ fn cycles_by_mode(path: &Path) -> Vec<u8> {
 }
 
 fn images(path: &Path, sent: bool) -> Vec<Vec<u8>> {
-    let file = std::fs::File::open(path).expect("the recording");
-    let mut reader = PcapNgReader::new(file).expect("pcapng");
-    let mut images = Vec::new();
-    while let Some(block) = reader.next_block() {
-        let Block::EnhancedPacket(packet) = block.expect("a block") else {
-            continue;
-        };
-        if packet.data[11] != 0x20 || (packet.data[6] & 2 == 0) != sent {
-            continue;
-        }
-        let (logical, _) = datagrams(&packet.data);
-        images.extend(bytes(&logical, 0).map(<[u8]>::to_vec));
-    }
-    images
+    let frames = frames(path).into_iter();
+    let frames = frames.filter(|frame| frame.cyclic && frame.sent == sent);
+    frames
+        .filter_map(|frame| Some(bytes(&logical(&frame), 0)?.to_vec()))
+        .collect()
 }
 
 /// Returns the largest step between targets while the drive displays CSP, in turns/s.
@@ -511,7 +485,7 @@ impl Link for Panicking {
         if frame.get(11) == Some(&0x20) {
             self.frames += 1;
             assert!(!self.panics.contains(&self.frames), "a panic of the test");
-            let (logical, _) = datagrams(frame);
+            let logical = logical(&Frame::parse(frame));
             if let Some(data) = bytes(&logical, 0) {
                 self.seen.lock().expect("one thread").push(Cycle {
                     controlword: u16::from_le_bytes([data[0], data[1]]),
@@ -528,7 +502,7 @@ impl Link for Panicking {
         let len = self.bus.recv(buf)?;
         if let Some(frame) = len.map(|len| &buf[..len])
             && frame.get(11) == Some(&0x20)
-            && let (logical, _) = datagrams(frame)
+            && let logical = logical(&Frame::parse(frame))
             && let Some(data) = bytes(&logical, 0)
             && let Some(last) = self.seen.lock().expect("one thread").last_mut()
         {
@@ -578,8 +552,6 @@ fn a_panic_in_the_cycle_brings_the_axes_to_rest() {
         let mut during = pin!(prepared.supervisor.run());
         let mut context = Context::from_waker(Waker::noop());
         let mut result = None;
-        let hook = std::panic::take_hook();
-        std::panic::set_hook(Box::new(|_| {}));
         for _ in 0..30_000 {
             if engine.halted() {
                 break;
@@ -591,7 +563,6 @@ fn a_panic_in_the_cycle_brings_the_axes_to_rest() {
                 result = Some(done);
             }
         }
-        std::panic::set_hook(hook);
         let (_, result) = result.expect("it ended");
         assert!(matches!(result, Err(RunError::Panicked(_))), "{result:?}");
         let seen = seen.lock().expect("one thread");

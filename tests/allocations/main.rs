@@ -1,0 +1,340 @@
+//! Counts allocations of the real-time path: none in 100,000 cycles, which include a lost frame and
+//! a drive fault.
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::pin::{Pin, pin};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::sync::mpsc::channel;
+use std::task::{Context, Poll, Waker};
+
+use ecaxis_axis::Command;
+use ecaxis_master::clock::{self, Clock, Nanos};
+use ecaxis_master::config::{AxisRef, Machine};
+use ecaxis_master::link::capture::{Recorder, WriterMode};
+use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
+use ecaxis_master::mailbox::DeviceMailbox;
+use ecaxis_master::recording::Direction;
+use ecaxis_master::rt::controller::{Controller, CycleContext};
+use ecaxis_master::rt::cycle::{Engine, EngineReport};
+use ecaxis_master::session::{Options, Prepared, Progress, RunBuilder, RunError};
+use ecaxis_test_support::{axes, faults, load, machine, virtual_time};
+
+thread_local! {
+    static METERED: Cell<bool> = const { Cell::new(false) };
+    static COUNT: Cell<u64> = const { Cell::new(0) };
+}
+
+/// Counts allocations, reallocations and frees of metered threads.
+struct Counting;
+
+fn count() {
+    // A thread in teardown has no counters left and is not metered.
+    let _ = METERED.try_with(|metered| {
+        if metered.get() {
+            let _ = COUNT.try_with(|count| count.set(count.get() + 1));
+        }
+    });
+}
+
+// SAFETY: every call goes unchanged to the system allocator.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count();
+        // SAFETY: the caller upholds the contract.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
+        count();
+        // SAFETY: the caller upholds the contract.
+        unsafe { System.dealloc(ptr, layout) }
+    }
+
+    unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
+        count();
+        // SAFETY: the caller upholds the contract.
+        unsafe { System.realloc(ptr, layout, new_size) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// The simulated bus stands for the wire and the devices. Its allocations do not count for the
+/// cycle.
+#[derive(Debug)]
+struct Unmetered(Box<dyn Link>);
+
+fn unmetered<T>(work: impl FnOnce() -> T) -> T {
+    let before = METERED.replace(false);
+    let result = work();
+    METERED.set(before);
+    result
+}
+
+impl Link for Unmetered {
+    fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
+        unmetered(|| self.0.send(frame))
+    }
+
+    fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+        unmetered(|| self.0.recv(buf))
+    }
+
+    fn next_arrival(&self) -> Option<Nanos> {
+        self.0.next_arrival()
+    }
+}
+
+#[test]
+fn the_counter_counts_allocations() {
+    METERED.set(true);
+    let boxed = std::hint::black_box(Box::new(1));
+    METERED.set(false);
+    drop(boxed);
+    assert_eq!(COUNT.get(), 1);
+}
+
+/// The bus and its recorder above are unmetered. The recorder of a real-time run is not part of the
+/// bus, so this test meters it.
+#[test]
+fn recording_in_the_cycle_allocates_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.pcapng");
+    let mut recorder = Recorder::create(&path, WriterMode::Background, None).expect("a recording");
+    let frame = [0x5a; MAX_FRAME];
+    COUNT.set(0);
+    METERED.set(true);
+    for at in 0..1_000 {
+        recorder.frame(Direction::Out, at, &frame[..128]);
+        recorder.frame(Direction::In, at, &frame);
+    }
+    METERED.set(false);
+    let counted = COUNT.get();
+    let stats = recorder.finish().expect("written");
+    assert_eq!(stats.written + stats.dropped, 2_000);
+    assert!(stats.written > 0);
+    assert_eq!(counted, 0);
+}
+
+type Ended = Option<Result<(), RunError>>;
+
+/// Runs the cycle with its supervisor. Returns the allocations of the cycles, the bytes still
+/// allocated, and the supervisor's result.
+fn metered(
+    machine: Machine,
+    options: &Options,
+    controller: Option<Box<dyn Controller>>,
+    cycles: u64,
+) -> (u64, EngineReport, Ended) {
+    let (counted, remains, ended, _) = metered_among_users(machine, options, controller, cycles, 0);
+    (counted, remains, ended)
+}
+
+/// Same as `metered`, with repeated mailbox reads of the first devices. Returns the number of
+/// transfers as well.
+fn metered_among_users(
+    machine: Machine,
+    options: &Options,
+    controller: Option<Box<dyn Controller>>,
+    cycles: u64,
+    asked: usize,
+) -> (u64, EngineReport, Ended, u64) {
+    options.clock.enter();
+    let (progress, reported) = channel();
+    let stop = Arc::new(AtomicBool::new(false));
+    let job = RunBuilder {
+        machine: &Arc::new(machine),
+        options,
+        stop,
+        progress,
+        controller,
+    };
+    let Prepared {
+        mut parts,
+        supervisor,
+    } = job.prepare().expect("comes up");
+    parts.link = Box::new(Unmetered(parts.link));
+    let mut engine = Engine::new(parts);
+    let mut during = pin!(supervisor.run());
+    let mut context = Context::from_waker(Waker::noop());
+    let mut result = None;
+    let done = Cell::new(0);
+    let mut users: Vec<Pin<Box<dyn Future<Output = ()> + '_>>> = Vec::new();
+
+    COUNT.set(0);
+    for _ in 0..cycles {
+        METERED.set(true);
+        engine.cycle();
+        METERED.set(false);
+        if result.is_none()
+            && let Poll::Ready((_, ended)) = during.as_mut().poll(&mut context)
+        {
+            result = Some(ended);
+        }
+        for said in reported.try_iter() {
+            if let Progress::Mailboxes(mailboxes) = said {
+                let names = mailboxes.names().take(asked);
+                let each = names.filter_map(|name| mailboxes.device(name).ok());
+                users = each.map(|mailbox| reading(mailbox, &done)).collect();
+            }
+        }
+        users.retain_mut(|user| user.as_mut().poll(&mut context).is_pending());
+    }
+    drop(users);
+    (COUNT.get(), engine.finish(), result, done.get())
+}
+
+/// Reads expedited and segmented objects until mailbox access closes.
+fn reading(mailbox: DeviceMailbox, done: &Cell<u64>) -> Pin<Box<dyn Future<Output = ()> + '_>> {
+    Box::pin(async move {
+        for (index, sub) in [(0x6041, 0), (0x1008, 0), (0x6064, 0)].into_iter().cycle() {
+            if mailbox.upload(index, sub).await.is_err() {
+                return;
+            }
+            done.set(done.get() + 1);
+        }
+    })
+}
+
+#[test]
+fn a_hundred_thousand_cycles_allocate_nothing() {
+    const CYCLES: u64 = 100_000;
+    let script = "[[fault]]\nkind = \"frame-loss\"\nat = \"20s\"\ncount = 2\n\
+                  [[fault]]\nkind = \"drive-fault\"\ndevice = 1\nat = \"60s\"\ncode = 0x8611\n";
+    let options = Options {
+        repeat: Some(1_000_000),
+        ..faults(script)
+    };
+    let (counted, remains, result) = metered(machine(&axes(3)), &options, None, CYCLES);
+    assert_eq!(remains.stats.counters.cycles, CYCLES);
+    assert!(
+        remains.stats.counters.lost_frames >= 1,
+        "{:?}",
+        remains.stats.counters
+    );
+    assert!(
+        matches!(
+            result,
+            Some(Err(RunError::DriveFault {
+                code: Some(0x8611),
+                ..
+            }))
+        ),
+        "{result:?}"
+    );
+    assert!(remains.axes.iter().all(|slot| slot.last_enabled.is_some()));
+    assert_eq!(counted, 0, "allocations in {CYCLES} cycles");
+}
+
+#[test]
+fn mailbox_transfers_cause_no_allocation_in_the_cycle() {
+    let options = Options {
+        repeat: Some(1_000_000),
+        ..virtual_time()
+    };
+    let bus = machine(&axes(4));
+    let (counted, remains, _, done) = metered_among_users(bus, &options, None, 20_000, 3);
+    assert!(done > 1_000, "{done} transfers");
+    assert_eq!(remains.stats.counters.wkc_errors, 0);
+    assert_eq!(counted, 0, "allocations during {done} transfers");
+}
+
+/// Covers mode switches, homing, profiles, lines, gears, tables, waves, inputs and outputs.
+#[test]
+fn programs_of_every_kind_allocate_nothing() {
+    for file in [
+        "together.toml",
+        "probe.toml",
+        "profiles.toml",
+        "loops.toml",
+        "program.toml",
+    ] {
+        let (counted, _, result) = metered(load(file), &virtual_time(), None, 20_000);
+        assert!(matches!(result, Some(Ok(()))), "{file}: {result:?}");
+        assert_eq!(counted, 0, "allocations in {file}");
+    }
+}
+
+struct Swing(AxisRef, f64);
+
+impl Controller for Swing {
+    fn cycle(&mut self, machine: &mut CycleContext<'_>) {
+        if machine.axis(self.0).ready {
+            self.1 += machine.dt_s();
+            let _ = machine.set_point(self.0, 5.0 - 5.0 * self.1.cos());
+        }
+    }
+}
+
+#[test]
+fn a_controller_is_called_without_an_allocation() {
+    let machine = load("controller.toml");
+    let x = machine.axis("x").expect("an axis");
+    let controller = Box::new(Swing(x, 0.0));
+    let (counted, remains, _) = metered(machine, &virtual_time(), Some(controller), 5_000);
+    assert!(remains.axes[0].axis.status().enabled);
+    assert_eq!(counted, 0);
+}
+
+struct Stalls(AxisRef, u32);
+
+impl Controller for Stalls {
+    fn cycle(&mut self, machine: &mut CycleContext<'_>) {
+        if !machine.axis(self.0).ready {
+            return;
+        }
+        self.1 += 1;
+        if self.1 == 1 {
+            let (velocity, ramp) = (5.0, 1.0);
+            let _ = machine.command(self.0, Command::Velocity { velocity, ramp });
+        } else if self.1.is_multiple_of(500) {
+            Clock::Virtual.relax(clock::now() + 40_000_000);
+        }
+    }
+}
+
+/// The handling of skipped cycles does not allocate either.
+#[test]
+fn skipped_cycles_allocate_nothing() {
+    let machine = load("controller.toml");
+    let x = machine.axis("x").expect("an axis");
+    let controller = Box::new(Stalls(x, 0));
+    let (counted, remains, _) = metered(machine, &virtual_time(), Some(controller), 5_000);
+    let counters = remains.stats.counters;
+    assert!(counters.overruns > 200, "{counters:?}");
+    assert!(remains.axes[0].axis.status().enabled);
+    assert_eq!(counted, 0);
+}
+
+/// Stops of the machine do not allocate either: an emergency, a lost gear, a lost bus, and a group.
+#[test]
+fn stopping_allocates_nothing() {
+    let gear =
+        "[[step]]\ngear = { a1 = { to = \"a0\", ratio = 3.0 } }\n[[step]]\nmove = { a0 = 80.0 }\n";
+    let emergency = "[stop]\nemergency = { a0.\"0x6064\" = { above = 20000 } }\n";
+    let lost = "[[fault]]\nkind = \"silent\"\nat = \"1s\"\n";
+    let group = "[[stop.group]]\nname = \"g\"\naxes = [\"a0\"]\noutside = \"continue\"\n\
+                 [[step]]\nmove = { a1 = 0.0 }\n[[step]]\nreset = [\"a0\"]\n[[step]]\nmove = { a0 = 0.0 }\n";
+    let fault = "[[fault]]\nkind = \"drive-fault\"\ndevice = 0\nat = \"1s\"\ncode = 0x8611\n";
+    let bus = axes(2);
+    let (devices, _) = bus.split_once("\n[[step]]").expect("steps");
+    for (text, options) in [
+        (format!("{devices}\n{gear}"), virtual_time()),
+        (format!("{bus}\n{emergency}"), virtual_time()),
+        (bus.clone(), faults(lost)),
+        (
+            format!(
+                "{devices}\n[[step]]\nvelocity = {{ a0 = 10.0 }}\n[[step]]\nmove = {{ a1 = 80.0 }}\n{group}"
+            ),
+            faults(fault),
+        ),
+    ] {
+        let (counted, remains, result) = metered(machine(&text), &options, None, 20_000);
+        assert!(matches!(result, Some(Err(_))), "{result:?}");
+        assert!(remains.axes.iter().all(|slot| slot.last_enabled.is_some()));
+        assert_eq!(counted, 0, "{result:?}");
+    }
+}

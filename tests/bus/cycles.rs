@@ -1,0 +1,87 @@
+//! The shortest and longest cycle times, on the simulated bus in virtual time.
+
+use ecaxis_master::config;
+use ecaxis_test_support::{axes, machine, root, run_badly, run_well, virtual_time};
+
+/// Returns the machine of `axes` with another cycle.
+fn at(cycle: &str) -> String {
+    axes(2).replace("\"1ms\"", &format!("\"{cycle}\""))
+}
+
+fn moves(text: &str, cycle_ns: u64) {
+    let machine = machine(text);
+    assert_eq!(machine.bus.cycle_ns, cycle_ns);
+    let summary = run_well(machine, virtual_time());
+    assert_eq!(summary.cycle_ns, cycle_ns);
+    assert_eq!(summary.counters.overruns, 0);
+    assert_eq!(summary.counters.lost_frames, 0);
+    assert_eq!(summary.axes.len(), 2);
+    for axis in &summary.axes {
+        let error = axis.final_error_counts.expect("CSP");
+        assert!(error.abs() <= 1, "{axis:#?}");
+    }
+    let phase = summary.dc_phase_error.expect("distributed clocks");
+    assert!(phase.count > 0, "frames keep in phase with SYNC0");
+    // 80 turns and back at 50 turns/s and 500 turns/s²: 1.7 s each, plus bring-up and stop.
+    assert!(
+        (3.4..10.0).contains(&summary.machine_seconds),
+        "{}",
+        summary.machine_seconds
+    );
+}
+
+#[test]
+fn axes_move_at_four_kilohertz() {
+    moves(&at("250us"), 250_000);
+}
+
+#[test]
+fn axes_move_at_fifty_hertz() {
+    // A drive at 50 turns/s lags one turn behind a target that changes every 20 ms.
+    let text = at("20ms").replace("following_error = 1.0", "following_error = 4.0");
+    moves(&text, 20_000_000);
+}
+
+/// A cycle that 0x60C2 cannot express is rejected, except for drives without this object.
+fn moves_without_interpolation_time(cycle: &str, cycle_ns: u64, refused: &str) {
+    let text = at(cycle);
+    let path = root().join("configs/test.toml");
+    let error = config::parse(&path, &text).expect_err("EPOS4 has 0x60C2");
+    let error = error.to_string();
+    assert!(error.contains(refused), "{error}");
+
+    let folder = tempfile::tempdir().expect("a folder");
+    let esi = std::fs::read_to_string(root().join("configs/esi/EPOS4.xml")).expect("an ESI file");
+    let without = folder.path().join("without.xml");
+    std::fs::write(&without, esi.replace("#x60C2", "#x2FFF")).expect("written");
+    moves(
+        &text.replace("esi/EPOS4.xml", without.to_str().expect("UTF-8")),
+        cycle_ns,
+    );
+}
+
+/// 62.5 µs is 625 × 10⁻⁷ s, and 0x60C2 has only 8 bits for the value 625.
+#[test]
+fn sixteen_kilohertz_requires_drives_without_0x60c2() {
+    let refused = "62500 ns cannot be written to 0x60C2 (value 0..100 times a power of ten); nearest are 62 µs and 63 µs";
+    moves_without_interpolation_time("62.5us", 62_500, refused);
+}
+
+/// 125 µs is expressible, but this drive's file allows 100 at most.
+#[test]
+fn eight_kilohertz_requires_drives_without_0x60c2() {
+    let refused = "125000 ns cannot be written to 0x60C2 (value 0..100 times a power of ten); nearest are 120 µs and 130 µs";
+    moves_without_interpolation_time("125us", 125_000, refused);
+}
+
+#[test]
+fn a_cycle_shorter_than_its_frames_is_reported_as_lost_bus() {
+    // 30 axes need more than three quarters of 50 µs on the wire.
+    let text = axes(30).replace("\"1ms\"", "\"50us\"");
+    let (error, summary) = run_badly(machine(&text), virtual_time());
+    assert!(
+        error.contains("cyclic frames do not return in time") || error.contains("bus is lost"),
+        "{error}"
+    );
+    assert!(summary.is_some_and(|s| s.counters.cycles > 0));
+}

@@ -1,0 +1,17 @@
+//! Whole-bus runs on the simulated bus in virtual time: from a machine file to the motion of the
+//! axes.
+
+#![allow(clippy::print_stdout, reason = "what was measured")]
+
+mod axes;
+mod controller;
+mod cycles;
+mod demo;
+mod homing;
+mod lrw;
+mod mailboxes;
+mod phase;
+mod probe;
+mod program;
+mod samples;
+mod units;

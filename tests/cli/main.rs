@@ -1,0 +1,8 @@
+//! The binary from the user's view: exit codes, messages, output and files.
+
+mod bench;
+mod complaints;
+mod doctor;
+mod esi;
+mod messages;
+mod terminal;

@@ -1,0 +1,559 @@
+//! Manual operation of a machine: the dead-man rule, speeds, stops and resets, in virtual time.
+//! Also `ecaxis jog` with lines and in a terminal.
+
+mod hands;
+mod instead;
+mod lines;
+mod terminal;
+
+use ecaxis_axis::{Mode, State, Trip};
+use ecaxis_master::supervise::jog::{
+    Activity, HOLD_TO_RUN_TIMEOUT, JogEvent, MAX_MANUAL_SPEED, OperatorInput, Presence, Request,
+    View,
+};
+use ecaxis_test_support::{axes, faults, machine, virtual_time};
+use hands::{Seen, by_hand, here, request};
+
+/// Limits of the machines of `axes`, in turns/s and turns/s².
+const VELOCITY: f64 = 50.0;
+const ACCELERATION: f64 = 500.0;
+const CYCLE_S: f64 = 0.001;
+const LET_GO_S: f64 = HOLD_TO_RUN_TIMEOUT as f64 * 1e-9;
+
+/// Enables axis 0, then calls `then` with the seconds since the axis was ready.
+fn once_enabled(
+    mut then: impl FnMut(&View<'_>, f64) -> Option<OperatorInput> + Send + 'static,
+) -> impl FnMut(&View<'_>, f64) -> OperatorInput + Send + 'static {
+    let mut ready = None;
+    move |view, now| {
+        let axis = &view.snapshot.axes[0];
+        if ready.is_none() && !axis.ready {
+            return match view.hands[0].doing {
+                Activity::Nothing => request(Request::Enable { axis: 0 }),
+                _ => here(),
+            };
+        }
+        let since = now - *ready.get_or_insert(now);
+        then(view, since).unwrap_or_else(hands::gone)
+    }
+}
+
+/// Checks that the commanded velocity and its changes stay within the jog limits in every cycle.
+#[track_caller]
+fn within_limits(seen: &[Seen], axis: usize) {
+    for pair in seen.windows(2) {
+        let [before, now] = [&pair[0].axes[axis], &pair[1].axes[axis]];
+        let velocity = now.target_velocity.abs();
+        assert!(
+            velocity <= MAX_MANUAL_SPEED * VELOCITY * 1.000_001,
+            "{velocity} turns/s at {} s",
+            pair[1].time_s
+        );
+        if before.enabled && now.enabled {
+            let cycles = ((pair[1].time_s - pair[0].time_s) / CYCLE_S)
+                .round()
+                .max(1.0);
+            let change = (now.target_velocity - before.target_velocity).abs();
+            let most = ACCELERATION * CYCLE_S * cycles * 1.001;
+            assert!(change <= most, "{change} turns/s at {} s", pair[1].time_s);
+        }
+    }
+}
+
+#[test]
+fn a_released_axis_brakes() {
+    let velocity = 0.1 * VELOCITY;
+    let (outcome, seen) = by_hand(
+        machine(&axes(1)),
+        virtual_time(),
+        once_enabled(move |_, since| match since {
+            ..1.0 => Some(request(Request::Jog { axis: 0, velocity })),
+            ..3.0 => Some(here()),
+            _ => None,
+        }),
+    );
+    outcome.result.expect("leaving is no failure");
+    within_limits(&seen, 0);
+    let moving = |s: &&Seen| s.axes[0].target_velocity != 0.0;
+    let first = seen.iter().find(moving).expect("it jogs").time_s;
+    let full = seen
+        .iter()
+        .filter(|s| s.axes[0].target_velocity == velocity);
+    let slows = full.clone().next_back().expect("at full speed").time_s;
+    let stands = seen.iter().rfind(moving).expect("it jogs").time_s;
+    // The request lasts one second.
+    let held = slows - first;
+    assert!((held - (1.0 + LET_GO_S)).abs() < 0.02, "{held} s at speed");
+    let braking = stands - slows;
+    assert!(braking <= velocity / ACCELERATION + 0.005, "{braking} s");
+    let news: Vec<_> = seen.iter().flat_map(|s| s.news.clone()).collect();
+    let reported = [
+        JogEvent::Done {
+            axis: 0,
+            what: Activity::Enabling,
+        },
+        JogEvent::LetGo { axis: 0 },
+        JogEvent::Done {
+            axis: 0,
+            what: Activity::Stopping,
+        },
+    ];
+    assert_eq!(news, reported);
+}
+
+#[test]
+fn an_absent_operator_starts_nothing_and_stops_all_motion() {
+    for jogs in [true, false] {
+        let (outcome, seen) = by_hand(
+            machine(&axes(1)),
+            virtual_time(),
+            once_enabled(move |_, since| {
+                let jog = Request::Jog {
+                    axis: 0,
+                    velocity: 5.0,
+                };
+                let go = Request::MoveTo {
+                    axis: 0,
+                    position: 80.0,
+                    speed: 0.2,
+                };
+                let mut turn = match since {
+                    0.0 if !jogs => request(go),
+                    ..2.0 if jogs => request(jog),
+                    // A move requested by an absent operator is rejected as well.
+                    0.8..0.9 => request(go),
+                    ..3.0 => here(),
+                    _ => return None,
+                };
+                if (0.5..1.0).contains(&since) {
+                    turn.presence = Presence::Away;
+                }
+                // The returned operator sends no request.
+                if since >= 1.0 {
+                    turn.requests.clear();
+                }
+                Some(turn)
+            }),
+        );
+        outcome.result.expect("leaving is no failure");
+        within_limits(&seen, 0);
+        let ready = seen
+            .iter()
+            .find(|s| s.axes[0].ready)
+            .expect("enabled")
+            .time_s;
+        let moving = seen.iter().filter(|s| s.axes[0].target_velocity != 0.0);
+        let stands = moving.map(|s| s.time_s).next_back().expect("it moves") - ready;
+        assert!((0.5..0.53).contains(&stands), "moves until {stands} s");
+    }
+}
+
+#[test]
+fn an_operator_who_leaves_in_motion_leaves_a_machine_at_rest() {
+    let (outcome, seen) = by_hand(
+        machine(&axes(2)),
+        virtual_time(),
+        once_enabled(|_, since| match since {
+            0.0 => Some(request(Request::MoveBy {
+                axis: 0,
+                distance: 80.0,
+                speed: MAX_MANUAL_SPEED,
+            })),
+            ..0.5 => Some(here()),
+            _ => None,
+        }),
+    );
+    outcome.result.expect("leaving is no failure");
+    within_limits(&seen, 0);
+    let last = &seen.last().expect("seen").axes[0];
+    assert_eq!(
+        last.target_velocity,
+        MAX_MANUAL_SPEED * VELOCITY,
+        "in the middle of it"
+    );
+    let summary = outcome.summary.expect("a summary");
+    assert_eq!(summary.counters.wkc_errors, 0);
+    // 12.5 turns/s for nearly half a second, then deceleration within the limits.
+    let end = summary.axes[0].final_position;
+    assert!((5.0..8.0).contains(&end), "stands at {end}");
+}
+
+#[test]
+fn jog_rejects_more_than_a_quarter_of_the_speed_limit() {
+    let jog = |velocity| Request::Jog { axis: 0, velocity };
+    let by = |speed| Request::MoveBy {
+        axis: 0,
+        distance: 1.0,
+        speed,
+    };
+    let all = [
+        jog(MAX_MANUAL_SPEED * VELOCITY * 1.001),
+        jog(-VELOCITY),
+        jog(f64::NAN),
+        jog(f64::INFINITY),
+        by(MAX_MANUAL_SPEED * 1.001),
+        by(0.0),
+        by(-0.1),
+        by(f64::NAN),
+        Request::MoveTo {
+            axis: 0,
+            position: 101.0,
+            speed: 0.1,
+        },
+        Request::MoveTo {
+            axis: 0,
+            position: f64::NAN,
+            speed: 0.1,
+        },
+        Request::Home { axis: 0 },
+        Request::SetMode {
+            axis: 0,
+            mode: Mode::Csv,
+        },
+    ];
+    let mut next = all.into_iter();
+    let (outcome, seen) = by_hand(
+        machine(&axes(1)),
+        virtual_time(),
+        once_enabled(move |view, since| {
+            if since == 0.0 || view.news.iter().any(JogEvent::is_failure) {
+                return next.next().map(request);
+            }
+            (since < 5.0).then(here)
+        }),
+    );
+    outcome.result.expect("leaving is no failure");
+    assert!(seen.iter().all(|s| s.axes[0].target_velocity == 0.0));
+    let refused = seen.iter().flat_map(|s| &s.news);
+    let refused = refused.filter(|news| matches!(news, JogEvent::Refused { .. }));
+    assert_eq!(refused.count(), all.len());
+}
+
+#[test]
+fn a_rejected_request_keeps_the_dead_man_rule_active() {
+    let (outcome, seen) = by_hand(
+        machine(&axes(1)),
+        virtual_time(),
+        once_enabled(|_, since| {
+            let mut turn = here();
+            if since == 0.0 {
+                // The second request is accepted before the rejection of the first is reported.
+                turn.requests = vec![
+                    Request::MoveTo {
+                        axis: 0,
+                        position: 1000.0,
+                        speed: 0.1,
+                    },
+                    Request::Jog {
+                        axis: 0,
+                        velocity: 5.0,
+                    },
+                ];
+            }
+            (since < 2.0).then_some(turn)
+        }),
+    );
+    outcome.result.expect("leaving is no failure");
+    within_limits(&seen, 0);
+    let moving = seen.iter().filter(|s| s.axes[0].target_velocity != 0.0);
+    let moving: Vec<f64> = moving.map(|s| s.time_s).collect();
+    let lasted = moving
+        .last()
+        .zip(moving.first())
+        .map_or(0.0, |(b, a)| b - a);
+    assert!(lasted < LET_GO_S + 0.05, "{lasted} s");
+}
+
+#[test]
+fn jog_stays_within_the_range_while_the_key_is_held() {
+    let velocity = MAX_MANUAL_SPEED * VELOCITY;
+    let (outcome, seen) = by_hand(
+        machine(&axes(1)),
+        virtual_time(),
+        once_enabled(move |_, since| match since {
+            ..12.0 => Some(request(Request::Jog { axis: 0, velocity })),
+            _ => None,
+        }),
+    );
+    outcome.result.expect("leaving is no failure");
+    within_limits(&seen, 0);
+    let last = &seen.last().expect("seen").axes[0];
+    assert!(last.held_by_range);
+    assert!((last.position - 100.0).abs() < 0.01, "{}", last.position);
+    let beyond = seen.iter().find(|s| s.axes[0].target_position > 100.0);
+    assert!(beyond.is_none(), "{beyond:?}");
+}
+
+#[test]
+fn a_fault_stops_all_axes_and_is_reset() {
+    let script = "[[fault]]\nkind = \"drive-fault\"\ndevice = 1\nat = \"2s\"\ncode = 0x8611\n";
+    let mut reset = false;
+    let (outcome, seen) = by_hand(
+        machine(&axes(2)),
+        faults(script),
+        move |view: &View<'_>, now: f64| {
+            let status = &view.snapshot.axes;
+            let idle = view.idle();
+            let ready = status.iter().all(|axis| axis.ready);
+            if status[1].fault.is_some() && !reset && !status[0].enabled {
+                reset = true;
+                return request(Request::Reset { axis: 1 });
+            }
+            if now > 6.0 {
+                return hands::gone();
+            }
+            let mut turn = here();
+            if idle && !ready && (!reset || status[1].fault.is_none()) {
+                turn.requests = (0..2).map(|axis| Request::Enable { axis }).collect();
+            } else if ready {
+                turn.requests = (0..2)
+                    .map(|axis| Request::Jog {
+                        axis,
+                        velocity: if axis == 0 { 2.0 } else { -2.0 },
+                    })
+                    .collect();
+            }
+            turn
+        },
+    );
+    outcome.result.expect("the fault was seen to");
+    within_limits(&seen, 0);
+    let faulty = seen.iter().position(|s| s.axes[1].fault.is_some());
+    let faulty = faulty.expect("a fault");
+    // Axis 0 stops too and loses its power; both axes are enabled again later.
+    let after = &seen[faulty..];
+    let off = after
+        .iter()
+        .position(|s| s.axes[0].state != State::OperationEnabled);
+    let off = off.expect("axis 0 loses its power");
+    assert_eq!(after[off].axes[0].target_velocity, 0.0);
+    let again = after[off..].iter().find(|s| s.axes.iter().all(|a| a.ready));
+    assert!(again.is_some(), "both come back");
+    let [a, b] = [0, 1].map(|axis| seen.last().expect("seen").axes[axis].target_velocity);
+    assert_eq!((a, b), (2.0, -2.0), "and jog");
+    let summary = outcome.summary.expect("a summary");
+    assert_eq!(summary.group_stops.len(), 1, "{:?}", summary.group_stops);
+}
+
+#[test]
+fn an_emergency_stop_removes_power_and_requires_a_reset() {
+    for reset in [true, false] {
+        let mut phase = 0;
+        let (outcome, seen) = by_hand(
+            machine(&axes(2)),
+            virtual_time(),
+            once_enabled(move |view, since| {
+                let axis = &view.snapshot.axes[0];
+                let (next, turn) = match phase {
+                    0 => (
+                        1,
+                        request(Request::MoveBy {
+                            axis: 0,
+                            distance: 50.0,
+                            speed: 0.2,
+                        }),
+                    ),
+                    1 if since > 0.5 => (2, request(Request::EmergencyStop)),
+                    2 if since > 1.5 => {
+                        assert!(!axis.enabled && axis.trip == Some(Trip::EmergencyStop));
+                        (3, request(Request::Enable { axis: 0 }))
+                    }
+                    3 if view.news.iter().any(JogEvent::is_failure) => {
+                        assert!(!axis.enabled);
+                        let enable = Request::Reset { axis: 0 };
+                        (if reset { 4 } else { 6 }, request(enable))
+                    }
+                    4 if view.idle() => (5, request(Request::Enable { axis: 0 })),
+                    5 if axis.ready => (6, here()),
+                    6 => return None,
+                    same => (same, here()),
+                };
+                phase = if turn.requests == [Request::Reset { axis: 0 }] && !reset {
+                    return None;
+                } else {
+                    next
+                };
+                assert!(since < 20.0, "phase {phase}: {:?}", view.hands);
+                Some(turn)
+            }),
+        );
+        outcome.result.expect("leaving is no failure, reset or not");
+        let again = seen.iter().skip_while(|s| s.axes[0].trip.is_none());
+        assert_eq!(again.clone().any(|s| s.axes[0].ready), reset);
+    }
+}
+
+/// An axis that supports homing and a switch to CSV.
+const VERSATILE: &str = r#"
+[bus]
+nic = "sim"
+cycle = "1ms"
+[[device]]
+name = "x"
+esi = "esi/EPOS4.xml"
+position = 0
+mode = "csp"
+pdo.rx = ["0x6040", "0x6060", "0x607A", "0x60FF"]
+pdo.tx = ["0x6041", "0x6061", "0x6064", "0x606C"]
+[device.axis]
+unit = "turn"
+encoder = 2000
+limits = { velocity = 50.0, acceleration = 500.0, following_error = 0.5 }
+homing = { method = 17, search = 5.0, zero = 0.5, acceleration = 100.0, position = 3.0 }
+[device.sim]
+track = { negative_limit = -6.0, positive_limit = 6.0, home = [2.0, 2.5], index = 0.25 }
+"#;
+
+#[test]
+fn jog_homes_an_axis_and_switches_its_mode() {
+    let plan = [
+        Request::Home { axis: 0 },
+        Request::MoveTo {
+            axis: 0,
+            position: 5.0,
+            speed: 0.2,
+        },
+        Request::SetMode {
+            axis: 0,
+            mode: Mode::Csv,
+        },
+        Request::Jog {
+            axis: 0,
+            velocity: 2.0,
+        },
+    ];
+    let mut next = plan.into_iter();
+    let (outcome, seen) = by_hand(
+        machine(VERSATILE),
+        virtual_time(),
+        once_enabled(move |view, since| {
+            assert!(since < 20.0, "{:?}", view.hands);
+            if view.idle() {
+                return next.next().map(request);
+            }
+            Some(here())
+        }),
+    );
+    outcome.result.expect("leaving is no failure");
+    within_limits(&seen, 0);
+    let news = seen.iter().flat_map(|s| s.news.clone());
+    let done: Vec<JogEvent> = news
+        .filter(|news| !matches!(news, JogEvent::LetGo { .. }))
+        .collect();
+    let done: Vec<String> = done.iter().map(ToString::to_string).collect();
+    assert_eq!(done, ["enabled", "homed", "is there", "in CSV", "stopped"]);
+    let last = &seen.last().expect("seen").axes[0];
+    assert!(last.homed && last.mode == Mode::Csv);
+    // 2 turns/s for 0.3 s, plus acceleration and deceleration.
+    assert!((5.5..6.0).contains(&last.position), "{}", last.position);
+}
+
+#[test]
+fn homing_ends_without_an_operator() {
+    let (outcome, seen) = by_hand(
+        machine(VERSATILE),
+        virtual_time(),
+        once_enabled(|_, since| {
+            let mut turn = match since {
+                0.0 => request(Request::Home { axis: 0 }),
+                ..2.0 => here(),
+                _ => return None,
+            };
+            if since > 0.5 {
+                turn.presence = Presence::Away;
+            }
+            Some(turn)
+        }),
+    );
+    outcome.result.expect("leaving is no failure");
+    let ready = seen
+        .iter()
+        .find(|s| s.axes[0].ready)
+        .expect("enabled")
+        .time_s;
+    let searched = seen.iter().filter(|s| s.axes[0].velocity.abs() > 1.0);
+    let last = searched.map(|s| s.time_s).next_back().expect("it searches") - ready;
+    assert!((0.4..0.7).contains(&last), "searches until {last} s");
+    assert!(!seen.last().expect("seen").axes[0].homed);
+}
+
+#[test]
+fn random_requests_stay_within_the_limits() {
+    for seed in 1..=12_u64 {
+        // xorshift
+        let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        let mut dice = move |sides: u64| {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            state % sides
+        };
+        let mut last_jog = [0.0_f64; 2];
+        let mut away = false;
+        let (outcome, seen) = by_hand(machine(&axes(2)), virtual_time(), move |view, now| {
+            if now > 8.0 {
+                return hands::gone();
+            }
+            for (axis, hand) in view.hands.iter().enumerate() {
+                let jogs = matches!(hand.doing, Activity::Jogging { .. });
+                let long = now - last_jog[axis] > LET_GO_S + 0.003;
+                assert!(!(jogs && long), "seed {seed}: still jogs at {now} s");
+            }
+            if dice(300) == 0 {
+                away = !away;
+            }
+            let mut turn = here();
+            if away {
+                turn.presence = Presence::Away;
+            }
+            for _ in 0..dice(3) {
+                let axis = dice(2) as usize;
+                let part = dice(1000) as f64 / 500.0 - 1.0;
+                let again = match dice(60) {
+                    0..10 => {
+                        let velocity = part * 2.0 * MAX_MANUAL_SPEED * VELOCITY;
+                        last_jog[axis] = now;
+                        Request::Jog { axis, velocity }
+                    }
+                    10 => Request::MoveBy {
+                        axis,
+                        distance: part * 20.0,
+                        speed: part * 0.5,
+                    },
+                    11 => Request::MoveTo {
+                        axis,
+                        position: part * 150.0,
+                        speed: part * 0.5,
+                    },
+                    12..20 => Request::Enable { axis },
+                    20 => Request::Disable { axis },
+                    21 => Request::Stop { axis },
+                    22 => Request::StopAll,
+                    23..30 => Request::Reset { axis },
+                    30 if dice(20) == 0 => Request::EmergencyStop,
+                    31 => Request::Home { axis },
+                    32 => Request::SetMode {
+                        axis,
+                        mode: Mode::Csv,
+                    },
+                    33 => Request::Enable { axis: 7 },
+                    _ => continue,
+                };
+                turn.requests.push(again);
+            }
+            turn
+        });
+        outcome
+            .result
+            .unwrap_or_else(|error| panic!("seed {seed}: {error}"));
+        for axis in 0..2 {
+            within_limits(&seen, axis);
+            let out = seen
+                .iter()
+                .find(|s| s.axes[axis].target_position.abs() > 100.0);
+            assert!(out.is_none(), "seed {seed}: {out:?}");
+        }
+        let moved = seen.iter().any(|s| s.axes[0].target_velocity != 0.0);
+        assert!(moved, "seed {seed}: nothing has been tried");
+    }
+}

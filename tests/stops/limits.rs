@@ -1,0 +1,356 @@
+//! Limits of a drive besides its set-points: the process data watchdog, the drive's own limits, and
+//! outputs without an axis. Read from the wire.
+
+use std::path::Path;
+
+use ecaxis_master::config::{self, Machine};
+use ecaxis_test_support::program;
+use ecaxis_test_support::recordings::{FPRD, FPWR, LRW, datagrams};
+use ecaxis_test_support::{Heard, assert_contains, faults, recorded, root, run, virtual_time};
+
+/// A machine with ESI files in a temporary folder.
+struct Bench {
+    folder: tempfile::TempDir,
+}
+
+impl Bench {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().expect("a folder");
+        std::fs::create_dir(folder.path().join("esi")).expect("a folder");
+        Self { folder }
+    }
+
+    /// Writes a changed copy of a file of `configs/esi`.
+    fn esi(&self, name: &str, change: impl Fn(String) -> String) {
+        let text = std::fs::read_to_string(root().join("configs/esi").join(name));
+        let changed = change(text.expect("an ESI file"));
+        std::fs::write(self.folder.path().join("esi").join(name), changed).expect("written");
+    }
+
+    fn parse(&self, text: &str) -> Result<Machine, String> {
+        let path = self.folder.path().join("machine.toml");
+        config::parse(&path, text).map_err(|error| error.to_string())
+    }
+
+    fn machine(&self, text: &str) -> Machine {
+        self.parse(text).unwrap_or_else(|error| panic!("{error}"))
+    }
+}
+
+const SV1_CSV: &str = r#"
+[bus]
+nic = "sim"
+cycle = "1ms"
+lost_frames = 50
+[[device]]
+name = "z"
+esi = "esi/SV1.xml"
+position = 0
+mode = "csv"
+[device.axis]
+unit = "turn"
+encoder = 131072
+limits = { velocity = 20.0, acceleration = 100.0, torque = 100.0 }
+[[step]]
+velocity = { z = 15.0 }
+[[step]]
+dwell = "3s"
+"#;
+
+#[test]
+fn an_axis_has_a_watchdog_with_any_esi() {
+    let bench = Bench::new();
+    bench.esi("SV1.xml", |text| {
+        let changed = text.replace("ControlByte=\"#x64\"", "ControlByte=\"#x24\"");
+        assert_ne!(changed, text);
+        changed
+    });
+    let silent = "[[fault]]\nkind = \"silent\"\nat = \"2s\"\nfor = \"250ms\"\n";
+    let (options, path) = recorded(faults(silent), bench.folder.path());
+    let (outcome, _) = run(bench.machine(SV1_CSV), options);
+    outcome.result.expect_err("the bus was silent");
+    let all = datagrams(&path);
+    let written = |register: u16| {
+        let mut each = all.iter().filter(|d| d.sent && d.command == FPWR);
+        each.find(|d| d.register() == register).map(|d| &d.data[..])
+    };
+    let outputs = written(0x0810).expect("the outputs' SyncManager");
+    assert_eq!(outputs[4], 0x64, "ControlByte with its watchdog trigger");
+    for (register, value) in [(0x0400, 2498_u16), (0x0410, 1000), (0x0420, 1000)] {
+        assert_eq!(written(register), Some(&value.to_le_bytes()[..]));
+        let mut read = all.iter().filter(|d| d.command == FPRD && !d.sent);
+        let back = read.find(|d| d.register() == register && d.data.len() == 2);
+        let back = back.unwrap_or_else(|| panic!("0x{register:04x} is not read back"));
+        assert_eq!(back.data, value.to_le_bytes());
+    }
+    // When frames return, the drive has left Op because of its watchdog.
+    let states = |register: u16| {
+        let read = all.iter().filter(move |d| !d.sent && d.working_counter > 0);
+        read.filter(move |d| d.register() <= register && register - d.register() < 0x30)
+            .filter_map(move |d| d.data.get(usize::from(register - d.register())).copied())
+    };
+    let found: Vec<u8> = states(0x0130).collect();
+    assert!(found.contains(&0x14), "AL states {found:02x?}");
+    let codes: Vec<u8> = states(0x0134).collect();
+    assert!(codes.contains(&0x1b), "AL status codes {codes:02x?}");
+    let expired: Vec<u8> = all
+        .iter()
+        .filter(|d| !d.sent && d.register() == 0x0400 && d.data.len() > 0x42)
+        .map(|d| d.data[0x42])
+        .collect();
+    assert!(expired.contains(&1), "expirations in 0x0442: {expired:?}");
+}
+
+/// Returns an axis of 2000 counts per turn on `configs/esi/EPOS4.xml`, with additional keys of its
+/// device.
+fn epos4(device: &str, limits: &str) -> String {
+    format!(
+        r#"
+[bus]
+nic = "sim"
+cycle = "1ms"
+[[device]]
+name = "x"
+esi = "esi/EPOS4.xml"
+position = 0
+mode = "csp"
+{device}
+[device.axis]
+unit = "turn"
+encoder = 2000
+limits = {{ {limits} }}
+[[step]]
+dwell = "50ms"
+"#
+    )
+}
+
+fn same(text: String) -> String {
+    text
+}
+
+/// Replaces the default of one of the ESI's objects, after its index.
+fn default(text: &str, index: &str, from: &str, to: &str) -> String {
+    let at = text
+        .find(&format!("<Index>#x{index}</Index>"))
+        .expect(index);
+    let from = format!("<DefaultValue>{from}</DefaultValue>");
+    let at = at + text[at..].find(&from).expect("its default");
+    let to = format!("<DefaultValue>{to}</DefaultValue>");
+    format!("{}{to}{}", &text[..at], &text[at + from.len()..])
+}
+
+#[test]
+fn a_limit_above_a_startup_sdo_is_rejected() {
+    let bench = Bench::new();
+    bench.esi("EPOS4.xml", same);
+    let wide = "position = [-20.0, 20.0], velocity = 40.0, acceleration = 200.0, torque = 120.0, following_error = 0.5";
+    for (sdo, expected) in [
+        (
+            "{ index = 0x6080, value = 600 }",
+            "0x6080:00 (Max motor speed) = 600 rpm allows 10 turn/s, `limits.velocity` is 40 turn/s",
+        ),
+        (
+            "{ index = 0x607D, sub = 2, value = 2000 }",
+            "0x607d:02 (Max position limit) = 2000 is 1 turn, `limits.position` goes to 20 turn",
+        ),
+        (
+            "{ index = 0x607D, sub = 1, value = -2000 }",
+            "0x607d:01 (Min position limit) = -2000 is -1 turn, `limits.position` goes to -20 turn",
+        ),
+        (
+            "{ index = 0x6065, value = 900 }",
+            "0x6065:00 (Following error window) = 900 is 0.45 turn, `limits.following_error` is 0.5 turn",
+        ),
+        (
+            "{ index = 0x60C5, value = 6000 }",
+            "0x60c5:00 (Max acceleration) = 6000 rpm/s allows 100 turn/s², `limits.acceleration` is 200 turn/s²",
+        ),
+        (
+            "{ index = 0x6072, value = 1000 }",
+            "0x6072:00 (Max torque) = 1000 ‰ of rated torque allows 100 %, `limits.torque` is 120 %",
+        ),
+    ] {
+        let error = bench.parse(&epos4(&format!("sdo = [{sdo}]"), wide));
+        let error = error.expect_err(sdo);
+        assert!(error.contains(expected), "{sdo}: {error}");
+        // Limits within the drive's limits are accepted.
+        let narrow = "position = [-0.9, 0.9], velocity = 9.0, acceleration = 90.0, torque = 99.0, following_error = 0.4";
+        bench.machine(&epos4(&format!("sdo = [{sdo}]"), narrow));
+    }
+}
+
+#[test]
+fn a_drive_limit_below_the_file_limit_causes_a_warning() {
+    let bench = Bench::new();
+    // The 0x6080 of the simulated motor is 6000 rpm.
+    bench.esi("EPOS4.xml", |text| default(&text, "6065", "2000", "400"));
+    let limits =
+        "position = [-20.0, 20.0], velocity = 1000.0, acceleration = 200.0, following_error = 0.5";
+    let machine = bench.machine(&epos4("", limits));
+    let notes = machine.devices[0].selection.notes.join("\n");
+    assert!(notes.contains("0x6080:00 (Max motor speed)"), "{notes}");
+    let (outcome, heard) = run(machine, virtual_time());
+    outcome.result.expect("nothing moves");
+    let warned = |heard: &Heard, text: &str| {
+        let all = heard.warnings();
+        all.iter().any(|w| w.contains("`x`") && w.contains(text))
+    };
+    for expected in [
+        "0x6080:00 (Max motor speed) = 6000 rpm allows 100 turn/s, `limits.velocity` is 1000 turn/s",
+        "0x6065:00 (Following error window) = 400 is 0.2 turn, `limits.following_error` is 0.5 turn",
+    ] {
+        assert!(warned(&heard, expected), "{:?}", heard.warnings());
+    }
+    let modest =
+        "position = [-20.0, 20.0], velocity = 10.0, acceleration = 200.0, following_error = 0.2";
+    let (outcome, heard) = run(bench.machine(&epos4("", modest)), virtual_time());
+    outcome.result.expect("nothing moves");
+    assert_eq!(heard.warnings(), Vec::<String>::new());
+}
+
+#[test]
+fn a_trip_names_the_drive_limit_that_held_the_axis_back() {
+    let bench = Bench::new();
+    bench.esi("EPOS4.xml", same);
+    let limits = "velocity = 150.0, acceleration = 1500.0, following_error = 0.5";
+    let text = epos4("", limits) + "[[step]]\nmove_by = { x = 80.0 }\n";
+    let file = bench.folder.path().join("machine.toml");
+    std::fs::write(&file, text).expect("written");
+    let file = file.to_str().expect("UTF-8");
+    let said = program::run(["run", file, "--sim", "--virtual"])
+        .exits(1)
+        .err;
+    let hint = said.split("help:").nth(1).unwrap_or_default();
+    let hint = hint.split_whitespace().collect::<Vec<_>>().join(" ");
+    let limit = ["0x6080:00", "allows 100 turn/s", "`limits.velocity`"];
+    assert_contains(&hint, &[&limit[..], &["the drive allows less"]].concat());
+}
+
+/// Returns the sent outputs of a device, cycle by cycle.
+fn outputs(recording: &Path) -> Vec<Vec<u8>> {
+    let all = datagrams(recording).into_iter();
+    let sent = all.filter(|d| d.sent && d.command == LRW);
+    sent.map(|d| d.data).collect()
+}
+
+const OFFSET_AND_SECOND_AXIS: &str = "\
+pdo.rx = [\"0x6040\", \"0x607A\", \"0x60B0\", \"0x6840\", \"0x68FF\"]\n\
+pdo.tx = [\"0x6041\", \"0x6061\", \"0x6064\"]";
+
+/// Returns a drive with an offset, and with power and velocity for a second axis.
+fn two_axes(text: String) -> String {
+    let object = |index: &str, name: &str, kind: &str, bits: u8, value: u32| {
+        format!(
+            "<Object><Index>#x{index}</Index><Name>{name}</Name><Type>{kind}</Type><BitSize>{bits}</BitSize>\
+             <Info><DefaultValue>{value}</DefaultValue></Info>\
+             <Flags><Access>rw</Access><PdoMapping>R</PdoMapping></Flags></Object>"
+        )
+    };
+    let text = default(&text, "60B0", "0", "1900");
+    let more = object("6840", "Controlword 2", "UINT", 16, 0x0f)
+        + &object("68FF", "Target velocity 2", "DINT", 32, 5000);
+    text.replacen("</Objects>", &(more + "</Objects>"), 1)
+}
+
+const LIMITS: &str =
+    "position = [-10.0, 10.0], velocity = 10.0, acceleration = 50.0, following_error = 1.0";
+
+#[test]
+fn offsets_and_outputs_of_a_second_axis_stay_zero() {
+    let bench = Bench::new();
+    bench.esi("EPOS4.xml", two_axes);
+    let text = epos4(OFFSET_AND_SECOND_AXIS, LIMITS);
+    let machine = bench.machine(&(text.clone() + "[[step]]\nmove = { x = 2.0 }\n"));
+    let notes = machine.devices[0].selection.notes.join("\n");
+    assert!(notes.contains("axis 2 of the drive"), "{notes}");
+    let (options, path) = recorded(virtual_time(), bench.folder.path());
+    run(machine, options).0.result.expect("it moves");
+    let cycles = outputs(&path);
+    assert!(cycles.len() > 100, "{} cycles", cycles.len());
+    for (number, data) in cycles.iter().enumerate() {
+        assert_eq!(data[6..16], [0; 10], "cycle {number}: {data:02x?}");
+    }
+    for name in ["0x60B0", "0x6840", "0x68FF"] {
+        let step = format!("[[step]]\nset = {{ x.\"{name}\" = 1 }}\n");
+        let error = bench.parse(&(text.clone() + &step)).expect_err(name);
+        let message = "give the axis a command instead";
+        assert!(error.contains(message), "{name}: {error}");
+    }
+}
+
+#[test]
+fn offsets_of_targets_are_rejected_or_set_to_zero() {
+    let bench = Bench::new();
+    bench.esi("EPOS4.xml", two_axes);
+    for index in ["0x60B0", "0x60B1", "0x60B2"] {
+        let sdo = |value: i32| {
+            epos4(
+                &format!("sdo = [{{ index = {index}, value = {value} }}]"),
+                LIMITS,
+            )
+        };
+        let error = bench.parse(&sdo(5)).expect_err(index);
+        assert!(error.contains("adds to every target"), "{error}");
+        bench.machine(&sdo(0));
+    }
+    // The drive holds the offset, but the object is not in its process data.
+    let (options, path) = recorded(virtual_time(), bench.folder.path());
+    let (outcome, heard) = run(bench.machine(&epos4("", LIMITS)), options);
+    outcome.result.expect("nothing moves");
+    let warnings = heard.warnings();
+    let warned = |w: &String| w.contains("0x60b0:00 (Position offset)");
+    assert!(warnings.iter().any(warned), "{warnings:?}");
+    // An expedited download of 0 to 0x60B0, as in the drive's mailbox.
+    let download = [0x23, 0xb0, 0x60, 0x00, 0, 0, 0, 0];
+    let all = datagrams(&path);
+    let mut written = all.iter().filter(|d| d.sent && d.command == FPWR);
+    assert!(written.any(|d| d.data.windows(8).any(|part| part == download)));
+}
+
+#[test]
+fn interpolation_time_equals_the_cycle_if_csp_or_csv_is_possible() {
+    let bench = Bench::new();
+    bench.esi("EPOS4.xml", same);
+    let csp = "pdo.rx = [\"0x6040\", \"0x6060\", \"0x607A\", \"0x6071\"]\n\
+               pdo.tx = [\"0x6041\", \"0x6061\", \"0x6064\", \"0x606C\", \"0x6077\"]";
+    let alone = "";
+    for (pdo, expected) in [(csp, (2, -3)), (alone, (0, 0))] {
+        let text = epos4(pdo, "velocity = 40.0, acceleration = 200.0");
+        let text = text.replace("\"csp\"", "\"cst\"").replace("1ms", "2ms");
+        let (options, path) = recorded(virtual_time(), bench.folder.path());
+        let (outcome, _) = run(bench.machine(&text), options);
+        outcome.result.expect("nothing moves");
+        let all = datagrams(&path);
+        let downloads = |sub: u8| {
+            let request = [0x2f, 0xc2, 0x60, sub];
+            let mut sent = all.iter().filter(|d| d.sent && d.command == FPWR);
+            sent.find_map(|d| {
+                let mut parts = d.data.windows(5);
+                parts
+                    .find(|part| part[..4] == request)
+                    .map(|part| part[4] as i8)
+            })
+        };
+        assert_eq!(downloads(1), Some(expected.0), "{pdo}");
+        assert_eq!(downloads(2).unwrap_or(0), expected.1, "{pdo}");
+    }
+}
+
+fn terminals(count: usize) -> String {
+    let mut text = String::from("[bus]\nnic = \"sim\"\ncycle = \"4ms\"\n");
+    for n in 0..count {
+        text += &format!("[[device]]\nname = \"io{n}\"\nesi = \"esi/IO8.xml\"\nposition = {n}\n");
+    }
+    text + "[[step]]\ndwell = \"20ms\"\n"
+}
+
+#[test]
+fn bring_up_supports_more_than_128_devices_and_rejects_more_than_512() {
+    let bench = Bench::new();
+    bench.esi("IO8.xml", same);
+    let (outcome, _) = run(bench.machine(&terminals(130)), virtual_time());
+    outcome.result.expect("it runs");
+    let error = bench.parse(&terminals(513)).expect_err("one too many");
+    assert!(error.contains("at most 512 SubDevices"), "{error}");
+}

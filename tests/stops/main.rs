@@ -1,0 +1,8 @@
+//! Stops of machines, groups and axes for every cause, in virtual time.
+
+mod brake;
+mod bus_faults;
+mod causes;
+mod failures;
+mod groups;
+mod limits;
