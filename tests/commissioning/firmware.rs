@@ -5,7 +5,7 @@ mod cli;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use ecaxis_master::acyclic::enumerate::DeviceSelector;
+use ecaxis_master::acyclic::eeprom::EepromAccess;
 use ecaxis_master::acyclic::{DatagramClient, device, mailbox, run_on_link};
 use ecaxis_master::bringup::{AlState, al};
 use ecaxis_master::clock::Clock;
@@ -134,8 +134,8 @@ impl Bench {
     }
 
     fn examine(&mut self) -> DeviceIdentity {
-        let which = DeviceSelector::Position(self.position);
-        let work = async move |wire| firmware::examine(&wire, which, "x").await;
+        let which = Locator::Position(self.position);
+        let work = async move |wire| firmware::examine(&wire, which, Some("x")).await;
         let stop = AtomicBool::new(false);
         let done = run_on_link(&mut self.link, Clock::Virtual, &stop, work);
         done.expect("carried").expect("examined")
@@ -148,7 +148,7 @@ impl Bench {
         file: &[u8],
         report: &mut dyn FnMut(UpdateProgress),
     ) -> Result<UpdateReport, FirmwareError> {
-        let (which, expected) = (DeviceSelector::Position(self.position), self.expected);
+        let (which, expected) = (Locator::Position(self.position), self.expected);
         let order = UpdateRequest {
             via,
             file: file.to_vec(),
@@ -157,7 +157,7 @@ impl Bench {
             read_back: true,
         };
         let work = async move |wire| {
-            let before = firmware::examine(&wire, which, "x").await?;
+            let before = firmware::examine(&wire, which, Some("x")).await?;
             firmware::update(&wire, &before, expected, &order, report).await
         };
         let stop = Arc::clone(&self.stop);
@@ -404,7 +404,8 @@ fn the_eeprom_of_a_running_device_stays_assigned_to_it() {
                 let at = device::locate(&wire, Locator::Position(0), None).await;
                 let (found, at) = at.expect("located");
                 if found.state == AlState::Init {
-                    let sii = device::information(&wire, &found, &at).await.expect("read");
+                    let sii = device::read_sii(&wire, &at, EepromAccess::Force).await;
+                    let sii = sii.expect("read");
                     mailbox::open(&wire, &at, &sii).await.expect("in PreOp");
                     wire.write(at.station, 0x0500, &[1]).await.expect("lent");
                 } else {

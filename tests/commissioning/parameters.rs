@@ -72,10 +72,9 @@ async fn with_device<T>(
     work: impl AsyncFnOnce(&mut CoeClient) -> T,
 ) -> T {
     let at = Locator::Position(position);
-    let (found, at) = device::locate(wire, at, None).await.expect("located");
-    let sii = device::information(wire, &found, &at)
-        .await
-        .expect("an image");
+    let (_, at) = device::locate(wire, at, None).await.expect("located");
+    let sii = device::read_sii(wire, &at, EepromAccess::Force).await;
+    let sii = sii.expect("an image");
     let done: Result<T, ServiceError> =
         device::with_mailbox(wire, &at, &sii, "a test", async |lent| {
             Ok(work(&mut lent.coe).await)
@@ -236,10 +235,9 @@ fn frame_sized_mailboxes_transfer_everything() {
             .await;
 
             let at = device::locate(&wire, Locator::Position(0), None).await;
-            let (found, at) = at.expect("located");
-            let sii = device::information(&wire, &found, &at)
-                .await
-                .expect("an image");
+            let (_, at) = at.expect("located");
+            let sii = device::read_sii(&wire, &at, EepromAccess::Force).await;
+            let sii = sii.expect("an image");
             let registers = Registers {
                 wire: &wire,
                 device: &at,

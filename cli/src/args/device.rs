@@ -1,9 +1,12 @@
-//! Device selection: by name in a machine file, or by position or alias on an interface.
+//! Device selection: by name in a machine file, or by position, alias or identification on an
+//! interface.
 
 use std::path::PathBuf;
 
 use ecaxis_esi::sii::Sii;
 use ecaxis_esi::{Dictionary, Identity, SelectOptions, select};
+use ecaxis_master::acyclic::eeprom::EepromAccess;
+use ecaxis_master::acyclic::enumerate::EnumeratedDevice;
 use ecaxis_master::acyclic::{DatagramClient, ServiceError, device};
 use ecaxis_master::bringup::{AlState, DeviceRef};
 use ecaxis_master::config::{self, DeviceConfig, Locator, Machine, Nic, nearest};
@@ -15,50 +18,53 @@ use ecaxis_tools::parameters::dump::Origin;
 use crate::args::bus::{self, Bus};
 use crate::hints;
 use crate::hints::Failure;
+use crate::verbs::esi::number_16;
 
-/// Options that select a device
+/// Options that select one device
 #[derive(Debug, Clone, clap::Args)]
 #[command(next_help_heading = "Which device")]
 pub(crate) struct DeviceArgs {
-    /// Use this network interface; without a machine file, with --position or --alias
+    /// Use this network interface instead of the machine file's, or without a machine file
     #[arg(long, value_name = "IF", conflicts_with = "sim")]
     nic: Option<String>,
     /// Use the machine file's simulated bus
     #[arg(long)]
     sim: bool,
     /// Position of the device on the interface, counted from 0
-    #[arg(long, value_name = "N", requires = "nic", conflicts_with = "alias")]
+    #[arg(long, value_name = "N", requires = "nic", conflicts_with_all = ["alias", "id"])]
     position: Option<u16>,
     /// Station alias of the device
-    #[arg(long, value_name = "A", requires = "nic", value_parser = crate::verbs::esi::number_16)]
+    #[arg(long, value_name = "A", requires = "nic", conflicts_with = "id", value_parser = number_16)]
     alias: Option<u16>,
-    /// ESI file or folder of the device, without a machine file
-    #[arg(long, value_name = "PATH", requires = "nic")]
-    esi: Option<PathBuf>,
+    /// Explicit device identification of the device, such as its ID switch
+    #[arg(long, value_name = "ID", requires = "nic", value_parser = number_16)]
+    id: Option<u16>,
 }
 
 /// The device selected on the command line.
 #[derive(Debug)]
 pub(crate) struct Target {
     pub bus: Bus,
-    at: Locator,
+    pub at: Locator,
+    /// The machine file, if it selects the device.
+    pub machine: Option<Box<Machine>>,
     /// The device's section of the machine file.
-    config: Option<Box<DeviceConfig>>,
-    esi: Option<PathBuf>,
+    pub config: Option<Box<DeviceConfig>>,
+    /// ESI file or folder of the device, without a machine file.
+    pub esi: Option<PathBuf>,
 }
 
 impl DeviceArgs {
-    /// Returns the device and the remaining words. Without `--position` or `--alias`, the first two
-    /// words are machine file and device name. `rest` describes the words after them.
+    /// Returns the device and the remaining words. Without `--position`, `--alias` or `--id`, the
+    /// first two words are machine file and device name. `rest` describes the words after them.
     pub fn take<'w>(
         &self,
         words: &'w [String],
         rest: &str,
     ) -> Result<(Target, &'w [String]), Failure> {
-        let at = match (self.position, self.alias) {
-            (Some(position), _) => Some(Locator::Position(position)),
-            (None, alias) => alias.map(Locator::Alias),
-        };
+        let position = self.position.map(Locator::Position);
+        let alias = self.alias.map(Locator::Alias);
+        let at = position.or(alias).or(self.id.map(Locator::Id));
         if let (Some(nic), Some(at)) = (&self.nic, at) {
             if nic == "sim" {
                 let message = "the simulated bus is a machine file's: `FILE DEVICE --sim`";
@@ -67,15 +73,16 @@ impl DeviceArgs {
             let target = Target {
                 bus: Bus::interface(nic),
                 at,
+                machine: None,
                 config: None,
-                esi: self.esi.clone(),
+                esi: None,
             };
             return Ok((target, words));
         }
         let [file, name, rest @ ..] = words else {
             let message = format!("which device? A machine file and a name in it, then {rest}");
             return Err(Failure::new(hints::WRONG, message).hint(
-                "without a machine file: `--nic IF` with `--position N` or `--alias A`; `ecaxis scan` shows them",
+                "without a machine file: `--nic IF` with `--position N`, `--alias A` or `--id ID`; `ecaxis scan` shows them",
             ));
         };
         let file = PathBuf::from(file);
@@ -85,18 +92,31 @@ impl DeviceArgs {
         } else if let Some(nic) = &self.nic {
             machine.bus.nic = Nic::Interface(nic.clone());
         }
-        let config = named(&machine, name)?;
+        let config = named(&machine, name)?.clone();
         let target = Target {
             bus: Bus::of(&machine),
             at: config.at,
-            config: Some(Box::new(config.clone())),
-            esi: self.esi.clone(),
+            machine: Some(Box::new(machine)),
+            config: Some(Box::new(config)),
+            esi: None,
         };
         Ok((target, rest))
     }
 }
 
-fn named<'m>(machine: &'m Machine, name: &str) -> Result<&'m DeviceConfig, Failure> {
+/// Fails if words remain.
+pub(crate) fn no_more(rest: &[String]) -> Result<(), Failure> {
+    match rest.first() {
+        None => Ok(()),
+        Some(word) => {
+            let message = format!("`{word}` is one word too many");
+            Err(Failure::new(hints::WRONG, message))
+        }
+    }
+}
+
+/// Returns the device of a machine with this name.
+pub(crate) fn named<'m>(machine: &'m Machine, name: &str) -> Result<&'m DeviceConfig, Failure> {
     let found = machine.devices.iter().find(|device| device.name == name);
     found.ok_or_else(|| {
         let names = machine.devices.iter().map(|device| device.name.as_str());
@@ -123,7 +143,7 @@ pub(crate) struct OpenDevice {
     nic: Nic,
     /// True if another MainDevice is active on the bus.
     others: bool,
-    found: ecaxis_master::acyclic::enumerate::EnumeratedDevice,
+    found: EnumeratedDevice,
 }
 
 impl Target {
@@ -137,6 +157,7 @@ impl Target {
             at,
             config,
             esi,
+            ..
         } = self;
         let nic = bus.nic();
         let done = bus.visit(async move |wire: DatagramClient, others| {
@@ -162,8 +183,9 @@ impl Target {
     ) -> Result<T, Failure> {
         self.visit(async move |located: &OpenDevice| {
             let at = located;
-            let sii = device::information(&at.wire, &at.found, &at.device).await;
-            let sii = at.map_error(sii)?;
+            let access = EepromAccess::of(at.state);
+            let sii = device::read_sii_unless_in_use(&at.wire, &at.found, &at.device, access).await;
+            let sii = at.map_error(sii)?.unwrap_or_default();
             at.check(sii.identity)?;
             let done = device::with_mailbox(&at.wire, &at.device, &sii, step, async |lent| {
                 let mut open = Open {

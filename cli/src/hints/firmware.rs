@@ -23,9 +23,6 @@ pub(crate) fn firmware(error: &FirmwareError, nic: &Nic) -> Failure {
     let failure = Failure::new(code, message(error));
     match error {
         FirmwareError::Service(error) => service(error, nic),
-        FirmwareError::Eeprom { .. } => {
-            failure.hint("the device's EEPROM is damaged: rewrite it with its vendor's tools")
-        }
         FirmwareError::Identity { .. } => failure
             .hint("`ecaxis firmware info` shows the device; select the intended one")
             .hint("if this is the right one, name its ESI file in the machine file, or `--expect-product`"),

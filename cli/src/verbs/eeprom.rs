@@ -52,7 +52,7 @@ Examples:
 
 /// Read, write and check the EEPROM of a device, or set its station alias
 ///
-/// Select the device by machine file and name, or by --nic with --position or --alias.
+/// Select the device by machine file and name, or by --nic with --position, --alias or --id.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {

@@ -3,15 +3,14 @@
 use ecaxis_esi::sii::{self, Sii};
 
 use super::eeprom::{EepromAccess, EepromError, with_eeprom};
-use super::enumerate::{DeviceSelector, EnumeratedDevice, address, enumerate};
+use super::enumerate::{EnumeratedDevice, address, enumerate, select};
 use super::mailbox::{self, MailboxSession};
 use super::{DatagramClient, ServiceError};
-use crate::bringup::al::read_explicit_id;
-use crate::bringup::{AlState, DeviceRef};
+use crate::bringup::{AlState, DeviceRef, al};
 use crate::config::Locator;
 use crate::mailbox::MailboxTransport;
 
-/// Returns the requested device with its present station address.
+/// Returns the requested device with its present station address. Every device has one afterwards.
 ///
 /// # Errors
 /// [`ServiceError::NotFound`], [`ServiceError::Ambiguous`]; as [`enumerate`].
@@ -22,58 +21,58 @@ pub async fn locate(
 ) -> Result<(EnumeratedDevice, DeviceRef), ServiceError> {
     let mut all = enumerate(wire).await?;
     address(wire, &mut all).await?;
-    let found = match at {
-        Locator::Position(position) => DeviceSelector::Position(position).select_from(&all)?,
-        Locator::Alias(alias) => DeviceSelector::Alias(alias).select_from(&all)?,
-        Locator::Id(id) => by_id(wire, &all, id).await?,
+    let at = match at {
+        Locator::Id(id) => {
+            let stations = all.iter().map(|found| found.station);
+            let found = al::find_explicit_id(wire, stations, id).await;
+            let found = found.and_then(|index| all.get(index));
+            found.map_or(at, |found| Locator::Position(found.position))
+        }
+        at => at,
     };
+    let found = select(&all, at)?;
     let name = name.map_or_else(|| format!("device {}", found.position), ToOwned::to_owned);
     Ok((found.clone(), found.named(name)))
 }
 
-/// Finds a device by its explicit device identification (ETG.1020), read from the device itself.
-async fn by_id<'f>(
-    wire: &DatagramClient,
-    all: &'f [EnumeratedDevice],
-    id: u16,
-) -> Result<&'f EnumeratedDevice, ServiceError> {
-    for found in all {
-        if matches!(read_explicit_id(wire, found.station).await, Ok(Some(actual)) if actual == id) {
-            return Ok(found);
-        }
-    }
-    Err(ServiceError::NotFound {
-        wanted: format!("device identification {id}"),
-        found: format!("{} were asked", all.len()),
-    })
-}
-
-/// Returns the EEPROM content. Empty if the PDI is using the EEPROM and the mailbox is already
-/// configured: the mailbox does not need it then.
+/// Reads the content of a device's EEPROM.
 ///
 /// # Errors
 /// [`ServiceError::Eeprom`], [`ServiceError::Sii`].
-pub async fn information(
+pub async fn read_sii(
     wire: &impl MailboxTransport,
-    found: &EnumeratedDevice,
     device: &DeviceRef,
+    access: EepromAccess,
 ) -> Result<Sii, ServiceError> {
-    let has_mailbox = matches!(found.state, AlState::PreOp | AlState::SafeOp | AlState::Op);
-    let claim = EepromAccess::of(found.state);
-    let image = with_eeprom(wire, device, "reading its EEPROM", claim, async |eeprom| {
+    let image = with_eeprom(wire, device, "reading its EEPROM", access, async |eeprom| {
         eeprom.image(&mut |_, _| {}).await
     });
-    let image: Vec<u8> = match image.await {
-        Err(ServiceError::Eeprom {
-            source: EepromError::InUse,
-            ..
-        }) if has_mailbox => return Ok(Sii::default()),
-        image => image?,
-    };
-    sii::parse(&image).map_err(|source| ServiceError::Sii {
+    let image: Result<Vec<u8>, ServiceError> = image.await;
+    sii::parse(&image?).map_err(|source| ServiceError::Sii {
         device: device.clone(),
         source,
     })
+}
+
+/// Reads the content of a device's EEPROM; `None` if the PDI is using the EEPROM and the mailbox is
+/// already configured: the mailbox does not need it then.
+///
+/// # Errors
+/// As [`read_sii`].
+pub async fn read_sii_unless_in_use(
+    wire: &impl MailboxTransport,
+    found: &EnumeratedDevice,
+    device: &DeviceRef,
+    access: EepromAccess,
+) -> Result<Option<Sii>, ServiceError> {
+    let has_mailbox = matches!(found.state, AlState::PreOp | AlState::SafeOp | AlState::Op);
+    match read_sii(wire, device, access).await {
+        Err(ServiceError::Eeprom {
+            source: EepromError::InUse,
+            ..
+        }) if has_mailbox => Ok(None),
+        sii => sii.map(Some),
+    }
 }
 
 /// Runs `work` on a device's CoE mailbox. A device in Init is in PreOp meanwhile and returns to

@@ -1,9 +1,8 @@
 //! Enumerates the SubDevices of a segment and assigns station addresses.
 
-use std::fmt;
-
 use super::ServiceError;
 use crate::bringup::{AlState, DeviceRef};
+use crate::config::Locator;
 use crate::datagram::DatagramClient;
 use crate::mailbox::DatagramError;
 use ecaxis_ecat::registers;
@@ -11,11 +10,15 @@ use ecaxis_ecat::registers;
 /// The number of broadcasts without an answer after which a segment counts as silent.
 const TRIES: u32 = 5;
 /// The first station address assigned, as in ethercrab.
-const FIRST_STATION: u16 = 0x1000;
+pub(crate) const FIRST_STATION: u16 = 0x1000;
 
+const STEP: &str = "asking who is there";
 const ERROR: u8 = 0x10;
 
 /// A SubDevice as its registers describe it.
+///
+/// Only [`enumerate`] reads all devices. Callers read further data for the devices that need it:
+/// [`super::device::read_sii`] the EEPROM, [`super::device::with_mailbox`] objects.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EnumeratedDevice {
     pub position: u16,
@@ -23,6 +26,8 @@ pub struct EnumeratedDevice {
     pub station: u16,
     /// The station alias that the controller loaded from the EEPROM at power-on.
     pub alias: u16,
+    /// DL status (0x0110).
+    pub dl_status: u16,
     pub state: AlState,
     /// `true` if the device has an unacknowledged error.
     pub error: bool,
@@ -42,73 +47,74 @@ impl EnumeratedDevice {
     }
 }
 
-/// Selects a SubDevice.
+/// DL status, AL status and AL status code, read by one datagram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum DeviceSelector {
-    /// The position; the first device has 0.
-    Position(u16),
-    Alias(u16),
-    Station(u16),
+pub(crate) struct StatusRegisters {
+    pub dl_status: u16,
+    pub al_status: u8,
+    pub al_code: u16,
 }
 
-impl fmt::Display for DeviceSelector {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Position(position) => write!(f, "position {position}"),
-            Self::Alias(alias) => write!(f, "alias {alias}"),
-            Self::Station(station) => write!(f, "station address 0x{station:04x}"),
-        }
-    }
-}
+impl StatusRegisters {
+    /// The first register, and the number of bytes.
+    pub const START: u16 = registers::DL_STATUS;
+    pub const LEN: usize = (registers::AL_STATUS_CODE + 2 - Self::START) as usize;
 
-impl DeviceSelector {
-    fn fits(self, found: &EnumeratedDevice) -> bool {
-        match self {
-            Self::Position(position) => found.position == position,
-            Self::Alias(alias) => found.alias == alias,
-            Self::Station(station) => found.station == station,
-        }
-    }
-
-    /// Returns the selected device.
-    ///
-    /// # Errors
-    /// [`ServiceError::NotFound`], [`ServiceError::Ambiguous`].
-    pub fn select_from(
-        self,
-        found: &[EnumeratedDevice],
-    ) -> Result<&EnumeratedDevice, ServiceError> {
-        let mut fitting = found.iter().filter(|found| self.fits(found));
-        let Some(first) = fitting.next() else {
-            return Err(ServiceError::NotFound {
-                wanted: self.to_string(),
-                found: match (self, found.len()) {
-                    (_, 1) => "1 answers, at position 0".to_owned(),
-                    (Self::Alias(_), n) if found.iter().all(|f| f.alias == 0) => {
-                        format!("none of the {n} has one")
-                    }
-                    (Self::Alias(_), _) => format!("their aliases are {}", aliases(found)),
-                    (_, n) => format!("{n} answer, at positions 0 to {}", n.saturating_sub(1)),
-                },
-            });
+    pub fn parse(bytes: &[u8; Self::LEN]) -> Self {
+        let offset = |register: u16| usize::from(register - Self::START);
+        let word = |register: u16| {
+            let at = offset(register);
+            u16::from_le_bytes([bytes[at], bytes[at + 1]])
         };
-        let more: Vec<&EnumeratedDevice> = fitting.collect();
-        if more.is_empty() {
-            return Ok(first);
+        Self {
+            dl_status: word(registers::DL_STATUS),
+            al_status: bytes[offset(registers::AL_STATUS)],
+            al_code: word(registers::AL_STATUS_CODE),
         }
-        let all = std::iter::once(first).chain(more);
-        let positions: Vec<String> = all.map(|found| found.position.to_string()).collect();
-        Err(ServiceError::Ambiguous {
-            wanted: self.to_string(),
-            count: positions.len(),
-            positions: positions.join(", "),
-        })
     }
 }
 
-fn aliases(found: &[EnumeratedDevice]) -> String {
-    let each: Vec<String> = found.iter().map(|f| f.alias.to_string()).collect();
-    each.join(", ")
+/// Returns the device at a position or with an alias. Identifications are not in a snapshot:
+/// [`super::device::locate`] reads them.
+///
+/// # Errors
+/// [`ServiceError::NotFound`], [`ServiceError::Ambiguous`].
+pub fn select(all: &[EnumeratedDevice], at: Locator) -> Result<&EnumeratedDevice, ServiceError> {
+    let fits = |found: &&EnumeratedDevice| match at {
+        Locator::Position(position) => found.position == position,
+        Locator::Alias(alias) => found.alias == alias,
+        Locator::Id(_) => false,
+    };
+    let fitting: Vec<&EnumeratedDevice> = all.iter().filter(fits).collect();
+    let list = |values: &mut dyn Iterator<Item = u16>| {
+        let each: Vec<String> = values.map(|value| value.to_string()).collect();
+        each.join(", ")
+    };
+    match *fitting {
+        [one] => Ok(one),
+        [] => Err(ServiceError::NotFound {
+            wanted: at.to_string(),
+            found: match (at, all.len()) {
+                (Locator::Id(_), n) => format!("{n} were asked"),
+                (_, 1) => "1 answers, at position 0".to_owned(),
+                (Locator::Alias(_), n) if all.iter().all(|found| found.alias == 0) => {
+                    format!("none of the {n} has one")
+                }
+                (Locator::Alias(_), _) => {
+                    let aliases = list(&mut all.iter().map(|found| found.alias));
+                    format!("their aliases are {aliases}")
+                }
+                (Locator::Position(_), n) => {
+                    format!("{n} answer, at positions 0 to {}", n.saturating_sub(1))
+                }
+            },
+        }),
+        _ => Err(ServiceError::Ambiguous {
+            wanted: at.to_string(),
+            count: fitting.len(),
+            positions: list(&mut fitting.iter().map(|found| found.position)),
+        }),
+    }
 }
 
 /// Returns all SubDevices in segment order. Only reads.
@@ -116,36 +122,46 @@ fn aliases(found: &[EnumeratedDevice]) -> String {
 /// # Errors
 /// [`ServiceError::NoAnswer`]; [`ServiceError::Silent`] if a device leaves meanwhile.
 pub async fn enumerate(wire: &DatagramClient) -> Result<Vec<EnumeratedDevice>, ServiceError> {
-    const STEP: &str = "asking who is there";
     let mut found = Vec::new();
     for position in 0..count(wire).await? {
-        let addresses = at(wire, position, STEP, registers::STATION_ADDRESS).await?;
-        let [s0, s1, a0, a1] = addresses;
-        let [status, _, _, _, c0, c1] = at(wire, position, STEP, registers::AL_STATUS).await?;
-        found.push(EnumeratedDevice {
-            position,
-            station: u16::from_le_bytes([s0, s1]),
-            alias: u16::from_le_bytes([a0, a1]),
-            state: AlState::from_status(status),
-            error: status & ERROR != 0,
-            code: u16::from_le_bytes([c0, c1]),
-        });
+        found.push(read_device(wire, position).await?);
     }
     Ok(found)
 }
 
+/// Reads the registers of one SubDevice by its position.
+///
+/// # Errors
+/// [`ServiceError::Silent`] if no device answers.
+pub async fn read_device(
+    wire: &DatagramClient,
+    position: u16,
+) -> Result<EnumeratedDevice, ServiceError> {
+    let addresses = at(wire, position, STEP, registers::STATION_ADDRESS).await?;
+    let [s0, s1, a0, a1] = addresses;
+    let status = at(wire, position, STEP, StatusRegisters::START).await?;
+    let status = StatusRegisters::parse(&status);
+    Ok(EnumeratedDevice {
+        position,
+        station: u16::from_le_bytes([s0, s1]),
+        alias: u16::from_le_bytes([a0, a1]),
+        dl_status: status.dl_status,
+        state: AlState::from_status(status.al_status),
+        error: status.al_status & ERROR != 0,
+        code: status.al_code,
+    })
+}
+
 /// Returns the number of devices that answer a broadcast; at least 1.
-async fn count(wire: &DatagramClient) -> Result<u16, ServiceError> {
+///
+/// # Errors
+/// [`ServiceError::NoAnswer`], [`ServiceError::Segment`].
+pub async fn count(wire: &DatagramClient) -> Result<u16, ServiceError> {
     for _ in 0..TRIES {
         match wire.count().await {
             Ok(0) | Err(DatagramError::Timeout { .. }) => {}
             Ok(count) => return Ok(count),
-            Err(source) => {
-                return Err(ServiceError::Segment {
-                    step: "asking who is there",
-                    source,
-                });
-            }
+            Err(source) => return Err(ServiceError::Segment { step: STEP, source }),
         }
     }
     Err(ServiceError::NoAnswer)

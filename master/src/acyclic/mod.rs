@@ -9,7 +9,8 @@
 //! - [`device`]: finds one device by its locator;
 //! - [`eeprom`]: the EEPROM interface of one device;
 //! - [`image`]: EEPROM images, and how to write them;
-//! - [`mailbox`]: the mailboxes of one device, and the state they need.
+//! - [`mailbox`]: the mailboxes of one device, and the state they need;
+//! - [`topology`]: how the devices are connected.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -34,6 +35,7 @@ pub mod image;
 pub mod mailbox;
 #[cfg(test)]
 mod tests;
+pub mod topology;
 
 /// The stack size in bytes of the thread that exchanges the frames. Its futures hold whole frames
 /// by value.

@@ -7,9 +7,9 @@ use std::time::Duration;
 
 use ecaxis_esi::sii;
 
-use super::device::{information, locate, with_mailbox};
+use super::device::{locate, read_sii, with_mailbox};
 use super::eeprom::{Eeprom, EepromAccess, EepromError, with_eeprom};
-use super::enumerate::{DeviceSelector, EnumeratedDevice, address, enumerate};
+use super::enumerate::{EnumeratedDevice, address, enumerate, select};
 use super::image::{WriteError, write};
 use super::{DatagramClient, ServiceError, mailbox, run_on_link};
 use crate::bringup::{AlState, DeviceRef};
@@ -165,12 +165,8 @@ fn mailbox_of_another_program_answers_the_first_request() {
     let (answers, _) = with_drives(async |wire| {
         let found = addressed(&wire).await;
         let device = found[0].named("x");
-        let eeprom = Eeprom::claim(&wire, &device, "reading", EepromAccess::IfFree)
-            .await
-            .expect("free");
-        let image = eeprom.image(&mut |_, _| {}).await.expect("read");
-        eeprom.release().await.expect("given back");
-        let sii = sii::parse(&image).expect("an image");
+        let sii = read_sii(&wire, &device, EepromAccess::IfFree).await;
+        let sii = sii.expect("read");
         let mut first = mailbox::open(&wire, &device, &sii).await.expect("lent");
         let mut answers = Vec::new();
         // The loop covers all seven counter values.
@@ -197,11 +193,8 @@ fn mailbox_session_restores_init() {
     let (done, link) = with_drives(async |wire| {
         let found = addressed(&wire).await;
         let device = found[0].named("x");
-        let eeprom = Eeprom::claim(&wire, &device, "reading", EepromAccess::IfFree)
-            .await
-            .expect("free");
-        let image = eeprom.image(&mut |_, _| {}).await.expect("read");
-        let sii = sii::parse(&image).expect("an image");
+        let sii = read_sii(&wire, &device, EepromAccess::IfFree).await;
+        let sii = sii.expect("read");
         let mut lent = mailbox::open(&wire, &device, &sii).await.expect("lent");
         let vendor = lent
             .coe
@@ -234,27 +227,27 @@ fn mailbox_session_restores_init() {
 }
 
 #[test]
-fn device_selector_finds_devices_or_reports_why_not() {
+fn select_finds_devices_or_reports_why_not() {
     let found: Vec<EnumeratedDevice> = [(0, 5), (1, 0), (2, 5)]
         .map(|(position, alias)| EnumeratedDevice {
             position,
             station: 0x1000 + position,
             alias,
+            dl_status: 0,
             state: AlState::Init,
             error: false,
             code: 0,
         })
         .into();
-    let position = |which: DeviceSelector| {
-        which
-            .select_from(&found)
+    let position = |at: Locator| {
+        select(&found, at)
             .map(|f| f.position)
             .map_err(|e| e.to_string())
     };
-    assert_eq!(position(DeviceSelector::Position(2)), Ok(2));
-    assert_eq!(position(DeviceSelector::Station(0x1001)), Ok(1));
+    assert_eq!(position(Locator::Position(2)), Ok(2));
+    assert_eq!(position(Locator::Alias(0)), Ok(1));
     assert_eq!(
-        position(DeviceSelector::Position(3)),
+        position(Locator::Position(3)),
         Err("no SubDevice has position 3; 3 answer, at positions 0 to 2".to_owned())
     );
     let nameless = found
@@ -262,19 +255,17 @@ fn device_selector_finds_devices_or_reports_why_not() {
         .map(<[EnumeratedDevice]>::to_vec)
         .unwrap_or_default();
     let nameless = [nameless.clone(), nameless].concat();
-    let none = DeviceSelector::Alias(7)
-        .select_from(&nameless)
-        .map_err(|e| e.to_string());
+    let none = select(&nameless, Locator::Alias(7)).map_err(|e| e.to_string());
     assert_eq!(
         none.map(|found| found.position),
         Err("no SubDevice has alias 7; none of the 2 has one".to_owned())
     );
     assert_eq!(
-        position(DeviceSelector::Alias(7)),
+        position(Locator::Alias(7)),
         Err("no SubDevice has alias 7; their aliases are 5, 0, 5".to_owned())
     );
     assert_eq!(
-        position(DeviceSelector::Alias(5)),
+        position(Locator::Alias(5)),
         Err("2 SubDevices have alias 5: at positions 0, 2".to_owned())
     );
 }
@@ -343,7 +334,7 @@ fn with_mailbox_restores_the_device_when_stopped() {
                           found: EnumeratedDevice,
                           at: DeviceRef,
                           stop: &AtomicBool| {
-            let sii = information(&wire, &found, &at).await?;
+            let sii = read_sii(&wire, &at, EepromAccess::of(found.state)).await?;
             let mut reached = 0;
             let step = "reading its parameters";
             let all = with_mailbox(
@@ -534,7 +525,7 @@ fn eeprom_write_rejects_an_image_beyond_the_chip() {
 #[test]
 fn mailbox_open_restores_init_after_a_lost_frame() {
     let (done, left, _) = stopped(0, async |wire, found, at, _| {
-        let sii = information(&wire, &found, &at).await?;
+        let sii = read_sii(&wire, &at, EepromAccess::of(found.state)).await?;
         // The first answer after the request for PreOp is lost.
         let asked = Cell::new(false);
         let lossy = Lossy {

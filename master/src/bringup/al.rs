@@ -304,3 +304,17 @@ pub async fn read_explicit_id(
     // Shielded, because the request must be withdrawn.
     wire.stop().shield(whole).await
 }
+
+/// Returns the index of the first of these devices with this explicit device identification.
+pub async fn find_explicit_id(
+    wire: &impl MailboxTransport,
+    stations: impl Iterator<Item = u16>,
+    id: u16,
+) -> Option<usize> {
+    for (index, station) in stations.enumerate() {
+        if read_explicit_id(wire, station).await == Ok(Some(id)) {
+            return Some(index);
+        }
+    }
+    None
+}

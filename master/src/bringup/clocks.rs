@@ -57,40 +57,19 @@ pub(super) async fn configure(
         let now = system_time(wire, reference).await?;
         let start = (now.wrapping_add(ahead) / cycle + 1).wrapping_mul(cycle);
         for (dc, device) in &wanting {
-            write(wire, device, STEP, registers::DC_CYCLIC_CONTROL, &[0, 0]).await?;
             let first = start.wrapping_add_signed(i64::from(dc.sync0_shift_ns));
-            write(
-                wire,
-                device,
-                STEP,
-                registers::DC_START_TIME,
-                &first.to_le_bytes(),
-            )
-            .await?;
-            write(
-                wire,
-                device,
-                STEP,
-                registers::DC_SYNC0_CYCLE,
-                &dc.sync0_cycle_ns.to_le_bytes(),
-            )
-            .await?;
-            write(
-                wire,
-                device,
-                STEP,
-                registers::DC_SYNC1_CYCLE,
-                &dc.sync1_cycle_ns.to_le_bytes(),
-            )
-            .await?;
-            write(
-                wire,
-                device,
-                STEP,
-                registers::DC_CYCLIC_CONTROL,
-                &dc.assign_activate.to_le_bytes(),
-            )
-            .await?;
+            for (register, data) in [
+                (registers::DC_CYCLIC_CONTROL, &[0, 0][..]),
+                (registers::DC_START_TIME, &first.to_le_bytes()),
+                (registers::DC_SYNC0_CYCLE, &dc.sync0_cycle_ns.to_le_bytes()),
+                (registers::DC_SYNC1_CYCLE, &dc.sync1_cycle_ns.to_le_bytes()),
+                (
+                    registers::DC_CYCLIC_CONTROL,
+                    &dc.assign_activate.to_le_bytes(),
+                ),
+            ] {
+                write(wire, &device.at, STEP, register, data).await?;
+            }
         }
         // A device with a start time in the past never generates a pulse.
         let shifts = || wanting.iter().map(|(dc, _)| i64::from(dc.sync0_shift_ns));
@@ -154,22 +133,10 @@ pub(super) async fn set_again(
     };
     for device in clocks() {
         let start = DEFAULT_SPEED_START.to_le_bytes();
-        write(
-            wire,
-            device,
-            STEP,
-            registers::DC_SPEED_COUNTER_START,
-            &start,
-        )
-        .await?;
-        write(
-            wire,
-            device,
-            STEP,
-            registers::DC_SYSTEM_TIME_DELAY,
-            &delay(device).to_le_bytes(),
-        )
-        .await?;
+        let delay = delay(device).to_le_bytes();
+        let at = &device.at;
+        write(wire, at, STEP, registers::DC_SPEED_COUNTER_START, &start).await?;
+        write(wire, at, STEP, registers::DC_SYSTEM_TIME_DELAY, &delay).await?;
     }
     let failed = |source| BringUpError::Wire {
         device: reference.at.clone(),
@@ -179,43 +146,20 @@ pub(super) async fn set_again(
     wire.write_all(registers::DC_RECEIVE_TIME, &[0; 4])
         .await
         .map_err(failed)?;
-    let mut offset = [0; 8];
-    read(
-        wire,
-        reference,
-        STEP,
-        registers::DC_SYSTEM_TIME_OFFSET,
-        &mut offset,
-    )
-    .await?;
-    let mut local = [0; 8];
-    read(
-        wire,
-        reference,
-        STEP,
-        registers::DC_RECEIVE_TIME_UNIT,
-        &mut local,
-    )
-    .await?;
+    let offset = read(wire, &reference.at, STEP, registers::DC_SYSTEM_TIME_OFFSET).await?;
+    let local = read(wire, &reference.at, STEP, registers::DC_RECEIVE_TIME_UNIT).await?;
     // The system time at which the frame was at the reference clock.
     let then = u64::from_le_bytes(local).wrapping_add(u64::from_le_bytes(offset));
     for device in clocks().filter(|device| device.at != reference.at) {
-        read(
-            wire,
-            device,
-            STEP,
-            registers::DC_RECEIVE_TIME_UNIT,
-            &mut local,
-        )
-        .await?;
+        let local = read(wire, &device.at, STEP, registers::DC_RECEIVE_TIME_UNIT).await?;
         let there = then.wrapping_add(u64::from(delay(device)));
-        let offset = there.wrapping_sub(u64::from_le_bytes(local));
+        let offset = there.wrapping_sub(u64::from_le_bytes(local)).to_le_bytes();
         write(
             wire,
-            device,
+            &device.at,
             STEP,
             registers::DC_SYSTEM_TIME_OFFSET,
-            &offset.to_le_bytes(),
+            &offset,
         )
         .await?;
     }
@@ -250,8 +194,7 @@ async fn system_time(
     wire: &impl MailboxTransport,
     reference: &BusDevice,
 ) -> Result<u64, BringUpError> {
-    let mut time = [0; 8];
-    read(wire, reference, STEP, registers::DC_SYSTEM_TIME, &mut time).await?;
+    let time = read(wire, &reference.at, STEP, registers::DC_SYSTEM_TIME).await?;
     Ok(u64::from_le_bytes(time))
 }
 

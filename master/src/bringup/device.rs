@@ -6,7 +6,9 @@ use ecaxis_esi::{StartupSdo, address};
 
 use super::{BringUpError, BusDevice, DeviceRef, Step};
 use crate::config::{DeviceConfig, StartupOptions};
-use crate::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, object_name};
+use crate::mailbox::{
+    CoeClient, DatagramError, MailboxTransport, NamedObject, SdoError, object_name,
+};
 use crate::rt::image::DeviceRegion;
 
 const FMMU_SIZE: u16 = 16;
@@ -133,14 +135,9 @@ async fn read_back(
     coe: &mut CoeClient,
     sdo: &StartupSdo,
 ) -> Result<Option<Vec<u8>>, BringUpError> {
-    match coe
-        .upload(wire, sdo.index, sdo.sub, sdo.complete_access)
+    coe.upload_optional(wire, sdo.index, sdo.sub, sdo.complete_access)
         .await
-    {
-        Ok(data) => Ok(Some(data)),
-        Err(SdoError::Abort { .. }) => Ok(None),
-        Err(source) => Err(failed(at, sdo, source)),
-    }
+        .map_err(|source| failed(at, sdo, source))
 }
 
 /// True if the device has the value. By complete access, a device may return more than was written.
@@ -230,14 +227,8 @@ pub(super) async fn map_process_data(
         let mut logical = region.map_or(0, |region| region.logical);
         for sm in sms {
             let register = registers::SYNC_MANAGER + registers::SYNC_MANAGER_LEN * u16::from(sm.sm);
-            write(
-                wire,
-                device,
-                "configuring SyncManagers",
-                register,
-                &sync_manager(sm),
-            )
-            .await?;
+            let step = "configuring SyncManagers";
+            write(wire, &device.at, step, register, &sync_manager(sm)).await?;
             if sm.len > 0 {
                 fmmus.push(fmmu(logical, sm.start_address, sm.len, kind));
                 logical = logical.saturating_add(u32::from(sm.len));
@@ -255,7 +246,7 @@ pub(super) async fn map_process_data(
     for (i, fmmu) in fmmus.iter().enumerate().filter(|(_, fmmu)| **fmmu != OFF) {
         let register =
             registers::FMMU + FMMU_SIZE * u16::try_from(i).unwrap_or(u16::MAX / FMMU_SIZE);
-        write(wire, device, "configuring FMMUs", register, fmmu).await?;
+        write(wire, &device.at, "configuring FMMUs", register, fmmu).await?;
     }
     Ok(())
 }
@@ -278,50 +269,42 @@ fn fmmu(logical: u32, physical: u16, len: u16, kind: u8) -> [u8; FMMU_SIZE as us
 /// Writes a register; fails if the device does not answer.
 pub(super) async fn write(
     wire: &impl MailboxTransport,
-    device: &BusDevice,
+    device: &DeviceRef,
     step: &'static str,
     register: u16,
     data: &[u8],
 ) -> Result<(), BringUpError> {
-    taken(
-        wire.write(device.at.station, register, data).await,
-        device,
-        step,
-        register,
-    )
+    let written = wire.write(device.station, register, data).await;
+    taken(written, device, step, register)
 }
 
 /// Reads a register; fails if the device does not answer.
-pub(super) async fn read(
+pub(super) async fn read<const N: usize>(
     wire: &impl MailboxTransport,
-    device: &BusDevice,
+    device: &DeviceRef,
     step: &'static str,
     register: u16,
-    data: &mut [u8],
-) -> Result<(), BringUpError> {
-    taken(
-        wire.read(device.at.station, register, data).await,
-        device,
-        step,
-        register,
-    )
+) -> Result<[u8; N], BringUpError> {
+    let mut data = [0; N];
+    let read = wire.read(device.station, register, &mut data).await;
+    taken(read, device, step, register).map(|()| data)
 }
 
 fn taken(
-    result: Result<u16, crate::mailbox::DatagramError>,
-    device: &BusDevice,
+    result: Result<u16, DatagramError>,
+    device: &DeviceRef,
     step: &'static str,
     register: u16,
 ) -> Result<(), BringUpError> {
     match result {
         Ok(1) => Ok(()),
         Ok(_) => Err(BringUpError::NotTaken {
-            device: device.at.clone(),
+            device: device.clone(),
             step,
             register,
         }),
         Err(source) => Err(BringUpError::Wire {
-            device: device.at.clone(),
+            device: device.clone(),
             step,
             source,
         }),

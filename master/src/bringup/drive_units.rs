@@ -65,15 +65,16 @@ pub async fn ask(
         encoder_resolution: ratio(wire, coe, 0x608f).await?,
         gear_ratio: ratio(wire, coe, 0x6091).await?,
         feed_constant: ratio(wire, coe, 0x6092).await?,
-        position_unit: value(wire, coe, 0x60a8, 0).await?,
-        velocity_unit: value(wire, coe, 0x60a9, 0).await?,
-        acceleration_unit: value(wire, coe, 0x60aa, 0).await?,
-        rated_torque: value(wire, coe, 0x6076, 0).await?,
+        position_unit: coe.upload_integer(wire, 0x60a8, 0).await?,
+        velocity_unit: coe.upload_integer(wire, 0x60a9, 0).await?,
+        acceleration_unit: coe.upload_integer(wire, 0x60aa, 0).await?,
+        rated_torque: coe.upload_integer(wire, 0x6076, 0).await?,
         torque_constant: match constant {
-            true => value(wire, coe, 0x3001, 5).await?,
+            true => coe.upload_integer(wire, 0x3001, 5).await?,
             false => None,
         },
-        polarity: value(wire, coe, 0x607e, 0)
+        polarity: coe
+            .upload_integer(wire, 0x607e, 0)
             .await?
             .map(|n| n.to_le_bytes()[0]),
     })
@@ -84,28 +85,9 @@ async fn ratio(
     coe: &mut CoeClient,
     index: u16,
 ) -> Result<Option<[u32; 2]>, SdoError> {
-    let Some(above) = value(wire, coe, index, 1).await? else {
+    let Some(above) = coe.upload_integer(wire, index, 1).await? else {
         return Ok(None);
     };
-    let below = value(wire, coe, index, 2).await?;
+    let below = coe.upload_integer(wire, index, 2).await?;
     Ok(below.map(|below| [above, below]))
-}
-
-/// Returns `None` if the drive does not have the object or does not allow reading it.
-pub async fn value(
-    wire: &impl MailboxTransport,
-    coe: &mut CoeClient,
-    index: u16,
-    sub: u8,
-) -> Result<Option<u32>, SdoError> {
-    match coe.upload(wire, index, sub, false).await {
-        Ok(data) => Ok(Some(
-            data.iter()
-                .take(4)
-                .rev()
-                .fold(0, |value, byte| value << 8 | u32::from(*byte)),
-        )),
-        Err(SdoError::Abort { .. }) => Ok(None),
-        Err(error) => Err(error),
-    }
 }

@@ -1,19 +1,13 @@
 //! Identifies the SubDevices on the bus and compares them with the machine file.
 
-use ecaxis_ecat::registers;
 use ecaxis_esi::model::Identity;
 use ethercrab::error::{Error, TimeoutError};
 use ethercrab::{MainDevice, SubDeviceIdentity};
 
 use super::{BringUpError, DeviceRef, Group, Step, al, scan_error};
+use crate::acyclic::enumerate::{EnumeratedDevice, FIRST_STATION, count, read_device};
 use crate::config::{DeviceConfig, Locator, Machine};
 use crate::datagram::DatagramClient;
-use crate::mailbox::DatagramError;
-
-/// The number of broadcasts before the segment counts as silent.
-const TRIES: u32 = 5;
-/// The first station address that ethercrab assigns.
-pub(crate) const FIRST_STATION: u16 = 0x1000;
 
 /// A scanned SubDevice.
 struct ScannedDevice {
@@ -23,72 +17,38 @@ struct ScannedDevice {
     station: u16,
 }
 
-/// Returns DL status, for a later comparison; 0 if it cannot be read.
-pub(super) async fn dl_status(wire: &DatagramClient, position: u16) -> u16 {
-    let mut status = [0; 2];
-    match wire
-        .read_at(position, registers::DL_STATUS, &mut status)
-        .await
-    {
-        Ok(1) => u16::from_le_bytes(status),
-        _ => 0,
-    }
-}
-
-/// Returns how many SubDevices answer a broadcast; at least one must.
-pub(super) async fn answering(wire: &DatagramClient) -> Result<u16, BringUpError> {
-    for _ in 0..TRIES {
-        match wire.count().await {
-            Ok(count) if count > 0 => return Ok(count),
-            Ok(_) | Err(DatagramError::Timeout { .. }) => {}
-            Err(error) => {
-                return Err(BringUpError::Scan {
-                    step: "scanning",
-                    message: error.to_string(),
-                });
-            }
-        }
-    }
-    Err(BringUpError::NoAnswer)
-}
-
 /// Finds the device that did not reach PreOp, and the reason. ethercrab reports neither.
 pub(super) async fn explain_scan(
     wire: &DatagramClient,
     machine: &Machine,
     error: Error,
 ) -> BringUpError {
-    let Ok(count) = answering(wire).await else {
+    let Ok(count) = count(wire).await else {
         return BringUpError::NoAnswer;
     };
     let (mut behind, mut unaddressed) = (None, None);
     for position in 0..count {
-        let station = FIRST_STATION.saturating_add(position);
+        let Ok(found) = read_device(wire, position).await else {
+            continue;
+        };
         let device = DeviceRef {
             name: name_at(machine, position),
             position,
-            station,
+            station: FIRST_STATION.saturating_add(position),
         };
-        let (status, code) = match al::read_status(wire, station).await {
-            Ok(Some(read)) => read,
-            // The device is counted but no longer has its station address.
-            Ok(None) => {
-                unaddressed.get_or_insert(device);
-                continue;
-            }
-            Err(_) => continue,
-        };
-        let actual = al::AlState::from_status(status);
-        if status & al::ERROR != 0 && (code != 0 || !al::emulated(wire, station).await) {
+        let EnumeratedDevice { state, code, .. } = found;
+        // The device has lost the station address that ethercrab assigned.
+        if found.station != device.station {
+            unaddressed.get_or_insert(device);
+        } else if found.error && (code != 0 || !al::emulated(wire, device.station).await) {
             return BringUpError::State(al::StateError::Refused {
                 device,
                 wanted: al::AlState::PreOp,
-                actual,
+                actual: state,
                 code,
             });
-        }
-        if actual != al::AlState::PreOp && behind.is_none() {
-            behind = Some((device, actual));
+        } else if state != al::AlState::PreOp && behind.is_none() {
+            behind = Some((device, state));
         }
     }
     if let Some(device) = unaddressed {
@@ -152,7 +112,9 @@ pub(super) async fn assign(
                 (usize::from(position) < found.len()).then_some(usize::from(position))
             }
             Locator::Alias(alias) => found.iter().position(|f| f.alias == alias),
-            Locator::Id(id) => find_id(wire, &found, id).await,
+            Locator::Id(id) => {
+                al::find_explicit_id(wire, found.iter().map(|f| f.station), id).await
+            }
         };
         match position {
             Some(position) => order.push(u16::try_from(position).unwrap_or(u16::MAX)),
@@ -285,15 +247,6 @@ fn not_located(name: &str, locator: String) -> BringUpError {
         name: name.to_owned(),
         locator,
     }
-}
-
-async fn find_id(wire: &DatagramClient, found: &[ScannedDevice], id: u16) -> Option<usize> {
-    for (position, &ScannedDevice { station, .. }) in found.iter().enumerate() {
-        if matches!(al::read_explicit_id(wire, station).await, Ok(Some(actual)) if actual == id) {
-            return Some(position);
-        }
-    }
-    None
 }
 
 fn identity(from: SubDeviceIdentity) -> Identity {

@@ -6,7 +6,7 @@ use ecaxis_esi::StartupSdo;
 use super::{BringUpError, BusDevice, Step, device};
 use crate::config::DeviceConfig;
 use crate::config::drive_limits::{OFFSETS, speed_unit};
-use crate::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError};
+use crate::mailbox::{MailboxTransport, NamedObject};
 
 pub(super) async fn compare(
     wire: &impl MailboxTransport,
@@ -33,7 +33,10 @@ pub(super) async fn compare(
     let mut held = Vec::new();
     for (index, sub) in axis.limit_objects() {
         if exists(index, sub)
-            && let Some(data) = read(wire, coe, index, sub).await.map_err(failed)?
+            && let Some(data) = coe
+                .upload_optional(wire, index, sub, false)
+                .await
+                .map_err(failed)?
         {
             held.push(((index, sub), data));
         }
@@ -52,7 +55,8 @@ pub(super) async fn compare(
         if !exists(index, 0) || selection.layout.rx_field(index, 0).is_some() {
             continue;
         }
-        let found = read(wire, coe, index, 0).await.map_err(failed)?;
+        let found = coe.upload_optional(wire, index, 0, false).await;
+        let found = found.map_err(failed)?;
         let Some(data) = found.filter(|data| data.iter().any(|byte| *byte != 0)) else {
             continue;
         };
@@ -73,18 +77,4 @@ pub(super) async fn compare(
         )));
     }
     Ok(())
-}
-
-/// Returns `None` if the drive does not have the object or does not allow reading it.
-async fn read(
-    wire: &impl MailboxTransport,
-    coe: &mut CoeClient,
-    index: u16,
-    sub: u8,
-) -> Result<Option<Vec<u8>>, SdoError> {
-    match coe.upload(wire, index, sub, false).await {
-        Ok(data) => Ok(Some(data)),
-        Err(SdoError::Abort { .. }) => Ok(None),
-        Err(error) => Err(error),
-    }
 }

@@ -1,8 +1,10 @@
 //! The positions of a device's mailboxes, as ethercrab has configured them from the EEPROM,
 //! compared with the ESI. A mailbox whose length differs from its SyncManager's never becomes full.
 
+use ecaxis_ecat::registers;
 use ecaxis_esi::model::SmUse;
 
+use super::device::read;
 use super::{BringUpError, DeviceRef};
 use crate::config::DeviceConfig;
 use crate::mailbox::{MailboxLayout, MailboxTransport};
@@ -22,7 +24,10 @@ pub(super) async fn open(
         return Ok(None);
     };
     for (sm, expected) in [(out_sm, out), (in_sm, inp)] {
-        let actual = read(wire, device, sm).await?;
+        let register = registers::SYNC_MANAGER + registers::SYNC_MANAGER_LEN * u16::from(sm);
+        let step = "reading the mailbox SyncManagers";
+        let [a0, a1, l0, l1] = read(wire, device, step, register).await?;
+        let actual = (u16::from_le_bytes([a0, a1]), u16::from_le_bytes([l0, l1]));
         if actual != expected {
             let show = |(address, len): (u16, u16)| format!("0x{address:04x}, {len} bytes");
             return Err(BringUpError::MailboxMoved {
@@ -51,31 +56,4 @@ fn find(config: &DeviceConfig, usage: SmUse) -> Option<(u8, (u16, u16))> {
         u8::try_from(number).ok()?,
         (sm.start_address, sm.default_size),
     ))
-}
-
-async fn read(
-    wire: &impl MailboxTransport,
-    device: &DeviceRef,
-    sm: u8,
-) -> Result<(u16, u16), BringUpError> {
-    const STEP: &str = "reading the mailbox SyncManagers";
-    let register = ecaxis_ecat::registers::SYNC_MANAGER
-        + ecaxis_ecat::registers::SYNC_MANAGER_LEN * u16::from(sm);
-    let mut bytes = [0; 4];
-    match wire.read(device.station, register, &mut bytes).await {
-        Ok(1) => {
-            let [a0, a1, l0, l1] = bytes;
-            Ok((u16::from_le_bytes([a0, a1]), u16::from_le_bytes([l0, l1])))
-        }
-        Ok(_) => Err(BringUpError::NotTaken {
-            device: device.clone(),
-            step: STEP,
-            register,
-        }),
-        Err(source) => Err(BringUpError::Wire {
-            device: device.clone(),
-            step: STEP,
-            source,
-        }),
-    }
 }

@@ -5,7 +5,7 @@ use ecaxis_esi::model::Pdo;
 
 use super::{BringUpError, BusDevice};
 use crate::config::DeviceConfig;
-use crate::mailbox::{MailboxTransport, SdoError};
+use crate::mailbox::MailboxTransport;
 
 /// The PDO assignment of SyncManager n is 0x1C10 + n (ETG.1000.6, Table 67).
 const ASSIGNMENT: u16 = 0x1c10;
@@ -67,49 +67,20 @@ async fn compare_contents(
     Ok(())
 }
 
-/// Reads subindices 1 to n of an array with n in subindex 0. Returns `None` if the device has no
-/// such object or no CoE mailbox.
+/// Returns `None` if the device has no such object or no CoE mailbox.
 async fn read_list(
     wire: &impl MailboxTransport,
     device: &mut BusDevice,
     index: u16,
 ) -> Result<Option<Vec<u32>>, BringUpError> {
-    let Some(count) = read(wire, device, index, 0).await? else {
-        return Ok(None);
-    };
-    let count = u8::try_from(count).unwrap_or(u8::MAX);
-    let mut list = Vec::with_capacity(usize::from(count));
-    for sub in 1..=count {
-        match read(wire, device, index, sub).await? {
-            Some(value) => list.push(value),
-            None => break,
-        }
-    }
-    Ok(Some(list))
-}
-
-async fn read(
-    wire: &impl MailboxTransport,
-    device: &mut BusDevice,
-    index: u16,
-    sub: u8,
-) -> Result<Option<u32>, BringUpError> {
     let Some(coe) = device.coe.as_mut() else {
         return Ok(None);
     };
-    match coe.upload(wire, index, sub, false).await {
-        Ok(data) => Ok(Some(
-            data.iter()
-                .take(4)
-                .rev()
-                .fold(0, |value, byte| value << 8 | u32::from(*byte)),
-        )),
-        Err(SdoError::Abort { .. }) => Ok(None),
-        Err(source) => Err(BringUpError::ReadBack {
-            device: device.at.clone(),
-            source,
-        }),
-    }
+    let list = coe.upload_list(wire, index).await;
+    list.map_err(|source| BringUpError::ReadBack {
+        device: device.at.clone(),
+        source,
+    })
 }
 
 fn differs(

@@ -18,6 +18,7 @@ use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
 use ecaxis_esi::address;
 
+use crate::acyclic::{ServiceError, enumerate};
 use crate::clock;
 use crate::config::{AdoptedUnits, LimitConflict, MAX_SUBDEVICES, Machine, UnitProblem};
 use crate::datagram::DatagramClient;
@@ -30,13 +31,12 @@ use crate::text::pluralize;
 pub mod al;
 pub(crate) mod clocks;
 mod device;
-mod identify;
-mod output_defaults;
-pub(crate) use identify::FIRST_STATION;
 pub mod drive_units;
+mod identify;
 mod limits;
 mod mailbox;
 mod mapping;
+mod output_defaults;
 mod watchdog;
 
 pub use al::{AlState, StateError};
@@ -324,7 +324,13 @@ pub async fn bring_up(
 ) -> Result<Bus, BringUpError> {
     let wire = DatagramClient::new(main_device);
     progress(Step::Scan);
-    identify::answering(&wire).await?;
+    enumerate::count(&wire).await.map_err(|error| match error {
+        ServiceError::Segment { source, .. } => BringUpError::Scan {
+            step: "scanning",
+            message: source.to_string(),
+        },
+        _ => BringUpError::NoAnswer,
+    })?;
 
     let group = match main_device
         .init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now)
@@ -370,7 +376,10 @@ pub async fn bring_up(
             limits: Vec::new(),
             dc,
             propagation_delay: sub_device.propagation_delay(),
-            dl_status: identify::dl_status(&wire, position).await,
+            // Used only for a later comparison; 0 if unreadable.
+            dl_status: enumerate::at(&wire, position, "reading its ports", registers::DL_STATUS)
+                .await
+                .map_or(0, u16::from_le_bytes),
         });
     }
 
@@ -453,9 +462,8 @@ async fn without_lrw(
     let mut process_data = image::process_data(machine);
     let mut more = false;
     for (device, data) in devices.iter().zip(&mut process_data) {
-        let mut features = [0; 2];
         let step = "reading what its controller can do";
-        device::read(wire, device, step, registers::FEATURES, &mut features).await?;
+        let features = device::read(wire, &device.at, step, registers::FEATURES).await?;
         if data.lrw && u16::from_le_bytes(features) & NO_LRW != 0 {
             data.lrw = false;
             more = true;

@@ -9,7 +9,7 @@ use ecaxis_esi::layout::Field;
 
 use super::{BringUpError, BusDevice};
 use crate::config::{DeviceConfig, further_axis};
-use crate::mailbox::{MailboxTransport, SdoError};
+use crate::mailbox::MailboxTransport;
 
 /// Objects for which zero is a normal value, or the only safe one.
 const ZERO_IS_SAFE: [u16; 11] = [
@@ -40,22 +40,17 @@ pub(super) async fn read(
         let Some(coe) = device.coe.as_mut() else {
             return Ok(());
         };
-        let data = match coe.upload(wire, field.index, field.sub, false).await {
-            Ok(data) => data,
-            // If an object cannot be read over CoE, the ESI's value is used.
-            Err(SdoError::Abort { .. }) => config
-                .selection
-                .dictionary
-                .item(field.index, field.sub)
-                .map(|item| item.default.to_vec())
-                .unwrap_or_default(),
-            Err(source) => {
-                return Err(BringUpError::ReadBack {
-                    device: device.at.clone(),
-                    source,
-                });
-            }
-        };
+        let (index, sub) = (field.index, field.sub);
+        let data = coe.upload_optional(wire, index, sub, false).await;
+        let data = data.map_err(|source| BringUpError::ReadBack {
+            device: device.at.clone(),
+            source,
+        })?;
+        // If an object cannot be read over CoE, the ESI's value is used.
+        let data = data.unwrap_or_else(|| {
+            let item = config.selection.dictionary.item(index, sub);
+            item.map(|item| item.default.to_vec()).unwrap_or_default()
+        });
         let value = data
             .iter()
             .take(8)

@@ -35,7 +35,7 @@ pub(super) async fn set(
         ),
         (
             registers::WATCHDOG_TIME_PDI,
-            "the registers::WATCHDOG_TIME_PDI watchdog's time",
+            "the PDI watchdog's time",
             Bus::PDI_WATCHDOG,
         ),
         (

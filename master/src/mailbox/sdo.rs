@@ -83,6 +83,74 @@ impl CoeClient {
         self.end(w, &transfer, result).await
     }
 
+    /// Reads an object; `None` if the device does not have it or refuses to send it.
+    pub async fn upload_optional<W: MailboxTransport>(
+        &mut self,
+        w: &W,
+        index: u16,
+        sub: u8,
+        complete: bool,
+    ) -> Result<Option<Vec<u8>>, SdoError> {
+        match self.upload(w, index, sub, complete).await {
+            Ok(data) => Ok(Some(data)),
+            Err(SdoError::Abort { .. }) => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Reads an integer of at most 32 bits; `None` if the device refuses the object or returns no
+    /// byte.
+    pub async fn upload_integer<W: MailboxTransport>(
+        &mut self,
+        w: &W,
+        index: u16,
+        sub: u8,
+    ) -> Result<Option<u32>, SdoError> {
+        let data = self.upload_optional(w, index, sub, false).await?;
+        Ok(data.filter(|data| !data.is_empty()).map(|data| {
+            let bytes = data.iter().take(4).rev();
+            bytes.fold(0, |value, byte| value << 8 | u32::from(*byte))
+        }))
+    }
+
+    /// Reads subindices 1 to n of an array with n in subindex 0; `None` if the device has no such
+    /// object.
+    pub async fn upload_list<W: MailboxTransport>(
+        &mut self,
+        w: &W,
+        index: u16,
+    ) -> Result<Option<Vec<u32>>, SdoError> {
+        let Some(count) = self.upload_integer(w, index, 0).await? else {
+            return Ok(None);
+        };
+        let count = u8::try_from(count).unwrap_or(u8::MAX);
+        let mut list = Vec::with_capacity(usize::from(count));
+        for sub in 1..=count {
+            match self.upload_integer(w, index, sub).await? {
+                Some(value) => list.push(value),
+                None => break,
+            }
+        }
+        Ok(Some(list))
+    }
+
+    /// Reads a text up to its first NUL, without control characters; `None` if the device refuses
+    /// the object or nothing remains.
+    pub async fn upload_text<W: MailboxTransport>(
+        &mut self,
+        w: &W,
+        index: u16,
+    ) -> Result<Option<String>, SdoError> {
+        const MAX_CHARACTERS: usize = 80;
+        let data = self.upload_optional(w, index, 0, false).await?;
+        let data = data.unwrap_or_default();
+        let text = data.split(|byte| *byte == 0).next().unwrap_or_default();
+        let text = String::from_utf8_lossy(text);
+        let shown = text.trim().chars().filter(|c| !c.is_control());
+        let text: String = shown.take(MAX_CHARACTERS).collect();
+        Ok((!text.is_empty()).then_some(text))
+    }
+
     /// Writes an object. If `complete`, writes all of it from `sub` (0 or 1) on.
     pub async fn download<W: MailboxTransport>(
         &mut self,

@@ -214,7 +214,7 @@ fn out_of_reach(error: &RunError, evidence: &Evidence, class: Class) -> Option<S
     }
     let link = device.parent.and_then(|(parent, port)| {
         let status = evidence.devices.get(parent)?.look.dl_status?;
-        Some(super::ports::has_link(status, port))
+        Some(crate::acyclic::topology::has_link(status, port))
     });
     Some(Seen::when(
         class == Class::Bus && !evidence.all_in_op(),

@@ -3,7 +3,6 @@
 //! - [`snapshot`]: reads the SubDevices after a stop and before they are set to Init; bounded in
 //!   time;
 //! - [`evidence`]: everything that is known then, as plain data;
-//! - [`ports`]: the topology from the open ports;
 //! - [`cause`]: the causes that stop a run, with their texts;
 //! - [`mod@diagnose`]: finds device and cause, a pure function of the evidence;
 //! - [`report`]: the whole fault report as data for a file.
@@ -14,7 +13,6 @@ pub mod cause;
 mod class;
 pub mod diagnose;
 pub mod evidence;
-pub mod ports;
 pub mod report;
 pub mod snapshot;
 

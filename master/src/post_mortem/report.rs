@@ -3,9 +3,10 @@
 use ecaxis_axis::cia402::describe;
 use serde::Serialize;
 
+use super::Cause;
 use super::evidence::Evidence;
 use super::snapshot::{SyncSnapshot, WatchdogSnapshot};
-use super::{Cause, ports};
+use crate::acyclic::topology;
 use crate::bringup::AlState;
 use crate::clock::Nanos;
 use crate::link::LinkStats;
@@ -134,7 +135,7 @@ impl DeviceSection {
             let look = &device.look;
             let links = |status| {
                 (0..4)
-                    .filter(|port| ports::has_link(status, *port))
+                    .filter(|port| topology::has_link(status, *port))
                     .collect()
             };
             Self {

@@ -9,6 +9,7 @@ use std::task::Poll;
 use ecaxis_ecat::registers;
 use serde::Serialize;
 
+use crate::acyclic::enumerate::StatusRegisters;
 use crate::clock::{self, Nanos};
 use crate::datagram::DatagramClient;
 use crate::mailbox::{DatagramError, DeviceMailbox, MailboxTransport};
@@ -24,7 +25,6 @@ const SILENT: u32 = 2;
 const TRIES: u32 = 3;
 
 const OP: u8 = 8;
-const STATUS_LEN: usize = 0x0136 - registers::DL_STATUS as usize;
 const ERROR_COUNTERS_LEN: usize = 0x14;
 const WATCHDOG_LEN: usize = 0x44;
 const SYNC_LEN: usize = 0x24;
@@ -332,7 +332,7 @@ impl<'a> SnapshotReader<'a> {
     }
 
     async fn status(&mut self, place: Place, look: &mut DeviceSnapshot) {
-        let bytes = match self.ask::<STATUS_LEN>(place, registers::DL_STATUS).await {
+        let bytes = match self.ask(place, StatusRegisters::START).await {
             ReadOutcome::Answer(bytes) => bytes,
             ReadOutcome::NoResponse => {
                 look.absent = true;
@@ -340,11 +340,11 @@ impl<'a> SnapshotReader<'a> {
             }
             ReadOutcome::Nothing => return,
         };
-        let word = |at: usize| u16::from_le_bytes([bytes[at], bytes[at + 1]]);
+        let status = StatusRegisters::parse(&bytes);
         (look.answers, look.absent) = (true, false);
-        look.dl_status = Some(word(0));
-        look.al_status = Some(bytes[0x20]);
-        look.al_code = Some(word(0x24));
+        look.dl_status = Some(status.dl_status);
+        look.al_status = Some(status.al_status);
+        look.al_code = Some(status.al_code);
     }
 
     async fn details(&mut self, place: Place, look: &mut DeviceSnapshot) {

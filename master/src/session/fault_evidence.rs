@@ -4,6 +4,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use super::events::EventLine;
 use super::{Options, RunError};
+use crate::acyclic::topology::{self, ParentPort};
 use crate::bringup::{Bus, DeviceRef};
 use crate::clock::{Clock, Nanos};
 use crate::config::{Locator, Machine};
@@ -11,7 +12,7 @@ use crate::link::LinkStats;
 use crate::post_mortem::evidence::Stopped;
 use crate::post_mortem::report::{AxisSection, CycleRecord, DeviceSection, Stop};
 use crate::post_mortem::{
-    DeviceEvidence, DeviceSnapshot, Evidence, FaultReport, Witnessed, diagnose, ports,
+    DeviceEvidence, DeviceSnapshot, Evidence, FaultReport, Witnessed, diagnose,
 };
 use crate::rt::axis::RtAxis;
 use crate::rt::exchange::{ErrorCounters, SubDeviceDiagnostics, Window};
@@ -70,12 +71,7 @@ pub(super) fn of_bring_up(
     if !seen.on_the_bus || matches!(error, RunError::Interrupted) {
         return None;
     }
-    let status: Vec<u16> = seen
-        .looks
-        .iter()
-        .map(|l| l.dl_status.unwrap_or(0))
-        .collect();
-    let parents = ports::parents(&status);
+    let parents = parents(seen.looks.iter().map(|look| look.dl_status.unwrap_or(0)));
     let devices = seen.looks.into_iter().zip(parents).zip(0u16..);
     let devices = devices.map(|((look, parent), position)| DeviceEvidence {
         at: expected_at(machine, position),
@@ -99,6 +95,13 @@ pub(super) fn of_bring_up(
         ..Evidence::default()
     };
     Some(build_report(machine, options, error, &evidence))
+}
+
+/// Returns the upstream device and its port for each SubDevice in segment order.
+fn parents(dl_status: impl Iterator<Item = u16>) -> Vec<Option<(usize, u8)>> {
+    let parents = topology::parents(dl_status).into_iter();
+    let place = |parent: ParentPort| (usize::from(parent.device), parent.port);
+    parents.map(|parent| parent.map(place)).collect()
 }
 
 /// Returns the device that the machine file assigns to `position`, or a generic name.
@@ -130,8 +133,7 @@ pub(super) fn of_run(
     let diagnoses = left.diagnoses.iter().zip(left.windows);
     let mut places: Vec<_> = left.places.into_iter().zip(diagnoses).collect();
     places.sort_by_key(|(place, _)| place.at.position);
-    let status: Vec<u16> = places.iter().map(|(place, _)| place.dl_status).collect();
-    let parents = ports::parents(&status);
+    let parents = parents(places.iter().map(|(place, _)| place.dl_status));
     let mut looks = left.witnessed.looks.into_iter();
     let devices = places.into_iter().zip(parents);
     let devices = devices.map(|((place, (diagnosis, window)), parent)| {

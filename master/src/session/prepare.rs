@@ -185,7 +185,7 @@ impl RunBuilder<'_> {
                 ) {
                     seen.looks = vec![DeviceSnapshot::default(); machine.devices.len()];
                     let wire = DatagramClient::new(main_device);
-                    let stations: Vec<_> = (crate::bringup::FIRST_STATION..)
+                    let stations: Vec<_> = (crate::acyclic::enumerate::FIRST_STATION..)
                         .take(machine.devices.len())
                         .collect();
                     let look =

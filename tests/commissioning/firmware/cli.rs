@@ -152,7 +152,13 @@ fn every_update_failure_has_code_device_step_cause_and_hint() {
             2,
             &["1 to 88 bytes", "--name"],
         ),
-        ("z", &x, &["--yes"], 2, &["no device `z`", "`x`", "`y`"]),
+        (
+            "z",
+            &x,
+            &["--yes"],
+            2,
+            &["no device is called `z`", "there are x, y"],
+        ),
     ] {
         let (found, _, err) = update(device, file, more);
         assert_eq!(found, code, "{more:?}: {err}");
@@ -164,7 +170,7 @@ fn every_update_failure_has_code_device_step_cause_and_hint() {
     has(&err, &["which device", "--position"]);
     let (code, _, err) = ran(&["info", MACHINE, "--sim"]);
     assert_eq!(code, 2);
-    has(&err, &["belong together"]);
+    has(&err, &["which device", "--position", "--id"]);
     let (_, out, _) = update("x", &y, &["--yes", "--json"]);
     let report: Value = serde_json::from_str(&out).expect("JSON");
     assert_eq!(report["ok"], false);

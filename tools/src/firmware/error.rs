@@ -3,10 +3,9 @@
 use std::fmt;
 use std::time::Duration;
 
-use ecaxis_esi::sii::SiiError;
-
 use super::{RunningProgram, UpdateMethod};
-use ecaxis_master::acyclic::{DatagramClient, ServiceError, enumerate};
+use ecaxis_master::acyclic::enumerate::{EnumeratedDevice, read_device};
+use ecaxis_master::acyclic::{DatagramClient, ServiceError};
 use ecaxis_master::bringup::al::AlState;
 use ecaxis_master::bringup::{DeviceRef, StateError};
 use ecaxis_master::mailbox::{FoeError, SdoError};
@@ -122,8 +121,6 @@ impl fmt::Display for FinalDeviceState {
 pub enum FirmwareError {
     #[error(transparent)]
     Service(#[from] ServiceError),
-    #[error("{device}: its EEPROM: {source}")]
-    Eeprom { device: DeviceRef, source: SiiError },
     #[error("{device}: is {found} by {by}, {expected} is meant")]
     Identity {
         device: DeviceRef,
@@ -188,18 +185,8 @@ impl Step {
 impl StepFailure {
     /// Adds the final state of the device, whose address may have changed.
     pub(super) async fn at(self, wire: &DatagramClient, device: &DeviceRef) -> FirmwareError {
-        let seen = enumerate::at(
-            wire,
-            device.position,
-            "looking after it",
-            ecaxis_ecat::registers::AL_STATUS,
-        )
-        .await;
-        let left = match seen {
-            Ok([status, _, _, _, c0, c1]) => FinalDeviceState::In {
-                state: AlState::from_status(status),
-                code: u16::from_le_bytes([c0, c1]),
-            },
+        let left = match read_device(wire, device.position).await {
+            Ok(EnumeratedDevice { state, code, .. }) => FinalDeviceState::In { state, code },
             Err(_) => FinalDeviceState::Silent,
         };
         FirmwareError::Failed {

@@ -3,14 +3,14 @@
 use std::fmt;
 use std::time::Duration;
 
-use ecaxis_esi::sii::{self, Protocols, Sii};
+use ecaxis_esi::sii::{Protocols, Sii};
 
 use super::FirmwareError;
-use ecaxis_master::acyclic::device::with_mailbox;
-use ecaxis_master::acyclic::eeprom::{EepromAccess, EepromError, with_eeprom};
-use ecaxis_master::acyclic::enumerate::{DeviceSelector, address, enumerate};
+use ecaxis_master::acyclic::device::{locate, read_sii_unless_in_use, with_mailbox};
+use ecaxis_master::acyclic::eeprom::EepromAccess;
 use ecaxis_master::acyclic::{DatagramClient, ServiceError};
 use ecaxis_master::bringup::{AlState, DeviceRef};
+use ecaxis_master::config::Locator;
 use ecaxis_master::mailbox::{CoeClient, SdoError, Timeouts};
 
 /// The device type (0x1000) of a maxon drive with stopped program; with running program it is
@@ -89,48 +89,28 @@ pub struct DeviceIdentity {
 /// has no objects. An EEPROM in use by the device is not read, except in Init and Bootstrap.
 ///
 /// # Errors
-/// [`FirmwareError::Service`], [`FirmwareError::Eeprom`]. A device without answers is not an error.
+/// [`FirmwareError::Service`]. A device without answers is not an error.
 pub async fn examine(
     wire: &DatagramClient,
-    which: DeviceSelector,
-    name: &str,
+    at: Locator,
+    name: Option<&str>,
 ) -> Result<DeviceIdentity, FirmwareError> {
-    look_at(wire, which, name, false).await
+    examine_with(wire, at, name, false).await
 }
 
 /// Like [`examine`]; `seize`: takes the EEPROM from the device in any state.
-pub(super) async fn look_at(
+pub(super) async fn examine_with(
     wire: &DatagramClient,
-    which: DeviceSelector,
-    name: &str,
+    at: Locator,
+    name: Option<&str>,
     seize: bool,
 ) -> Result<DeviceIdentity, FirmwareError> {
-    const STEP: &str = "reading its EEPROM";
-    let mut found = enumerate(wire).await?;
-    address(wire, &mut found).await?;
-    let found = which.select_from(&found)?;
-    let device = found.named(name);
-    let claim = match (seize, found.state) {
+    let (found, device) = locate(wire, at, name).await?;
+    let access = match (seize, found.state) {
         (true, _) | (false, AlState::Bootstrap) => EepromAccess::Force,
         (false, state) => EepromAccess::of(state),
     };
-    let has_mailbox = matches!(found.state, AlState::PreOp | AlState::SafeOp | AlState::Op);
-    let read = with_eeprom(wire, &device, STEP, claim, async |eeprom| {
-        eeprom.image(&mut |_, _| {}).await
-    });
-    let image: Option<Vec<u8>> = match read.await {
-        Ok(image) => Some(image),
-        Err(ServiceError::Eeprom {
-            source: EepromError::InUse,
-            ..
-        }) if has_mailbox => None,
-        Err(error) => return Err(error.into()),
-    };
-    let sii = image.as_deref().map(sii::parse).transpose();
-    let sii = sii.map_err(|source| FirmwareError::Eeprom {
-        device: device.clone(),
-        source,
-    })?;
+    let sii = read_sii_unless_in_use(wire, &found, &device, access).await?;
     let mut examined = DeviceIdentity {
         state: found.state,
         error: found.error,
@@ -170,61 +150,19 @@ async fn read_coe_identity(
 
 async fn ask(wire: &DatagramClient, coe: &mut CoeClient) -> Result<CoeIdentity, SdoError> {
     let mut spoken = CoeIdentity {
-        device_type: number(wire, coe, 0x1000, 0).await?,
-        name: text(wire, coe, 0x1008).await?,
-        hardware: text(wire, coe, 0x1009).await?,
-        software: text(wire, coe, 0x100a).await?,
-        identification: number(wire, coe, 0x1f56, 1).await?,
+        device_type: coe.upload_integer(wire, 0x1000, 0).await?,
+        name: coe.upload_text(wire, 0x1008).await?,
+        hardware: coe.upload_text(wire, 0x1009).await?,
+        software: coe.upload_text(wire, 0x100a).await?,
+        identification: coe.upload_integer(wire, 0x1f56, 1).await?,
         ..CoeIdentity::default()
     };
     for (sub, value) in (1..).zip(&mut spoken.identity) {
-        *value = number(wire, coe, 0x1018, sub).await?;
+        *value = coe.upload_integer(wire, 0x1018, sub).await?;
     }
-    let control = number(wire, coe, 0x1f51, 1).await?;
+    let control = coe.upload_integer(wire, 0x1f51, 1).await?;
     spoken.control = control.and_then(|value| u8::try_from(value).ok());
     Ok(spoken)
-}
-
-/// Reads an object; `None` if the device aborts.
-async fn upload(
-    wire: &DatagramClient,
-    coe: &mut CoeClient,
-    index: u16,
-    sub: u8,
-) -> Result<Option<Vec<u8>>, SdoError> {
-    match coe.upload(wire, index, sub, false).await {
-        Ok(bytes) => Ok(Some(bytes)),
-        Err(SdoError::Abort { .. }) => Ok(None),
-        Err(error) => Err(error),
-    }
-}
-
-async fn number(
-    wire: &DatagramClient,
-    coe: &mut CoeClient,
-    index: u16,
-    sub: u8,
-) -> Result<Option<u32>, SdoError> {
-    let bytes = upload(wire, coe, index, sub).await?;
-    Ok(bytes.filter(|b| (1..=4).contains(&b.len())).map(|bytes| {
-        let digits = bytes.iter().rev();
-        digits.fold(0, |value, byte| value << 8 | u32::from(*byte))
-    }))
-}
-
-/// Reads a text without unprintable characters.
-async fn text(
-    wire: &DatagramClient,
-    coe: &mut CoeClient,
-    index: u16,
-) -> Result<Option<String>, SdoError> {
-    let bytes = upload(wire, coe, index, 0).await?;
-    Ok(bytes.map(|bytes| {
-        let text = bytes.split(|b| *b == 0).next().unwrap_or_default();
-        let text = String::from_utf8_lossy(text);
-        let shown = text.chars().map(|c| if c.is_control() { ' ' } else { c });
-        shown.collect::<String>().trim().to_owned()
-    }))
 }
 
 impl DeviceIdentity {

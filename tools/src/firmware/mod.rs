@@ -17,12 +17,13 @@ use std::time::Duration;
 use ecaxis_esi::sii::Protocols;
 
 use ecaxis_master::acyclic::DatagramClient;
-use ecaxis_master::acyclic::enumerate::{DeviceSelector, address, enumerate};
+use ecaxis_master::acyclic::device::locate;
 use ecaxis_master::bringup::AlState;
 use ecaxis_master::bringup::al;
+use ecaxis_master::config::Locator;
 use ecaxis_master::mailbox::{MailboxTransport, foe};
 use error::StepFailure;
-use identify::look_at;
+use identify::examine_with;
 
 mod bootstrap;
 mod error;
@@ -201,8 +202,8 @@ pub async fn update(
     before.ready(order, expected)?;
     let seized;
     let before = if before.in_use {
-        let which = DeviceSelector::Position(before.device.position);
-        seized = look_at(wire, which, &before.device.name, true).await?;
+        let at = Locator::Position(before.device.position);
+        seized = examine_with(wire, at, Some(&before.device.name), true).await?;
         seized.ready(order, expected)?;
         &seized
     } else {
@@ -251,23 +252,20 @@ pub async fn update(
 /// Ends a transfer by returning to Init, where the device starts its present program.
 async fn given_up(wire: &DatagramClient, before: &DeviceIdentity, step: Step) -> StepFailure {
     // Its address may have changed; the final state is checked afterwards.
-    if let Ok(mut found) = enumerate(wire).await
-        && address(wire, &mut found).await.is_ok()
-        && let Ok(found) = DeviceSelector::Position(before.device.position).select_from(&found)
-    {
-        let device = [found.named(before.device.name.clone())];
-        let _ = al::change_state(wire, &device, AlState::Init, INIT_TIMEOUT).await;
+    let at = Locator::Position(before.device.position);
+    if let Ok((_, device)) = locate(wire, at, Some(&before.device.name)).await {
+        let _ = al::change_state(wire, &[device], AlState::Init, INIT_TIMEOUT).await;
     }
     step.failed(Cause::Interrupted)
 }
 
 /// Waits until the device answers again and runs a program, independent of address and state.
 async fn running(wire: &DatagramClient, before: &DeviceIdentity) -> Result<DeviceIdentity, Cause> {
-    let which = DeviceSelector::Position(before.device.position);
+    let at = Locator::Position(before.device.position);
     let end = after(wire, START_TIMEOUT);
     wire.delay(SETTLE).await;
     loop {
-        let cause = match examine(wire, which, &before.device.name).await {
+        let cause = match examine(wire, at, Some(&before.device.name)).await {
             Ok(found) => match found.runs() {
                 RunningProgram::Program => return Ok(found),
                 RunningProgram::Unknown if found.state != AlState::Bootstrap => return Ok(found),

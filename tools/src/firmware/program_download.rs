@@ -11,10 +11,11 @@ use super::error::{Cause, Step, StepFailure};
 use super::{
     DeviceIdentity, INIT_TIMEOUT, LOOK_AGAIN, ReadBack, UpdateProgress, UpdateRequest, after, since,
 };
-use ecaxis_master::acyclic::enumerate::{DeviceSelector, address, enumerate};
+use ecaxis_master::acyclic::device::locate;
 use ecaxis_master::acyclic::{DatagramClient, Registers, ServiceError, mailbox};
 use ecaxis_master::bringup::DeviceRef;
 use ecaxis_master::bringup::al::{self, AlState};
+use ecaxis_master::config::Locator;
 use ecaxis_master::mailbox::{CoeClient, MailboxTransport, SdoError, Timeouts};
 
 const PROGRAM_DATA: u16 = 0x1f50;
@@ -170,20 +171,13 @@ impl Session<'_> {
 
     /// Brings a device that lost address or state to PreOp again, if possible now.
     async fn wait_until_running(&mut self) {
-        let Ok(mut found) = enumerate(self.wire).await else {
-            return;
-        };
-        if address(self.wire, &mut found).await.is_err() {
-            return;
-        }
-        let position = DeviceSelector::Position(self.device.position);
-        let Ok(found) = position.select_from(&found) else {
+        let at = Locator::Position(self.device.position);
+        let Ok((found, device)) = locate(self.wire, at, Some(&self.device.name)).await else {
             return;
         };
         if found.station == self.device.station && found.state == AlState::PreOp && !found.error {
             return;
         }
-        let device = found.named(self.device.name.clone());
         if let Ok(coe) = pre_op(self.wire, self.examined, &device).await {
             (self.device, self.coe) = (device, coe);
         }

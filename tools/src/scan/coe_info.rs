@@ -6,8 +6,6 @@ use super::Device;
 use ecaxis_master::bringup::drive_units;
 use ecaxis_master::mailbox::{CoeClient, MailboxTransport, SdoError};
 
-/// The maximum number of modules; 0xF030 and 0xF050 have no more subindices.
-const MOST_MODULES: u8 = 255;
 const CONFIGURED: u16 = 0xf030;
 const DETECTED: u16 = 0xf050;
 
@@ -64,12 +62,12 @@ pub(super) async fn ask(
 ) -> Result<CoeInfo, SdoError> {
     coe.drain(wire).await?;
     let mut answers = CoeInfo {
-        device_type: drive_units::value(wire, coe, 0x1000, 0).await?,
-        name: text(wire, coe, 0x1008).await?,
-        hardware: text(wire, coe, 0x1009).await?,
-        software: text(wire, coe, 0x100a).await?,
-        configured: modules(wire, coe, CONFIGURED).await?,
-        detected: modules(wire, coe, DETECTED).await?,
+        device_type: coe.upload_integer(wire, 0x1000, 0).await?,
+        name: coe.upload_text(wire, 0x1008).await?,
+        hardware: coe.upload_text(wire, 0x1009).await?,
+        software: coe.upload_text(wire, 0x100a).await?,
+        configured: coe.upload_list(wire, CONFIGURED).await?,
+        detected: coe.upload_list(wire, DETECTED).await?,
         drive: None,
     };
     let profile = answers.device_type.map(|t| t & 0xffff);
@@ -85,61 +83,23 @@ async fn drive(
     coe: &mut CoeClient,
     maxon: bool,
 ) -> Result<DriveInfo, SdoError> {
-    let low = drive_units::value(wire, coe, 0x607d, 1).await?;
-    let high = drive_units::value(wire, coe, 0x607d, 2).await?;
+    let low = coe.upload_integer(wire, 0x607d, 1).await?;
+    let high = coe.upload_integer(wire, 0x607d, 2).await?;
     // `as` keeps the bits: these values are signed.
     let software_limits = low.zip(high).map(|(low, high)| [low as i32, high as i32]);
     Ok(DriveInfo {
         units: drive_units::ask(wire, coe, maxon).await?,
         sensor_resolution: match maxon {
-            true => drive_units::value(wire, coe, 0x3000, 5).await?,
+            true => coe.upload_integer(wire, 0x3000, 5).await?,
             false => None,
         },
-        supported_modes: drive_units::value(wire, coe, 0x6502, 0).await?,
-        following_window: drive_units::value(wire, coe, 0x6065, 0).await?,
+        supported_modes: coe.upload_integer(wire, 0x6502, 0).await?,
+        following_window: coe.upload_integer(wire, 0x6065, 0).await?,
         software_limits,
-        max_profile_velocity: drive_units::value(wire, coe, 0x607f, 0).await?,
-        max_motor_speed: drive_units::value(wire, coe, 0x6080, 0).await?,
-        max_torque: drive_units::value(wire, coe, 0x6072, 0).await?,
-        max_acceleration: drive_units::value(wire, coe, 0x60c5, 0).await?,
-        max_deceleration: drive_units::value(wire, coe, 0x60c6, 0).await?,
+        max_profile_velocity: coe.upload_integer(wire, 0x607f, 0).await?,
+        max_motor_speed: coe.upload_integer(wire, 0x6080, 0).await?,
+        max_torque: coe.upload_integer(wire, 0x6072, 0).await?,
+        max_acceleration: coe.upload_integer(wire, 0x60c5, 0).await?,
+        max_deceleration: coe.upload_integer(wire, 0x60c6, 0).await?,
     })
-}
-
-/// Reads a text object and removes unprintable characters.
-async fn text(
-    wire: &impl MailboxTransport,
-    coe: &mut CoeClient,
-    index: u16,
-) -> Result<Option<String>, SdoError> {
-    match coe.upload(wire, index, 0, false).await {
-        Ok(data) => {
-            let text = String::from_utf8_lossy(&data);
-            let text = text.trim_matches(|c: char| c.is_whitespace() || c == '\0');
-            let text: String = text.chars().filter(|c| !c.is_control()).take(80).collect();
-            Ok((!text.is_empty()).then_some(text))
-        }
-        Err(SdoError::Abort { .. }) => Ok(None),
-        Err(error) => Err(error),
-    }
-}
-
-/// Reads a list of module identities by slot.
-async fn modules(
-    wire: &impl MailboxTransport,
-    coe: &mut CoeClient,
-    index: u16,
-) -> Result<Option<Vec<u32>>, SdoError> {
-    let Some(count) = drive_units::value(wire, coe, index, 0).await? else {
-        return Ok(None);
-    };
-    let count = u8::try_from(count).unwrap_or(MOST_MODULES);
-    let mut idents = Vec::with_capacity(usize::from(count));
-    for sub in 1..=count {
-        let Some(ident) = drive_units::value(wire, coe, index, sub).await? else {
-            break;
-        };
-        idents.push(ident);
-    }
-    Ok(Some(idents))
 }

@@ -5,7 +5,7 @@
 //! they are free. States and mailboxes are not used unless [`Options::intrude`] is set.
 //!
 //! - [`registers`]: the controller's registers;
-//! - [`topology`]: connections and propagation delays;
+//! - [`delays`]: propagation delays;
 //! - [`other_main_device`]: evidence of another MainDevice;
 //! - [`coe_info`]: answers over the CoE mailbox;
 //! - [`esi_match`]: matching ESI files;
@@ -15,30 +15,29 @@ use std::time::Duration;
 
 use ecaxis_ecat::registers as esc;
 use ecaxis_esi::Identity;
-use ecaxis_esi::sii::{self, General, Protocols, Sii};
+use ecaxis_esi::sii::{General, Protocols, Sii};
 
-use ecaxis_master::acyclic::device::with_mailbox;
-use ecaxis_master::acyclic::eeprom::{EepromAccess, with_eeprom};
+use ecaxis_master::acyclic::device::{read_sii, with_mailbox};
+use ecaxis_master::acyclic::eeprom::EepromAccess;
 use ecaxis_master::acyclic::enumerate::{self, EnumeratedDevice};
+use ecaxis_master::acyclic::topology::{ParentPort, open_ports, parents};
 use ecaxis_master::acyclic::{DatagramClient, ServiceError};
-use ecaxis_master::bringup::DeviceRef;
 use ecaxis_master::bringup::al::{self, AlState};
 use ecaxis_master::mailbox::MailboxTransport;
 
 pub mod coe_info;
+pub mod delays;
 pub mod esi_match;
 pub mod other_main_device;
 pub mod registers;
 #[cfg(test)]
 mod tests;
-pub mod topology;
 pub mod write;
 
 pub use coe_info::{CoeInfo, DriveInfo};
 pub use esi_match::EsiMatch;
 pub use other_main_device::MainDeviceEvidence;
 use registers::{CONTROLLER_BYTES, Controller};
-pub use topology::ParentPort;
 
 /// The time to detect another MainDevice.
 const WATCH: Duration = Duration::from_millis(50);
@@ -83,8 +82,6 @@ pub struct Scan {
 pub struct Device {
     pub found: EnumeratedDevice,
     pub controller: Controller,
-    /// DL status (0x0110).
-    pub dl_status: u16,
     /// The port that it is connected to; `None`: the MainDevice.
     pub uplink: Option<ParentPort>,
     /// The one-way delay from the first device in ns.
@@ -198,8 +195,11 @@ pub async fn scan(
         });
         devices.push(look_at(wire, found, readable).await?);
     }
-    place(&mut devices);
-    delays(wire, &mut devices, quiet).await?;
+    let uplinks = parents(devices.iter().map(|device| device.found.dl_status));
+    for (device, uplink) in devices.iter_mut().zip(uplinks) {
+        device.uplink = uplink;
+    }
+    measure_delays(wire, &mut devices, quiet).await?;
 
     let mut scan = Scan {
         devices,
@@ -236,7 +236,6 @@ async fn look_at(
     const STEP: &str = "reading what its controller is";
     let position = found.position;
     let controller: [u8; CONTROLLER_BYTES] = enumerate::at(wire, position, STEP, esc::TYPE).await?;
-    let dl_status: [u8; 2] = enumerate::at(wire, position, STEP, esc::DL_STATUS).await?;
     let controller = Controller::from_registers(controller);
     let mut time = [0; 4];
     let dc = controller.has_receive_times()
@@ -246,7 +245,8 @@ async fn look_at(
         );
     let at = found.named(format!("position {position}"));
     let sii = if readable {
-        read_eeprom(wire, &at).await
+        let sii = read_sii(wire, &at, EepromAccess::IfFree).await;
+        sii.map_err(|error| error.to_string())
     } else {
         Err(format!(
             "{at}: its EEPROM was left alone: another master may be reading it"
@@ -255,7 +255,6 @@ async fn look_at(
     Ok(Device {
         found,
         controller,
-        dl_status: u16::from_le_bytes(dl_status),
         uplink: None,
         delay_ns: None,
         dc,
@@ -265,31 +264,9 @@ async fn look_at(
     })
 }
 
-/// Reads the EEPROM if it is free.
-async fn read_eeprom(wire: &DatagramClient, at: &DeviceRef) -> Result<Sii, String> {
-    const STEP: &str = "reading the EEPROM";
-    let read = with_eeprom(wire, at, STEP, EepromAccess::IfFree, async |eeprom| {
-        eeprom.image(&mut |_, _| {}).await
-    });
-    let image: Result<Vec<u8>, ServiceError> = read.await;
-    let image = image.map_err(|error| error.to_string())?;
-    sii::parse(&image).map_err(|error| format!("EEPROM: {error}"))
-}
-
-/// Finds the parent of every device.
-fn place(devices: &mut [Device]) {
-    let open: Vec<[bool; 4]> = devices
-        .iter()
-        .map(|device| registers::open_ports(device.dl_status))
-        .collect();
-    for (device, uplink) in devices.iter_mut().zip(topology::uplinks(&open)) {
-        device.uplink = uplink;
-    }
-}
-
 /// Measures propagation delays. Latching receive times only disturbs another measurement. With
 /// another MainDevice, its written delays are used.
-async fn delays(
+async fn measure_delays(
     wire: &DatagramClient,
     devices: &mut [Device],
     quiet: bool,
@@ -305,8 +282,8 @@ async fn delays(
     }
     let places: Vec<_> = devices
         .iter()
-        .map(|device| topology::TreeNode {
-            open: registers::open_ports(device.dl_status),
+        .map(|device| delays::TreeNode {
+            open: open_ports(device.found.dl_status),
             uplink: device.uplink,
         })
         .collect();
@@ -326,7 +303,7 @@ async fn delays(
                 None
             });
         }
-        let delays = topology::delays(&places, &times);
+        let delays = delays::delays(&places, &times);
         for ((sum, measured), delay) in sums.iter_mut().zip(&mut measured).zip(delays) {
             if let Some(delay) = delay {
                 *sum += delay;

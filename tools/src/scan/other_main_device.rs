@@ -243,6 +243,7 @@ mod tests {
                 position: 1,
                 station: 0x1001,
                 alias: 0,
+                dl_status: 0,
                 state,
                 error: false,
                 code: 0,

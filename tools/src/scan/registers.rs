@@ -102,32 +102,6 @@ impl Controller {
     }
 }
 
-/// The state of a port (DL status, 0x0110).
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Port {
-    /// The cable, or the E-bus neighbour, is connected.
-    pub link: bool,
-    /// Frames are forwarded and return.
-    pub open: bool,
-}
-
-#[must_use]
-pub fn ports(dl_status: u16) -> [Port; 4] {
-    [0, 1, 2, 3].map(|n: u16| {
-        let looped = dl_status >> (8 + 2 * n) & 1 != 0;
-        let communicates = dl_status >> (9 + 2 * n) & 1 != 0;
-        Port {
-            link: dl_status >> (4 + n) & 1 != 0,
-            open: !looped && communicates,
-        }
-    })
-}
-
-#[must_use]
-pub fn open_ports(dl_status: u16) -> [bool; 4] {
-    ports(dl_status).map(|port| port.open)
-}
-
 /// Parses 0x0900 to 0x090F: local times in ns at which a frame arrived at each port.
 #[must_use]
 pub fn receive_times(bytes: [u8; 16]) -> [u32; 4] {
@@ -162,33 +136,6 @@ mod tests {
         assert!(!without.has_receive_times() && !without.knows_lrw());
         assert_eq!(without.ports[3], PortKind::Ebus);
         assert_eq!(without.clock_bits(), 32);
-    }
-
-    /// Rows of the table "DL status": link, loop, communication.
-    #[test]
-    fn ports_are_open_if_communicating_without_loop() {
-        for (status, link, open) in [
-            (0x5530, [true, true, false, false], [false; 4]),
-            (
-                0x5a30,
-                [true, true, false, false],
-                [true, true, false, false],
-            ),
-            (
-                0x5610,
-                [true, false, false, false],
-                [true, false, false, false],
-            ),
-            (
-                0x99b0,
-                [true, true, false, true],
-                [false, true, false, true],
-            ),
-        ] {
-            let ports = ports(status);
-            assert_eq!(ports.map(|p| p.link), link, "0x{status:04x}");
-            assert_eq!(ports.map(|p| p.open), open, "0x{status:04x}");
-        }
     }
 
     #[test]

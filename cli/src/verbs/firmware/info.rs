@@ -2,9 +2,9 @@
 
 use ecaxis_tools::firmware;
 
-use super::show;
-use super::target::DeviceArgs;
+use super::{TargetArgs, show};
 use crate::args::bus;
+use crate::args::device::{self, Target};
 use crate::hints;
 use crate::hints::Failure;
 use crate::render::result;
@@ -26,18 +26,23 @@ pub(crate) struct Args {
     #[arg(value_names = ["MACHINE", "DEVICE"], num_args = 0..=2)]
     words: Vec<String>,
     #[command(flatten)]
-    at: DeviceArgs,
+    at: TargetArgs,
     /// Print the result as JSON
     #[arg(long)]
     json: bool,
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let target = args.at.target(&args.words, None)?;
-    let (which, name, nic) = (target.which, target.name.clone(), target.nic());
-    let found = target.visit(async move |wire, others| {
+    let (target, rest) = args.at.device.take(&args.words, "nothing")?;
+    device::no_more(rest)?;
+    let Target {
+        bus, at, config, ..
+    } = args.at.set_up(target, None)?;
+    let nic = bus.nic();
+    let found = bus.visit(async move |wire, others| {
         bus::warn_foreign_frames(others);
-        firmware::examine(&wire, which, &name).await
+        let name = config.as_ref().map(|config| config.name.as_str());
+        firmware::examine(&wire, at, name).await
     })?;
     let examined = found.map_err(|error| hints::firmware(&error, &nic))?;
     result(&if args.json {

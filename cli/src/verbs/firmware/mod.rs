@@ -1,17 +1,24 @@
 //! `ecaxis firmware`: shows and updates the firmware of a device.
 //!
-//! - `target`: selects device and bus;
+//! - here: the options of device and bus;
 //! - `info`, `update`, `sample`: one file per subcommand;
 //! - `show`: formats a device.
 
-use clap::Subcommand;
+use std::path::{Path, PathBuf};
 
-use crate::hints::Failure;
+use clap::Subcommand;
+use ecaxis_master::clock::Clock;
+use ecaxis_master::config::Nic;
+use ecaxis_master::session::Options;
+
+use crate::args::device::{DeviceArgs, Target};
+use crate::args::record;
+use crate::hints::{Failure, WRONG};
+use crate::verbs::run;
 
 mod info;
 mod sample;
 mod show;
-mod target;
 mod update;
 
 const EXAMPLES: &str = "\
@@ -41,6 +48,64 @@ enum FirmwareCommand {
     Info(info::Args),
     Update(update::Args),
     Sample(sample::Args),
+}
+
+/// Options of the device and its bus
+#[derive(Debug, clap::Args)]
+struct TargetArgs {
+    #[command(flatten)]
+    device: DeviceArgs,
+    /// Use virtual time: as fast as possible (simulated bus only)
+    #[arg(long = "virtual")]
+    virtual_time: bool,
+    /// Fault script for the simulated bus
+    #[arg(long, value_name = "FILE")]
+    faults: Option<PathBuf>,
+    /// Record all frames to this pcapng file
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
+    /// Overwrite existing output files
+    #[arg(long)]
+    force: bool,
+}
+
+impl TargetArgs {
+    /// Sets clock, faults and recording of the target's bus. `input`: a file that is read, with its
+    /// description.
+    fn set_up(&self, target: Target, input: Option<(&Path, &str)>) -> Result<Target, Failure> {
+        let machine = target.machine.as_deref();
+        let is_sim = target.bus.nic() == Nic::Sim;
+        if !is_sim && (self.virtual_time || self.faults.is_some()) {
+            return Err(wrong(
+                "virtual time and faults are for the simulated bus only",
+            ));
+        }
+        let faults = match (&self.faults, machine) {
+            (Some(file), Some(machine)) => Some(run::faults(file, machine)?),
+            _ => None,
+        };
+        if let Some(path) = &self.record {
+            record::check_distinct(path, self.force, machine, self.faults.as_deref(), input)?;
+        }
+        let mut options = Options {
+            clock: match self.virtual_time {
+                true => Clock::Virtual,
+                false => Clock::Real,
+            },
+            faults,
+            record: self.record.clone(),
+            ..Options::default()
+        };
+        if let Some(seed) = options.faults.as_ref().and_then(|faults| faults.seed) {
+            options.seed = seed;
+        }
+        let bus = target.bus.with(options);
+        Ok(Target { bus, ..target })
+    }
+}
+
+fn wrong(message: &str) -> Failure {
+    Failure::new(WRONG, message)
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {

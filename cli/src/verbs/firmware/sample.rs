@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use ecaxis_master::config;
 use ecaxis_sim::FirmwareHeader;
 
-use super::target;
+use crate::args::device::named;
 use crate::args::files::write_new;
 use crate::hints;
 use crate::hints::Failure;
@@ -65,7 +65,7 @@ fn version(text: &str) -> Result<[u8; 4], String> {
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let machine = config::load(&args.machine).map_err(|e| hints::config(&args.machine, &e))?;
-    let device = target::named(&machine, &args.machine, &args.device)?;
+    let device = named(&machine, &args.device)?;
     let identity = device.device.identity;
     let header = FirmwareHeader {
         vendor: identity.vendor,

@@ -6,14 +6,15 @@ use std::time::{Duration, Instant};
 
 use clap::ValueEnum;
 use ecaxis_tools::firmware::{
-    self, DeviceIdentity, ReadBack, Step, UpdateMethod, UpdateProgress, UpdateReport, UpdateRequest,
+    self, DeviceIdentity, Expected, ReadBack, Step, UpdateMethod, UpdateProgress, UpdateReport,
+    UpdateRequest,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
-use super::show;
-use super::target::{self, DeviceArgs};
+use super::{TargetArgs, show, wrong};
 use crate::args::bus;
+use crate::args::device::Target;
 use crate::hints;
 use crate::hints::Failure;
 use crate::render::note;
@@ -48,7 +49,7 @@ pub(crate) struct Args {
     #[arg(value_names = ["MACHINE", "DEVICE", "FILE"], num_args = 1..=3, required = true)]
     words: Vec<String>,
     #[command(flatten)]
-    at: DeviceArgs,
+    at: TargetArgs,
     /// Update method [default: FoE, if the device supports it]
     #[arg(long, value_enum)]
     via: Option<MethodArg>,
@@ -117,14 +118,20 @@ pub(crate) fn run(args: &Args, plain: bool) -> Result<(), Failure> {
 }
 
 fn update(args: &Args, plain: bool) -> Result<(), Failure> {
-    let Some((path, words)) = args.words.split_last() else {
-        return Err(target::wrong("the firmware file is missing"));
+    let (target, rest) = args.at.device.take(&args.words, "a firmware file")?;
+    let [path] = rest else {
+        return Err(wrong("which file? One firmware file after the device"));
     };
     let path = PathBuf::from(path);
     let input = (path.as_path(), "the firmware file");
-    let mut target = args.at.target(words, Some(input))?;
-    target.expected.vendor = args.expect_vendor.or(target.expected.vendor);
-    target.expected.product = args.expect_product.or(target.expected.product);
+    let Target {
+        bus, at, config, ..
+    } = args.at.set_up(target, Some(input))?;
+    let identity = config.as_ref().map(|config| config.device.identity);
+    let expected = Expected {
+        vendor: args.expect_vendor.or(identity.map(|i| i.vendor)),
+        product: args.expect_product.or(identity.map(|i| i.product)),
+    };
     let file = read(&path)?;
     let bytes = file.len();
     let name = match &args.name {
@@ -134,19 +141,19 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
             .map(|name| name.to_string_lossy().into_owned())
             .unwrap_or_default(),
     };
-    let (which, expected, nic) = (target.which, target.expected, target.nic());
-    let device = target.name.clone();
+    let nic = bus.nic();
     let chosen = args.via.map(UpdateMethod::from);
     let (password, read_back, write) = (args.password, args.read_back, args.yes);
     let teller = ProgressReporter::new(plain);
-    let target = if write { target.alone() } else { target };
-    let visited = target.visit(async move |wire, others| {
+    let bus = if write { bus.alone() } else { bus };
+    let visited = bus.visit(async move |wire, others| {
         if others > 0 && write {
             return Err(hints::shared_bus());
         }
         bus::warn_foreign_frames(others);
         let visited = async {
-            let before = firmware::examine(&wire, which, &device).await?;
+            let device = config.as_ref().map(|config| config.name.as_str());
+            let before = firmware::examine(&wire, at, device).await?;
             let via = before.way(chosen)?;
             let order = UpdateRequest {
                 via,
@@ -176,7 +183,7 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
         return if args.dry_run {
             Ok(())
         } else {
-            Err(target::wrong("nothing was written")
+            Err(wrong("nothing was written")
                 .hint("add `--yes` to write it, or `--dry-run` where this was all you wanted"))
         };
     };
@@ -188,10 +195,10 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, Failure> {
-    let failed = |why: String| target::wrong(&format!("cannot read {}: {why}", path.display()));
+    let failed = |why: String| wrong(&format!("cannot read {}: {why}", path.display()));
     let file = ecaxis_master::file::read(path, MOST).map_err(|e| failed(e.to_string()))?;
     if file.is_empty() {
-        return Err(target::wrong(&format!("{} is empty", path.display()))
+        return Err(wrong(&format!("{} is empty", path.display()))
             .hint("name a firmware file from the device's vendor"));
     }
     Ok(file)

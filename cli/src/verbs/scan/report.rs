@@ -1,7 +1,8 @@
 //! The result of a scan as JSON.
 
 use ecaxis_esi as esi;
-use ecaxis_tools::scan::{CoeInfo, Device, DriveInfo, EsiMatch, registers};
+use ecaxis_master::acyclic::topology;
+use ecaxis_tools::scan::{CoeInfo, Device, DriveInfo, EsiMatch};
 use serde_json::{Value, json};
 
 use super::ScanResult;
@@ -27,7 +28,7 @@ pub(super) fn json(seen: &ScanResult) -> Value {
 fn device(device: &Device, described: Option<&EsiMatch>) -> Value {
     let found = &device.found;
     let sii = device.sii.as_ref().ok();
-    let ports: Vec<Value> = registers::ports(device.dl_status)
+    let ports: Vec<Value> = topology::ports(device.found.dl_status)
         .iter()
         .zip(device.controller.ports)
         .map(|(port, kind)| json!({ "kind": kind.to_string(), "link": port.link, "open": port.open }))

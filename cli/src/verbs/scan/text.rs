@@ -3,7 +3,8 @@
 use ecaxis_axis::VelocityUnit;
 use ecaxis_ecat::al_status_code::al_status_text;
 use ecaxis_esi as esi;
-use ecaxis_tools::scan::{CoeInfo, Device, EsiMatch, registers};
+use ecaxis_master::acyclic::topology;
+use ecaxis_tools::scan::{CoeInfo, Device, EsiMatch};
 
 use super::ScanResult;
 use crate::render::table::Table;
@@ -84,7 +85,7 @@ fn places(seen: &ScanResult) -> Table {
     ];
     let mut table = Table::new(&head);
     for (device, _) in seen.devices() {
-        let open = registers::open_ports(device.dl_status);
+        let open = topology::open_ports(device.found.dl_status);
         let open: Vec<String> = (0..)
             .zip(open)
             .filter(|(_, open)| *open)

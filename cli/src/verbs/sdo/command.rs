@@ -4,7 +4,7 @@ use ecaxis_master::mailbox::MailboxTransport;
 use ecaxis_tools::parameters::command::Command;
 use serde_json::json;
 
-use crate::args::device::{DeviceArgs, Open};
+use crate::args::device::{DeviceArgs, Open, no_more};
 use crate::hints;
 use crate::hints::Failure;
 use crate::render::note;
@@ -66,12 +66,7 @@ pub(super) fn defaults(args: &DefaultsArgs) -> Result<(), Failure> {
 
 fn give(which: &Which, command: Command) -> Result<(), Failure> {
     let (target, rest) = which.place.take(&which.words, "nothing")?;
-    if let Some(word) = rest.first() {
-        return Err(Failure::new(
-            hints::WRONG,
-            format!("`{word}` is one word too many"),
-        ));
-    }
+    no_more(rest)?;
     let (step, what) = match command {
         Command::Store => ("storing its parameters", "parameters are stored"),
         Command::Defaults => ("resetting its parameters", "parameters are reset"),

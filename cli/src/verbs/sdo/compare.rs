@@ -42,7 +42,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
             [left.clone(), right.clone()],
         ),
         words => {
-            let (target, rest) = args.common.place.take(words, "a file of `sdo dump`")?;
+            let (target, rest) = args.common.take(words, "a file of `sdo dump`")?;
             let [file] = rest else {
                 return Err(Failure::new(hints::WRONG, "one file of `sdo dump`"));
             };

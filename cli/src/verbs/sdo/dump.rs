@@ -33,7 +33,7 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Result<(), Failure> {
-    let (target, rest) = args.common.place.take(&args.words, "a file to write")?;
+    let (target, rest) = args.common.take(&args.words, "a file to write")?;
     let [path] = rest else {
         return Err(Failure::new(hints::WRONG, "one file to write"));
     };

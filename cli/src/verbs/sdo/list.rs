@@ -1,8 +1,7 @@
 //! `ecaxis sdo list`.
 
 use super::Common;
-use crate::args::device::Open;
-use crate::hints;
+use crate::args::device::{Open, no_more};
 use crate::hints::Failure;
 use crate::render::result;
 use crate::verbs::esi::objects;
@@ -29,13 +28,8 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Result<(), Failure> {
-    let (target, rest) = args.common.place.take(&args.words, "nothing")?;
-    if let Some(word) = rest.first() {
-        return Err(Failure::new(
-            hints::WRONG,
-            format!("`{word}` is one word too many"),
-        ));
-    }
+    let (target, rest) = args.common.take(&args.words, "nothing")?;
+    no_more(rest)?;
     let ask = args.common.ask;
     let dictionary = target.open(
         "asking for its objects",

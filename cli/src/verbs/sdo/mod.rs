@@ -1,7 +1,7 @@
 //! `ecaxis sdo`: reads, writes, lists, saves and restores the parameters of a device. One file per
 //! subcommand.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
 use ecaxis_esi::Dictionary;
@@ -12,7 +12,7 @@ use ecaxis_tools::parameters::lookup::{FindError, ObjectQuery, find};
 use serde_json::{Value, json};
 
 use crate::args::Verbosity;
-use crate::args::device::{DeviceArgs, address};
+use crate::args::device::{DeviceArgs, Target, address};
 use crate::hints;
 use crate::hints::Failure;
 use crate::render::table::Table;
@@ -40,8 +40,8 @@ a number (0x6065, 0x1018:01) or a name (Statusword, \"Identity: Vendor ID\").";
 
 /// Read and write the parameters of a device, save and restore them
 ///
-/// Select the device by machine file and name, or by --nic with --position or --alias. Its state is
-/// kept: a device in Init is in PreOp during the access, a device in Op stays in Op.
+/// Select the device by machine file and name, or by --nic with --position, --alias or --id. Its
+/// state is kept: a device in Init is in PreOp during the access, a device in Op stays in Op.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -81,6 +81,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 struct Common {
     #[command(flatten)]
     place: DeviceArgs,
+    /// ESI file or folder of the device, without a machine file
+    #[arg(long, value_name = "PATH", requires = "nic")]
+    esi: Option<PathBuf>,
     /// Read the object dictionary from the device (SDO Information), even if an ESI file describes
     /// it
     #[arg(long)]
@@ -88,6 +91,15 @@ struct Common {
     /// Print as JSON
     #[arg(long)]
     json: bool,
+}
+
+impl Common {
+    /// As [`DeviceArgs::take`].
+    fn take<'w>(&self, words: &'w [String], rest: &str) -> Result<(Target, &'w [String]), Failure> {
+        let (target, rest) = self.place.take(words, rest)?;
+        let esi = self.esi.clone();
+        Ok((Target { esi, ..target }, rest))
+    }
 }
 
 /// Parses an object given by number or name.

@@ -48,7 +48,7 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Result<(), Failure> {
-    let (target, objects) = args.common.place.take(&args.words, "objects")?;
+    let (target, objects) = args.common.take(&args.words, "objects")?;
     if objects.is_empty() {
         return Err(Failure::new(hints::WRONG, "which object?")
             .hint("by number, such as 0x6041, or by name, such as Statusword"));

@@ -37,10 +37,7 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Result<(), Failure> {
-    let (target, rest) = args
-        .common
-        .place
-        .take(&args.words, "a file of `sdo dump`")?;
+    let (target, rest) = args.common.take(&args.words, "a file of `sdo dump`")?;
     let [file] = rest else {
         return Err(Failure::new(hints::WRONG, "one file of `sdo dump`"));
     };

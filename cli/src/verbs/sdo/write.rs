@@ -50,10 +50,7 @@ pub(super) struct Args {
 const MAX_BYTES: u64 = 256 << 20;
 
 pub(super) fn run(args: &Args) -> Result<(), Failure> {
-    let (target, words) = args
-        .common
-        .place
-        .take(&args.words, "an object and its value")?;
+    let (target, words) = args.common.take(&args.words, "an object and its value")?;
     let (object, written) = match (words, &args.from) {
         ([object], Some(path)) => {
             let bytes = file::read(path, MAX_BYTES).map_err(|error| {

@@ -1,19 +1,6 @@
-//! Topology and propagation delays. Pure.
-//!
-//! Frames pass the ports of a device in the order 0, 3, 1, 2 and back to 0. The device order is
-//! therefore a depth-first walk of the tree. Frames are assumed to enter at port 0, as with correct
-//! cabling.
+//! Propagation delays. Pure.
 
-/// The order in which frames pass the ports.
-const ORDER: [u8; 4] = [0, 3, 1, 2];
-
-/// A port that leads away from the MainDevice.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ParentPort {
-    /// The position of the device.
-    pub device: u16,
-    pub port: u8,
-}
+use ecaxis_master::acyclic::topology::{PORT_ORDER, ParentPort};
 
 /// A device of the tree.
 #[derive(Debug, Clone, Copy)]
@@ -21,34 +8,6 @@ pub struct TreeNode {
     /// The ports that forward frames.
     pub open: [bool; 4],
     pub uplink: Option<ParentPort>,
-}
-
-/// Returns for each device, in segment order, the port that it is connected to. `None` for the
-/// first device, and for devices without a free port, where the port states contradict each other.
-#[must_use]
-pub fn uplinks(open: &[[bool; 4]]) -> Vec<Option<ParentPort>> {
-    // Devices with ports whose neighbour is not found yet.
-    let mut waiting: Vec<(u16, Vec<u8>)> = Vec::new();
-    let mut all = Vec::with_capacity(open.len());
-    for (position, ports) in (0_u16..).zip(open) {
-        let mut uplink = None;
-        while let Some((device, free)) = waiting.last_mut() {
-            if free.is_empty() {
-                waiting.pop();
-                continue;
-            }
-            uplink = Some(ParentPort {
-                device: *device,
-                port: free.remove(0),
-            });
-            break;
-        }
-        all.push(uplink);
-        let free = ORDER.into_iter().skip(1);
-        let free = free.filter(|port| is_open(ports, *port)).collect();
-        waiting.push((position, free));
-    }
-    all
 }
 
 fn is_open(ports: &[bool; 4], port: u8) -> bool {
@@ -68,7 +27,7 @@ fn between(times: &[u32; 4], from: u8, to: u8) -> i64 {
 
 /// Returns the open port before `port` in frame order.
 fn before(ports: &[bool; 4], port: u8) -> u8 {
-    let earlier = ORDER.into_iter().take_while(|other| *other != port);
+    let earlier = PORT_ORDER.into_iter().take_while(|other| *other != port);
     let earlier = earlier.filter(|other| is_open(ports, *other));
     earlier.last().unwrap_or(0)
 }
@@ -91,7 +50,9 @@ pub fn delays(places: &[TreeNode], times: &[Option<[u32; 4]>]) -> Vec<Option<i64
             None => 0,
             Some((parent, their, uplink)) => {
                 let earlier = before(&parent.open, uplink.port);
-                let last = ORDER.into_iter().rfind(|port| is_open(&place.open, *port));
+                let last = PORT_ORDER
+                    .into_iter()
+                    .rfind(|port| is_open(&place.open, *port));
                 let behind = between(own, 0, last.unwrap_or(0));
                 let way = (between(their, earlier, uplink.port) - behind) / 2;
                 let theirs = delays.get(usize::from(uplink.device)).copied().flatten();
@@ -124,47 +85,22 @@ fn clocked<'a>(
 
 #[cfg(test)]
 mod tests {
+    use ecaxis_master::acyclic::topology::{open_ports, parents};
+
     use super::*;
 
-    const LINE: [bool; 4] = [true, true, false, false];
-    const END: [bool; 4] = [true, false, false, false];
+    const LINE: u16 = 0x0a00;
+    const END: u16 = 0x0200;
 
-    fn at(device: u16, port: u8) -> Option<ParentPort> {
-        Some(ParentPort { device, port })
-    }
-
-    #[test]
-    fn uplinks_of_a_line_use_port_1() {
-        assert_eq!(uplinks(&[LINE, LINE, END]), [None, at(0, 1), at(1, 1)]);
-        assert_eq!(uplinks(&[END]), [None]);
-        assert_eq!(uplinks(&[]), []);
-    }
-
-    #[test]
-    fn uplinks_follow_the_port_order() {
-        let coupler = [true, true, true, true];
-        assert_eq!(
-            uplinks(&[coupler, LINE, END, END, END]),
-            [None, at(0, 3), at(1, 1), at(0, 1), at(0, 2)]
-        );
-    }
-
-    #[test]
-    fn uplinks_rejects_contradicting_ports() {
-        // The first device reports no further neighbour.
-        assert_eq!(uplinks(&[END, END]), [None, None]);
-        assert_eq!(uplinks(&[LINE, END, END]), [None, at(0, 1), None]);
-    }
-
-    fn places(open: &[[bool; 4]]) -> Vec<TreeNode> {
-        let uplinks = uplinks(open);
-        open.iter()
-            .zip(uplinks)
-            .map(|(open, uplink)| TreeNode {
-                open: *open,
-                uplink,
-            })
-            .collect()
+    /// Returns the tree of devices with these DL status values.
+    fn places(dl_status: &[u16]) -> Vec<TreeNode> {
+        let uplinks = parents(dl_status.iter().copied());
+        let nodes = dl_status.iter().zip(uplinks);
+        let node = |(status, uplink): (&u16, Option<ParentPort>)| TreeNode {
+            open: open_ports(*status),
+            uplink,
+        };
+        nodes.map(node).collect()
     }
 
     /// 100 ns per cable; each device's clock has another start value, and one wraps.
@@ -188,7 +124,7 @@ mod tests {
 
     #[test]
     fn delays_of_the_second_branch_exclude_the_first() {
-        let places = places(&[[true, true, false, true], END, END]);
+        let places = places(&[0x8a00, END, END]);
         // Round trip: 200 ns at port 3, 600 ns at port 1.
         let times = [Some([0, 800, 0, 200]), Some([0; 4]), Some([0; 4])];
         assert_eq!(delays(&places, &times), [Some(0), Some(100), Some(500)]);
