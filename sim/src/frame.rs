@@ -102,7 +102,8 @@ impl Datagram {
         read_u16(frame, self.header + 2).unwrap_or(0)
     }
 
-    pub(crate) fn set_adp(&self, frame: &mut [u8], adp: u16) {
+    /// Sets the position or station address.
+    pub fn set_adp(&self, frame: &mut [u8], adp: u16) {
         write_u16(frame, self.header + 2, adp);
     }
 
@@ -124,7 +125,8 @@ impl Datagram {
         read_u16(frame, self.data.end).unwrap_or(0)
     }
 
-    pub(crate) fn add_wkc(&self, frame: &mut [u8], n: u16) {
+    /// Adds to the working counter, which wraps around.
+    pub fn add_wkc(&self, frame: &mut [u8], n: u16) {
         let wkc = self.wkc(frame).wrapping_add(n);
         write_u16(frame, self.data.end, wkc);
     }
@@ -182,7 +184,6 @@ fn parse_one(frame: &[u8], at: usize, end: usize) -> Option<Datagram> {
 
 /// The classification of a frame by a SubDevice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[non_exhaustive]
 pub enum Kind {
     /// A well-formed EtherCAT frame of type 1.
     EtherCat,
@@ -241,7 +242,7 @@ pub fn next(frame: &[u8], previous: Option<&Datagram>) -> Option<Datagram> {
 
 /// Returns the ns that the frame occupies a 100 Mbit/s wire, with preamble, padding, FCS and gap.
 #[must_use]
-pub(crate) fn wire_time(len: usize) -> u64 {
+pub fn wire_time(len: usize) -> u64 {
     (u64::try_from(len).unwrap_or(0).max(60) + 24) * 80
 }
 
@@ -261,7 +262,7 @@ impl Default for FrameBuilder {
 impl FrameBuilder {
     /// Starts a frame with this source address.
     #[must_use]
-    pub(crate) fn from_source(source: [u8; 6]) -> Self {
+    pub fn from_source(source: [u8; 6]) -> Self {
         let mut frame = vec![0xff; 6];
         frame.extend_from_slice(&source);
         frame.extend_from_slice(&ETHERTYPE.to_be_bytes());

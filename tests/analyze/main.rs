@@ -166,7 +166,7 @@ fn analyze_reports_bring_up_cycle_and_motion_of_an_own_run() {
             .collect::<Vec<_>>()
     );
 
-    let html = analyze::html("run.pcapng", &report);
+    let html = analyze::document("run.pcapng", &report, &[], false).html();
     let (charts, _) = assert_well_formed(&html);
     assert_eq!(
         charts,

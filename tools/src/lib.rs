@@ -6,7 +6,8 @@
 //! - [`firmware`]: firmware updates;
 //! - [`doctor`]: checks of host settings that delay the cycle;
 //! - [`mod@bench`]: the measurements of the benchmark;
-//! - [`analyze`]: analysis of recordings.
+//! - [`analyze`]: analysis of recordings;
+//! - [`document`]: reports as data, as text and as HTML.
 
 #![forbid(unsafe_code)]
 
@@ -14,7 +15,7 @@ pub mod analyze;
 pub mod bench;
 pub mod compare;
 pub mod doctor;
+pub mod document;
 pub mod firmware;
-mod html;
 pub mod parameters;
 pub mod scan;

@@ -2,16 +2,17 @@
 
 use std::io::{self, IsTerminal, Write};
 
+use ecaxis_tools::document::{Document, Table};
+use serde::Serialize;
+
 use crate::hints::{self, Failure};
 
-pub(crate) mod emergencies;
 pub(crate) mod fault_report;
 pub(crate) mod output;
 pub(crate) mod pdo_table;
 pub(crate) mod progress;
 pub(crate) mod report;
 pub(crate) mod style;
-pub(crate) mod table;
 
 /// Prints a result on stdout.
 pub(crate) fn result(text: &str) -> Result<(), Failure> {
@@ -22,6 +23,32 @@ pub(crate) fn result(text: &str) -> Result<(), Failure> {
 /// Prints prose on stdout. On a terminal, long lines are wrapped.
 pub(crate) fn page(text: &str) -> Result<(), Failure> {
     result(&output::wrapped(text, output::stdout_width()))
+}
+
+/// The width of pages with long lines, in columns.
+const PAGE: usize = 80;
+
+/// Prints a document. On a terminal, it is wrapped.
+pub(crate) fn print(document: &Document) -> Result<(), Failure> {
+    result(&document.text(output::stdout_width()))
+}
+
+/// Prints a table alone, without indent.
+pub(crate) fn print_table(table: &Table) -> Result<(), Failure> {
+    result(&table.text(0, output::stdout_width()))
+}
+
+/// Prints a document with long lines, wrapped to 80 columns or a wider terminal.
+pub(crate) fn print_page(document: &Document) -> Result<(), Failure> {
+    let width = output::stdout_width().unwrap_or(PAGE).max(PAGE);
+    result(&document.text(Some(width)))
+}
+
+/// Prints a result as JSON, its keys in order.
+pub(crate) fn print_json(value: &impl Serialize) -> Result<(), Failure> {
+    let failed = |e| Failure::new(hints::FAILED, format!("cannot write the result: {e}"));
+    let json = serde_json::to_string_pretty(value).map_err(failed)?;
+    result(&(json + "\n"))
 }
 
 /// Maps a write result. A closed pipe (`| head`) is not a failure.

@@ -1,107 +1,88 @@
-//! The summary of a run as text. In virtual time all figures describe the machine, not the
-//! computer.
+//! The summary of a run. In virtual time all figures describe the machine, not the computer.
 
 use std::time::Duration;
 
 use ecaxis_master::config::duration;
 use ecaxis_master::rt::stats::Percentiles;
-use ecaxis_master::session::{AxisSummary, DeviceErrors, EventLine, Summary, ThreadSummary};
+use ecaxis_master::session::{
+    AxisSummary, DeviceErrors, EmergencyLine, EventLine, Summary, ThreadSummary,
+};
+use ecaxis_master::text::pluralize;
+use ecaxis_tools::cells;
+use ecaxis_tools::document::format::{hex_bytes, hex16};
+use ecaxis_tools::document::{Document, Table};
 
-pub(crate) use crate::render::table::Table;
+/// The number of events shown.
+const EVENTS: usize = 12;
 
-/// Formats the whole summary of a run.
-pub(crate) fn summary(summary: &Summary) -> String {
-    let mut text = head(summary);
-    text += "\n";
-    text += &counters(summary).indented(2);
-    text += "\n\n";
-    text += &times(summary).indented(2);
-    text += "\n";
-    if let Some(thread) = &summary.thread {
-        text += &self::thread(thread, summary.counters.cycles);
-    }
-    if !summary.axes.is_empty() {
-        text += "\n";
-        text += &axes(&summary.axes).shown(2);
-        text += "\n";
-    }
-    for axis in &summary.axes {
-        for what in [&axis.fault, &axis.trip].into_iter().flatten() {
-            text += &format!("  {}: {what}\n", axis.name);
-        }
-    }
-    for stop in &summary.group_stops {
-        let end = if stop.released {
-            "reset since"
+/// Returns the whole summary of a run.
+pub(crate) fn summary(summary: &Summary) -> Document {
+    let runs = usize::try_from(summary.program_runs).unwrap_or(usize::MAX);
+    let mut out = Document::new(format!(
+        "{}: {}, {} in {} time, {} of the program{}",
+        summary.machine,
+        pluralize(summary.devices, "SubDevice"),
+        seconds(summary.machine_seconds),
+        summary.time,
+        pluralize(runs, "complete run"),
+        if summary.interrupted {
+            ", interrupted"
         } else {
-            "not reset"
-        };
-        text += &format!("  group `{}` stopped, {end}: {}\n", stop.group, stop.cause);
+            ""
+        },
+    ));
+    out.gap();
+    out.table(counters(summary));
+    out.table(times(summary));
+    if let Some(thread) = &summary.thread {
+        self::thread(thread, summary.counters.cycles, &mut out);
     }
+    axes(summary, &mut out);
     if !summary.probes.is_empty() {
-        text += "\n";
+        out.gap();
     }
     for found in &summary.probes {
         let times = match found.times {
             1 => String::new(),
             n => format!(" (the last of {n})"),
         };
-        text += &format!("  step {}: {found}{times}\n", found.step);
+        out.line(format!("step {}: {found}{times}", found.step));
     }
     if !summary.errors.is_empty() {
-        text += "\n";
-        text += &errors(&summary.errors).shown(2);
-        text += "\n";
+        out.gap();
+        out.table(errors(&summary.errors));
     }
     if !summary.emergencies.is_empty() {
-        text += "\n";
-        text += &crate::render::emergencies::table(&summary.emergencies, summary.more_emergencies);
+        emergencies(&summary.emergencies, summary.more_emergencies, &mut out);
     }
     if summary.events.iter().any(|event| event.failure) {
-        text += &format!("\n{}\n", events(&summary.events));
+        out.gap();
+        let last = summary.events.len().saturating_sub(EVENTS);
+        out.table(events(&summary.events[last..]));
     }
     if let Some(frames) = summary.recorded_frames {
-        text += &format!("\n  {frames} frames recorded");
-        match summary.recorded_frames_dropped {
-            Some(dropped @ 1..) => text += &format!(", {dropped} dropped: the disk is too slow\n"),
-            _ => text += "\n",
-        }
+        let dropped = match summary.recorded_frames_dropped {
+            Some(n @ 1..) => format!(", {n} dropped: the disk is too slow"),
+            _ => String::new(),
+        };
+        out.gap();
+        out.line(format!("{frames} frames recorded{dropped}"));
     }
-    text
-}
-
-fn head(summary: &Summary) -> String {
-    let plural = |n: u64, what: &str| format!("{n} {what}{}", if n == 1 { "" } else { "s" });
-    let devices = u64::try_from(summary.devices).unwrap_or(u64::MAX);
-    format!(
-        "{}: {}, {} in {} time, {} of the program{}\n",
-        summary.machine,
-        plural(devices, "SubDevice"),
-        seconds(summary.machine_seconds),
-        summary.time,
-        plural(u64::from(summary.program_runs), "complete run"),
-        if summary.interrupted {
-            ", interrupted"
-        } else {
-            ""
-        },
-    )
+    out
 }
 
 fn seconds(s: f64) -> String {
-    format!(
-        "{:.3} s",
-        Duration::try_from_secs_f64(s)
-            .unwrap_or_default()
-            .as_secs_f64()
-    )
+    let time = Duration::try_from_secs_f64(s).unwrap_or_default();
+    format!("{:.3} s", time.as_secs_f64())
 }
 
 fn counters(summary: &Summary) -> Table {
-    let counters = &summary.counters;
+    let (counters, link) = (&summary.counters, &summary.link);
+    let mut table = Table::new("");
     let cycle = format!("of {}", duration::show(summary.cycle_ns));
-    let mut table = Table::new(&["cycles", &counters.cycles.to_string(), &cycle]);
-    for (name, count, meaning) in [
+    table.row(cells!["cycles", counters.cycles, cycle]);
+    // The first three are always shown, the others only if not zero.
+    let rows = [
         (
             "lost frames",
             counters.lost_frames,
@@ -130,55 +111,43 @@ fn counters(summary: &Summary) -> Table {
         ),
         (
             "foreign frames",
-            summary.link.foreign,
+            link.foreign,
             "of other protocols or MainDevices on this wire",
         ),
         (
             "tagged frames",
-            summary.link.tagged,
+            link.tagged,
             "with a VLAN tag, which ours never have",
         ),
         (
             "damaged frames",
-            summary.link.damaged,
+            link.damaged,
             "shorter than they say, or too long",
         ),
         (
             "dropped frames",
-            summary.link.dropped,
+            link.dropped,
             "kernel receive buffer overflow",
         ),
-    ] {
-        // The first three are always shown, the others only if not zero.
-        if count > 0
-            || matches!(
-                name,
-                "lost frames" | "late frames" | "working-counter errors"
-            )
-        {
-            table.row([
-                name,
-                &count.to_string(),
-                if count > 0 { meaning } else { "" },
-            ]);
+    ];
+    for (n, (name, count, meaning)) in rows.into_iter().enumerate() {
+        if count > 0 || n < 3 {
+            table.row(cells![name, count, if count > 0 { meaning } else { "" }]);
         }
     }
     table
 }
 
 fn times(summary: &Summary) -> Table {
-    let mut table = Table::new(&["", "p50", "p99", "p99.9", "max"]);
+    let mut table = Table::new("|p50|p99|p99.9|max");
     let mut row = |name: &str, times: &Percentiles| {
-        let show = |ns: u64| {
-            if times.count == 0 {
-                "-".to_owned()
-            } else {
-                duration::show(ns)
-            }
+        let show = |ns: u64| match times.count {
+            0 => "-".to_owned(),
+            _ => duration::show(ns),
         };
         let [p50, p99, p99_9, max] =
             [times.p50_ns, times.p99_ns, times.p99_9_ns, times.max_ns].map(show);
-        table.row([name, &p50, &p99, &p99_9, &max]);
+        table.row(cells![name, p50, p99, p99_9, max]);
     };
     row("wake-up lateness", &summary.wake_up_lateness);
     row("round trip", &summary.round_trip);
@@ -189,12 +158,13 @@ fn times(summary: &Summary) -> Table {
     table
 }
 
-/// Formats CPU time and page faults of the real-time thread.
-fn thread(thread: &ThreadSummary, cycles: u64) -> String {
+/// Adds CPU time and page faults of the real-time thread.
+fn thread(thread: &ThreadSummary, cycles: u64, out: &mut Document) {
     let used = &thread.used;
     let a_cycle = |n: u64| n as f64 / cycles.max(1) as f64;
-    let mut text = format!(
-        "\n  real-time thread: {:.1} % of its CPU, {} a cycle; {:.2} context switches a cycle, {} against its will; {} page faults{}\n",
+    out.gap();
+    out.line(format!(
+        "real-time thread: {:.1} % of its CPU, {} a cycle; {:.2} context switches a cycle, {} against its will; {} page faults{}",
         thread.load_percent,
         duration::show(a_cycle(used.cpu_ns).round() as u64),
         a_cycle(used.voluntary_switches + used.involuntary_switches),
@@ -204,116 +174,144 @@ fn thread(thread: &ThreadSummary, cycles: u64) -> String {
             0 => String::new(),
             n => format!(", {n} of them from disk"),
         },
-    );
+    ));
     let slept = &thread.sleep_lateness;
     if slept.count > 0 {
-        text += &format!(
-            "  sleeping ends late by {} (p50), {} (p99), {} (p99.9); {} are spun before a release\n",
+        out.line(format!(
+            "sleeping ends late by {} (p50), {} (p99), {} (p99.9); {} are spun before a release",
             duration::show(slept.p50_ns),
             duration::show(slept.p99_ns),
             duration::show(slept.p99_9_ns),
             duration::show(thread.spin_ns),
-        );
+        ));
     }
-    text
 }
 
-/// One row per port with errors.
-fn errors(devices: &[DeviceErrors]) -> Table {
-    let mut table = Table::new(&[
-        "SubDevice",
-        "port",
-        "invalid frames",
-        "receive errors",
-        "found bad before",
-        "lost links",
-    ]);
-    for device in devices {
-        for port in 0..4 {
-            let of_port = [
-                device.invalid_frames,
-                device.rx_errors,
-                device.forwarded,
-                device.lost_links,
-            ]
-            .map(|counters| counters[port]);
-            if of_port != [0; 4] {
-                let [invalid, rx, forwarded, lost] = of_port.map(|n| n.to_string());
-                table.row([
-                    &device.name,
-                    &port.to_string(),
-                    &invalid,
-                    &rx,
-                    &forwarded,
-                    &lost,
-                ]);
-            }
+/// Adds a row for each port whose four counters are not all zero.
+pub(super) fn port_rows(table: &mut Table, name: &str, counters: [[u8; 4]; 4]) {
+    for port in 0..4 {
+        let of_port = counters.map(|counter| counter[port]);
+        if of_port != [0; 4] {
+            let [invalid, rx, forwarded, lost] = of_port;
+            table.row(cells![name, port, invalid, rx, forwarded, lost]);
         }
+    }
+}
+
+fn errors(devices: &[DeviceErrors]) -> Table {
+    let mut table =
+        Table::new("SubDevice|port|invalid frames|receive errors|found bad before|lost links");
+    for device in devices {
+        let ports = [
+            device.invalid_frames,
+            device.rx_errors,
+            device.forwarded,
+            device.lost_links,
+        ];
+        port_rows(&mut table, &device.name, ports);
         for (what, count) in [("unit", device.processing_unit), ("PDI", device.pdi)] {
             if count > 0 {
-                table.row([&device.name, what, &count.to_string(), "", "", ""]);
+                table.row(cells![device.name, what, count, "", "", ""]);
             }
         }
     }
     table
 }
 
-/// Formats the last events before the end, with their times.
-fn events(events: &[EventLine]) -> String {
-    const SHOWN: usize = 12;
-    let mut table = Table::new(&["time", "cycle", "what the cycle noticed last"]);
-    for event in &events[events.len().saturating_sub(SHOWN)..] {
-        let cycles = if event.first_cycle == event.last_cycle {
-            event.first_cycle.to_string()
-        } else {
-            format!("{}-{}", event.first_cycle, event.last_cycle)
-        };
-        table.row([&format!("{:.3} s", event.at_s), &cycles, &event.what]);
-    }
-    table.shown(2)
-}
-
-fn axes(axes: &[AxisSummary]) -> Table {
-    let mut table = Table::new(&[
-        "axis",
-        "mode",
-        "target",
-        "final position",
-        "off by",
-        "largest following error",
-        "state",
-    ]);
-    for axis in axes {
-        let unit = &axis.unit;
-        let position = |x: f64| format!("{:.4} {unit}", positive_zero(x));
-        let cyclic_position = axis.mode == "csp" && axis.was_enabled;
-        let heard = axis.last_heard_s.is_none();
-        let only = |show: bool, text: String| if show { text } else { "-".to_owned() };
-        let off = match axis.final_error_counts {
-            Some(1) if heard => "1 count".to_owned(),
-            Some(n) if heard => format!("{n} counts"),
-            _ => "-".to_owned(),
-        };
-        table.row([
-            &axis.name,
-            &axis.mode,
-            &only(
-                cyclic_position,
-                position(axis.target_place.unwrap_or(axis.target_position)),
-            ),
-            &only(
-                axis.was_enabled && heard,
-                position(axis.final_place.unwrap_or(axis.final_position)),
-            ),
-            &off,
-            &only(cyclic_position, position(axis.largest_following_error)),
-            &match axis.last_heard_s {
-                Some(at_s) => format!("not heard since {}", seconds(at_s)),
-                None => axis.final_state.clone(),
-            },
+fn emergencies(emergencies: &[EmergencyLine], more: u64, out: &mut Document) {
+    let mut table = Table::new("time|device|emergency|register|data|what");
+    for line in emergencies {
+        let (at, register) = (
+            format!("{:.3} s", line.at_s),
+            format!("0x{:02x}", line.register),
+        );
+        let data = hex_bytes(&line.data, " ");
+        table.row(cells![
+            at,
+            line.device,
+            hex16(line.code),
+            register,
+            data,
+            line.text
         ]);
     }
+    out.gap();
+    out.table(table);
+    match more {
+        0 => {}
+        1 => out.line("1 more emergency is not kept"),
+        n => out.line(format!("{n} more emergencies are not kept")),
+    }
+}
+
+/// Returns the events of the cycle with their times.
+pub(super) fn events(events: &[EventLine]) -> Table {
+    let mut table = Table::new("time|cycle|what the cycle noticed last");
+    for event in events {
+        let (first, last) = (event.first_cycle, event.last_cycle);
+        let cycles = match first == last {
+            true => first.to_string(),
+            false => format!("{first}-{last}"),
+        };
+        table.row(cells![format!("{:.3} s", event.at_s), cycles, event.what]);
+    }
     table
+}
+
+fn axes(summary: &Summary, out: &mut Document) {
+    let mut table =
+        Table::new("axis|mode|target|final position|off by|largest following error|state");
+    for axis in &summary.axes {
+        table.row(self::axis(axis));
+    }
+    if !table.is_empty() {
+        out.gap();
+        out.table(table);
+    }
+    for axis in &summary.axes {
+        for what in [&axis.fault, &axis.trip].into_iter().flatten() {
+            out.line(format!("{}: {what}", axis.name));
+        }
+    }
+    for stop in &summary.group_stops {
+        let end = if stop.released {
+            "reset since"
+        } else {
+            "not reset"
+        };
+        out.line(format!(
+            "group `{}` stopped, {end}: {}",
+            stop.group, stop.cause
+        ));
+    }
+}
+
+fn axis(axis: &AxisSummary) -> [String; 7] {
+    let unit = &axis.unit;
+    let position = |x: f64| format!("{:.4} {unit}", positive_zero(x));
+    let cyclic_position = axis.mode == "csp" && axis.was_enabled;
+    let heard = axis.last_heard_s.is_none();
+    let only = |show: bool, text: String| if show { text } else { "-".to_owned() };
+    let target = position(axis.target_place.unwrap_or(axis.target_position));
+    let actual = position(axis.final_place.unwrap_or(axis.final_position));
+    let off = match axis.final_error_counts {
+        Some(1) if heard => "1 count".to_owned(),
+        Some(n) if heard => format!("{n} counts"),
+        _ => "-".to_owned(),
+    };
+    let state = match axis.last_heard_s {
+        Some(at_s) => format!("not heard since {}", seconds(at_s)),
+        None => axis.final_state.clone(),
+    };
+    cells![
+        axis.name,
+        axis.mode,
+        only(cyclic_position, target),
+        only(axis.was_enabled && heard, actual),
+        off,
+        only(cyclic_position, position(axis.largest_following_error)),
+        state
+    ]
 }
 
 /// Replaces negative zero, which would print as `-0.0000`.
@@ -323,8 +321,6 @@ fn positive_zero(x: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use ecaxis_master::session::EmergencyLine;
-
     use super::*;
 
     fn sample() -> Summary {
@@ -460,14 +456,14 @@ m.toml: 1 SubDevice, 12.500 s in virtual time, 2 complete runs of the program
 
   7 frames recorded
 ";
-        assert_eq!(summary(&sample()), expected);
+        assert_eq!(summary(&sample()).text(None), expected);
     }
 
     #[test]
     fn summary_shows_when_an_axis_was_last_heard() {
         let mut summary = sample();
         summary.axes[0].last_heard_s = Some(0.908);
-        let text = self::summary(&summary);
+        let text = self::summary(&summary).text(None);
         let line = text.lines().find(|line| line.starts_with("  x ")).unwrap();
         let cells: Vec<&str> = line
             .split("  ")
@@ -508,6 +504,6 @@ m.toml: 1 SubDevice, 12.500 s in virtual time, 2 complete runs of the program
   real-time thread: 5.0 % of its CPU, 50 µs a cycle; 1.01 context switches a cycle, 125 against its will; 4 page faults, 1 of them from disk
   sleeping ends late by 120 ns (p50), 1.5 µs (p99), 2 µs (p99.9); 34 µs are spun before a release
 ";
-        assert!(self::summary(&summary).contains(expected));
+        assert!(self::summary(&summary).text(None).contains(expected));
     }
 }

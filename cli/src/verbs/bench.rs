@@ -14,15 +14,14 @@ use ecaxis_master::session::Observer;
 use ecaxis_tools::bench::bus::{FaultInjection, ReplyDelay};
 use ecaxis_tools::bench::plan::{Baseline, Plan, Target, exchange_name};
 use ecaxis_tools::bench::run::{self, BenchError, BenchObserver};
-use ecaxis_tools::bench::{fixture, host, html, text, veth};
+use ecaxis_tools::bench::{document, fixture, host, veth};
 
 use crate::args::files::{check_output, unwritable};
 use crate::args::signals;
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
 use crate::render::progress::ProgressPrinter;
-use crate::render::result;
+use crate::render::{note, print_json, print_page};
 
 /// The shortest cycle that is measured in ns; most drives support no faster SYNC0.
 const SHORTEST: u64 = 20_000;
@@ -229,16 +228,19 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             "interrupted before anything was measured",
         ));
     };
-    // Serialization cannot fail: keys are text and numbers are finite.
-    let json = serde_json::to_string_pretty(&report).unwrap_or_default() + "\n";
+    let document = document(&report);
     // Print the result even if it cannot be written to a file.
-    let text = text::text(&report);
-    let shown = result(if args.json { &json } else { &text });
+    let shown = match args.json {
+        true => print_json(&report),
+        false => print_page(&document),
+    };
     if let Some(path) = &args.html {
-        save(path, &html::html(&report))?;
+        save(path, &document.html())?;
     }
     if let Some(path) = &args.save {
-        save(path, &json)?;
+        // Serialization cannot fail: keys are text and numbers are finite.
+        let json = serde_json::to_string_pretty(&report).unwrap_or_default();
+        save(path, &(json + "\n"))?;
     }
     shown?;
     if stop.load(Ordering::Relaxed) {

@@ -4,12 +4,12 @@ use std::path::{Path, PathBuf};
 
 use ecaxis_master::config::{self, ConfigError, Machine, duration};
 use ecaxis_master::text::pluralize;
+use ecaxis_tools::document::Document;
 use serde_json::json;
 
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::page;
-use crate::render::result;
+use crate::render::{print, print_json};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -30,15 +30,10 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let loaded = config::load(&args.file);
-    let text = match &loaded {
-        _ if args.json => format!("{:#}\n", as_json(&args.file, &loaded)),
-        Ok(machine) => summary(machine),
-        Err(_) => String::new(),
-    };
-    let written = if args.json {
-        result(&text)
-    } else {
-        page(&text)
+    let written = match &loaded {
+        _ if args.json => print_json(&as_json(&args.file, &loaded)),
+        Ok(machine) => print(&summary(machine)),
+        Err(_) => Ok(()),
     };
     loaded.map_err(|e| hints::config(&args.file, &e))?;
     written
@@ -85,37 +80,37 @@ pub(crate) fn problems(error: &ConfigError) -> serde_json::Value {
     each.collect()
 }
 
-fn summary(machine: &Machine) -> String {
-    let mut text = format!(
-        "{}: {}, cycle {}, {}\n",
+fn summary(machine: &Machine) -> Document {
+    let mut out = Document::new(format!(
+        "{}: {}, cycle {}, {}",
         machine.path.display(),
         pluralize(machine.devices.len(), "device"),
         duration::show(machine.bus.cycle_ns),
         pluralize(machine.steps.len(), "step"),
-    );
+    ));
     for device in &machine.devices {
         let selection = &device.selection;
         let mode = selection.mode.map_or("I/O".to_owned(), |m| m.to_string());
-        text += &format!(
-            "  {} at {}: {}, {mode}, {} out, {} in\n",
-            device.name,
-            device.at,
-            selection.device_name,
+        let (name, bytes) = (
+            &selection.device_name,
             pluralize(selection.layout.rx_bytes(), "byte"),
-            selection.layout.tx_bytes(),
         );
+        let (at, back) = (&device.at, selection.layout.tx_bytes());
+        out.line(format!(
+            "{} at {at}: {name}, {mode}, {bytes} out, {back} in",
+            device.name
+        ));
         for note in &selection.notes {
-            text += &format!("    note: {note}\n");
+            out.item("  note: ", note);
         }
         for warning in &device.esi.warnings {
-            text += &format!(
-                "    {}:{} {}: {}\n",
-                device.esi_path.display(),
-                warning.position,
-                warning.path,
-                warning.message,
+            let (file, at) = (device.esi_path.display(), warning.position);
+            out.item(
+                "  ",
+                format!("{file}:{at} {}: {}", warning.path, warning.message),
             );
         }
     }
-    text + "no problems\n"
+    out.line("no problems");
+    out
 }

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use ecaxis_master::config::{self, Machine, Nic};
 use ecaxis_master::esi_library::{self, Library};
+use ecaxis_master::text::pluralize;
 use ecaxis_tools::compare::apply::{self, ApplyError, BusSnapshot};
 use ecaxis_tools::compare::{self, Comparison, Difference};
 use ecaxis_tools::scan::{self, Scan};
@@ -13,8 +14,7 @@ use crate::args::bus::{self, Bus};
 use crate::args::files::{back_up, replace};
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::page;
-use crate::render::result;
+use crate::render::{note, page, print_json};
 use crate::verbs::scan::{ScanResult, open};
 
 const EXAMPLES: &str = "\
@@ -96,10 +96,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         .map(|difference| difference.display(&machine, &seen.scan).to_string())
         .collect();
     if args.json {
-        result(&format!(
-            "{:#}\n",
-            as_json(&machine, &comparison, &seen.scan, complete)
-        ))?;
+        print_json(&as_json(&machine, &comparison, &seen.scan, complete))?;
     } else if differences.is_empty() && comparison.unknown.is_empty() {
         page("as in the file\n")?;
     } else if differences.is_empty() {
@@ -125,11 +122,8 @@ fn load(file: &Path) -> Result<Machine, Failure> {
 }
 
 fn differs(file: &Path, count: usize) -> Failure {
-    let plural = if count == 1 { "" } else { "s" };
-    let message = format!(
-        "the bus is not as in {}: {count} difference{plural}",
-        file.display()
-    );
+    let (file, count) = (file.display(), pluralize(count, "difference"));
+    let message = format!("the bus is not as in {file}: {count}");
     Failure::new(hints::FAILED, message).hint(
         "correct the bus, or `--apply` makes the file as the bus is; what revisions may stand for others, `identity` says",
     )
@@ -231,24 +225,20 @@ fn rewrite(
     let kept = back_up(file)?;
     replace(file, &applied.text)?;
     for reported in &applied.reported {
-        crate::render::note(&format!("  {reported}"));
+        note(&format!("  {reported}"));
     }
-    crate::render::note(&format!("the old text is in {}", kept.display()));
+    note(&format!("the old text is in {}", kept.display()));
     let shown = file.display();
-    crate::render::note(&format!(
+    note(&format!(
         "{shown} matches the bus now; run `ecaxis check {shown}`"
     ));
-    let marked = applied.text.lines();
-    let marked = marked.filter(|line| line.contains(scan::write::MARK));
+    let mark = scan::write::MARK;
+    let marked = applied.text.lines().filter(|line| line.contains(mark));
     match marked.count() {
         0 => {}
-        1 => crate::render::note(&format!(
-            "1 line is marked \"{}\" and wants a look",
-            scan::write::MARK
-        )),
-        n => crate::render::note(&format!(
-            "{n} lines are marked \"{}\" and need a check",
-            scan::write::MARK
+        n => note(&format!(
+            "{} marked \"{mark}\": check each",
+            pluralize(n, "line")
         )),
     }
     Ok(())
@@ -285,31 +275,9 @@ fn as_json(machine: &Machine, comparison: &Comparison, scan: &Scan, complete: bo
         .differences
         .iter()
         .map(|difference| {
-            let (kind, devices, positions) = match difference {
-                Difference::Missing { device } => ("missing", vec![*device], vec![]),
-                Difference::Added { position } => ("added", vec![], vec![*position]),
-                Difference::Swapped { devices, positions } => {
-                    ("swapped", devices.to_vec(), positions.to_vec())
-                }
-                Difference::Moved { device, to, .. } => ("moved", vec![*device], vec![*to]),
-                Difference::Revision {
-                    device, position, ..
-                } => ("revision", vec![*device], vec![*position]),
-                Difference::Alias {
-                    device, position, ..
-                } => ("alias", vec![*device], vec![*position]),
-                Difference::Serial {
-                    device, position, ..
-                } => ("serial", vec![*device], vec![*position]),
-                Difference::Modules {
-                    device, position, ..
-                } => ("modules", vec![*device], vec![*position]),
-                Difference::Parameter {
-                    device, position, ..
-                } => ("parameter", vec![*device], vec![*position]),
-            };
+            let (devices, positions) = difference.location();
             json!({
-                "kind": kind,
+                "kind": difference.kind(),
                 "devices": devices.into_iter().map(name).collect::<Vec<_>>(),
                 "positions": positions,
                 "text": difference.display(machine, scan).to_string(),

@@ -9,9 +9,7 @@ use ecaxis_tools::doctor::{self, Host, Measurements, RunProfile, Severity, ethto
 
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::result;
-use crate::render::stderr_is_terminal;
+use crate::render::{note, print_json, print_page, stderr_is_terminal};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -79,14 +77,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         wake_up: measure(args.seconds, &host, &intent)?,
     };
     let report = doctor::examine(&host, &intent, tried);
-    let text = if args.json {
-        let json = serde_json::to_string_pretty(&report);
-        json.map_err(|e| Failure::new(hints::FAILED, format!("cannot write the result: {e}")))?
-            + "\n"
-    } else {
-        report.to_string()
-    };
-    result(&text)?;
+    match args.json {
+        true => print_json(&report)?,
+        false => print_page(&report.document())?,
+    }
     match report.count(Severity::Bad) {
         0 => Ok(()),
         1 => Err(Failure::new(hints::FAILED, "one finding is bad")),

@@ -8,6 +8,7 @@ use ecaxis_esi::sii::{self, Sii};
 use ecaxis_master::acyclic::eeprom::{Eeprom, EepromAccess, size_of, with_eeprom};
 use ecaxis_master::acyclic::image::{category, with_alias, with_category, write};
 use ecaxis_master::acyclic::{DatagramClient, ServiceError};
+use ecaxis_master::text::pluralize;
 use serde_json::json;
 
 use crate::args::Verbosity;
@@ -16,8 +17,7 @@ use crate::args::device::{DeviceArgs, DeviceError, OpenDevice, counter};
 use crate::args::files::write_new;
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::result;
+use crate::render::{note, print_json, result};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -296,11 +296,10 @@ fn verify(args: &VerifyArgs) -> Result<(), Failure> {
         problems.extend(differing(&longer, image, path));
     }
     if args.json {
-        let report = json!({
+        print_json(&json!({
             "ok": problems.is_empty(), "device": device.name, "position": device.position,
             "bytes": there.len(), "problems": problems, "remarks": remarks,
-        });
-        result(&format!("{report:#}\n"))?;
+        }))?;
     } else {
         for line in problems.iter().chain(&remarks) {
             result(&format!("{line}\n"))?;
@@ -388,11 +387,8 @@ async fn burn(
         Ok(half?)
     });
     let written = done.await?;
-    let words = if written == 1 { "word" } else { "words" };
-    Ok(format!(
-        "{}: {written} {words} written and read back",
-        at.device
-    ))
+    let (device, words) = (&at.device, pluralize(written, "word"));
+    Ok(format!("{device}: {words} written and read back"))
 }
 
 /// Runs `work` on the EEPROM, then returns the EEPROM to its previous owner.

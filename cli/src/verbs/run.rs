@@ -17,11 +17,9 @@ use crate::args::signals;
 use crate::hints;
 use crate::hints::Failure;
 use crate::render::fault_report::{self, ReportDestination};
-use crate::render::note;
-use crate::render::page;
 use crate::render::progress::ProgressPrinter;
 use crate::render::report;
-use crate::render::result;
+use crate::render::{note, print, print_json};
 use crate::verbs::check;
 
 const EXAMPLES: &str = "\
@@ -146,23 +144,19 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if let (Some(story), Some(failure)) = (&story, &mut failure) {
         print_fault_report(args, story, failure, &nic);
     }
-    let text = if args.json {
-        let report = json!({
+    let written = if args.json {
+        print_json(&json!({
             "ok": failure.is_none(),
             "error": failure.as_ref().map(|f| &f.message),
             "hints": failure.as_ref().map_or(&[][..], |f| &f.hints),
             "problems": [],
             "summary": summary,
             "story": story,
-        });
-        format!("{report:#}\n")
+        }))
     } else {
-        summary.as_ref().map(report::summary).unwrap_or_default()
-    };
-    let written = if args.json {
-        result(&text)
-    } else {
-        page(&text)
+        summary
+            .as_ref()
+            .map_or(Ok(()), |summary| print(&report::summary(summary)))
     };
     failure.map_or(written, Err)
 }
@@ -225,11 +219,10 @@ fn print_fault_report(args: &Args, story: &FaultReport, failure: &mut Failure, n
 /// Prints the failure as JSON if `--json` was given.
 fn print_failure(args: &Args, error: &str, hints: &[String], problems: Value) {
     if args.json {
-        let report = json!({
-            "ok": false, "error": error, "hints": hints, "problems": problems, "summary": null,
-        });
         // Ignored: the caller prints the failure on stderr and sets the exit code.
-        let _ = result(&format!("{report:#}\n"));
+        let _ = print_json(&json!({
+            "ok": false, "error": error, "hints": hints, "problems": problems, "summary": null,
+        }));
     }
 }
 
@@ -344,7 +337,7 @@ mod tests {
         outcome.result.unwrap();
         let summary = outcome.summary.unwrap();
         (
-            report::summary(&summary),
+            report::summary(&summary).text(None),
             serde_json::to_string(&summary).unwrap(),
         )
     }

@@ -24,7 +24,6 @@ pub struct SiiWarning {
 /// A problem of a readable EEPROM image.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
-#[non_exhaustive]
 pub enum WarningKind {
     /// The checksum is wrong, so a controller ignores the configuration.
     Checksum {

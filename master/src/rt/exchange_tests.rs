@@ -1,7 +1,7 @@
 use super::*;
 use crate::link::MAX_FRAME;
-use ecaxis_ecat::datagram::Command;
 use crate::rt::image::{ProcessData, plan};
+use ecaxis_ecat::datagram::Command;
 use proptest::prelude::*;
 
 use super::frame::FIRST_DATAGRAM;

@@ -8,7 +8,7 @@
 //! - `cycle`, `clocks`, `axes`: process data, distributed clocks, CiA 402;
 //! - `context`: machine file and ESI files;
 //! - `events`, `values`: events as text;
-//! - `report`: the [`Report`]; `html`, `plot`: an HTML page with plots.
+//! - `report`: the [`Report`]; [`document`](fn@document): the report for readers.
 
 use std::io::Read;
 
@@ -19,26 +19,23 @@ mod axes;
 mod clocks;
 mod context;
 mod cycle;
+mod document;
 mod eeprom;
 mod events;
-mod html;
 mod mailbox;
 mod match_frames;
 mod objects;
-mod plot;
 mod registers;
 mod report;
 mod segment;
 mod values;
 
 pub use context::{Context, library};
-pub use html::html;
+pub use document::document;
 pub use report::{
     AxisReport, ClockReport, ClocksReport, CycleReport, DeviceReport, FileReport, Line, Report,
     SyncManagerReport, TransferReport, WkcRun, called, highest,
 };
-
-pub use crate::html::time;
 
 use match_frames::Pairing;
 use segment::Segment;

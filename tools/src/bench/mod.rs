@@ -10,14 +10,14 @@
 //! - [`exchange`]: the round-trip cost of a frame;
 //! - [`plan`], [`run`]: the variants and their rounds; [`peer`]: another MainDevice; [`machine`]:
 //!   the bus of a machine file; [`host`]: the computer;
-//! - [`report`], [`caveats`], [`text`], [`html`]: the result and its limits.
+//! - [`report`], [`caveats`], [`document`](fn@document): the result and its limits.
 
 pub mod bus;
 pub mod caveats;
+mod document;
 pub mod exchange;
 pub mod fixture;
 pub mod host;
-pub mod html;
 pub mod kernel;
 pub mod machine;
 pub mod measure;
@@ -26,7 +26,7 @@ pub mod plan;
 pub mod report;
 pub mod run;
 pub mod segment;
-mod svg;
-pub mod text;
 pub mod veth;
 pub mod wakeup;
+
+pub use document::document;

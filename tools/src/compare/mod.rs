@@ -358,6 +358,48 @@ fn modules(
 }
 
 impl Difference {
+    /// Returns the stable name of the kind.
+    #[must_use]
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Missing { .. } => "missing",
+            Self::Added { .. } => "added",
+            Self::Swapped { .. } => "swapped",
+            Self::Moved { .. } => "moved",
+            Self::Revision { .. } => "revision",
+            Self::Alias { .. } => "alias",
+            Self::Serial { .. } => "serial",
+            Self::Modules { .. } => "modules",
+            Self::Parameter { .. } => "parameter",
+        }
+    }
+
+    /// Returns the indices of the devices in the file and their positions on the bus.
+    #[must_use]
+    pub fn location(&self) -> (Vec<usize>, Vec<u16>) {
+        match self {
+            Self::Missing { device } => (vec![*device], vec![]),
+            Self::Added { position } => (vec![], vec![*position]),
+            Self::Swapped { devices, positions } => (devices.to_vec(), positions.to_vec()),
+            Self::Moved { device, to, .. } => (vec![*device], vec![*to]),
+            Self::Revision {
+                device, position, ..
+            }
+            | Self::Alias {
+                device, position, ..
+            }
+            | Self::Serial {
+                device, position, ..
+            }
+            | Self::Modules {
+                device, position, ..
+            }
+            | Self::Parameter {
+                device, position, ..
+            } => (vec![*device], vec![*position]),
+        }
+    }
+
     /// Returns the difference as text.
     #[must_use]
     pub fn display<'a>(&'a self, machine: &'a Machine, scan: &'a Scan) -> impl fmt::Display + 'a {

@@ -2,13 +2,17 @@
 
 use std::fmt::{self, Display, Formatter};
 
-use super::wakeup::{WaitMethod, WakeUp};
+use super::wakeup::WakeUp;
 use super::{Finding, Fix, Report, Severity};
+use crate::cells;
+use crate::document::format::{or_dash, time};
+use crate::document::{Document, Table};
 use ecaxis_master::config::duration;
+use ecaxis_master::text::pluralize;
 
 const COLUMNS: usize = 80;
 /// The column of a finding's text, after the labels.
-const INDENT: usize = 11;
+const LABEL: usize = 11;
 /// The maximum length of a name from a file.
 const LONGEST_NAME: usize = 40;
 /// The maximum length of a finding or a fact.
@@ -34,21 +38,6 @@ fn limited(text: &str, most: usize) -> String {
     text
 }
 
-/// Breaks words into lines of at most `width` characters. A longer word gets its own line.
-fn lines(words: impl Iterator<Item = String>, width: usize) -> Vec<String> {
-    let mut lines: Vec<String> = Vec::new();
-    for word in words {
-        match lines.last_mut() {
-            Some(line) if line.chars().count() + 1 + word.chars().count() <= width => {
-                line.push(' ');
-                *line += &word;
-            }
-            _ => lines.push(word),
-        }
-    }
-    lines
-}
-
 /// Splits a command into words, but not inside quotation marks.
 fn shell_words(command: &str) -> Vec<String> {
     let mut words = vec![String::new()];
@@ -70,31 +59,26 @@ fn shell_words(command: &str) -> Vec<String> {
     words
 }
 
-/// Prints a label and the text next to it.
-fn labelled(f: &mut Formatter<'_>, label: &str, lines: &[String]) -> fmt::Result {
-    for (n, line) in lines.iter().enumerate() {
-        let label = if n == 0 { label } else { "" };
-        let line = format!("  {label:<w$}{line}", w = INDENT - 2);
-        writeln!(f, "{}", line.trim_end())?;
-    }
-    Ok(())
-}
-
-fn prose(f: &mut Formatter<'_>, label: &str, text: &str) -> fmt::Result {
-    let words = text.split_whitespace().map(str::to_owned);
-    labelled(f, label, &lines(words, COLUMNS - INDENT))
-}
-
-fn command(f: &mut Formatter<'_>, label: &str, command: &str) -> fmt::Result {
+/// Breaks a command between its words; all but the last line end with a backslash.
+fn command(text: &str) -> String {
     // Room for the line continuation.
-    let mut all = lines(shell_words(command).into_iter(), COLUMNS - INDENT - 4);
-    let last = all.len().saturating_sub(1);
-    for (n, line) in all.iter_mut().enumerate() {
-        let deeper = if n == 0 { "" } else { "  " };
-        let goes_on = if n < last { " \\" } else { "" };
-        *line = format!("{deeper}{line}{goes_on}");
+    let width = COLUMNS - LABEL - 4;
+    let mut out = String::new();
+    let mut used = 0;
+    for word in shell_words(text) {
+        let len = word.chars().count();
+        match used {
+            0 => {}
+            _ if used + 1 + len > width => {
+                out += " \\\n  ";
+                used = 0;
+            }
+            _ => out.push(' '),
+        }
+        used += len + usize::from(used > 0);
+        out += &word;
     }
-    labelled(f, label, &all)
+    out
 }
 
 impl Display for Severity {
@@ -107,159 +91,112 @@ impl Display for Severity {
     }
 }
 
-impl Display for Finding {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let words = format!("{}: {}", self.severity, self.found);
-        let words = words.split_whitespace().map(str::to_owned);
-        for (n, line) in lines(words, COLUMNS - 2).iter().enumerate() {
-            writeln!(f, "{}{line}", if n == 0 { "" } else { "  " })?;
+impl Finding {
+    fn add_to(&self, out: &mut Document) {
+        out.heading(format!("{}: {}", self.severity, self.found));
+        let fixes = self.fix.iter().map(|fix| match fix {
+            Fix::Now(line) => ("now", command(line)),
+            Fix::Lasting(line) => ("for good", command(line)),
+            Fix::Advice(text) => ("fix", text.clone()),
+        });
+        for (label, text) in std::iter::once(("cost", self.cost.clone())).chain(fixes) {
+            out.item(format!("{label:<w$}", w = LABEL - 2), text);
         }
-        prose(f, "cost", &self.cost)?;
-        for fix in &self.fix {
-            match fix {
-                Fix::Now(line) => command(f, "now", line)?,
-                Fix::Lasting(line) => command(f, "for good", line)?,
-                Fix::Advice(text) => prose(f, "fix", text)?,
-            }
+    }
+}
+
+impl Report {
+    /// Returns the report for readers.
+    #[must_use]
+    pub fn document(&self) -> Document {
+        let intent = &self.intent;
+        let nic = intent.nic.as_deref().unwrap_or("no interface");
+        let cpu = intent.cpu;
+        let cpu = cpu.map_or("any CPU".to_owned(), |cpu| format!("CPU {cpu}"));
+        let (priority, cycle) = (intent.priority, duration::show(intent.cycle_ns));
+        let mut out = Document::new(format!("{nic}, {cpu}, priority {priority}, cycle {cycle}"));
+        out.gap();
+        let mut facts = Table::new("");
+        for fact in &self.facts {
+            facts.row(cells![fact.name, fact.value]);
         }
-        Ok(())
+        out.table(facts);
+        if let Some(wake_up) = &self.wake_up {
+            wake_up.add_to(&mut out);
+        }
+        for finding in &self.findings {
+            finding.add_to(&mut out);
+        }
+        let count = |severity| self.count(severity);
+        let warnings = pluralize(count(Severity::Warning), "warning");
+        let notes = pluralize(count(Severity::Note), "note");
+        out.heading(format!("{} bad, {warnings}, {notes}", count(Severity::Bad)));
+        out
     }
 }
 
 impl Display for Report {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let intent = &self.intent;
-        let what = [
-            intent
-                .nic
-                .clone()
-                .unwrap_or_else(|| "no interface".to_owned()),
-            intent
-                .cpu
-                .map_or("any CPU".to_owned(), |cpu| format!("CPU {cpu}")),
-            format!("priority {}", intent.priority),
-            format!("cycle {}", duration::show(intent.cycle_ns)),
-        ];
-        writeln!(f, "{}\n", what.join(", "))?;
-        let widest = self
-            .facts
-            .iter()
-            .map(|fact| fact.name.chars().count())
-            .max();
-        let at = widest.unwrap_or(0) + 4;
-        for fact in &self.facts {
-            let words = fact.value.split_whitespace().map(str::to_owned);
-            for (n, line) in lines(words, COLUMNS - at).iter().enumerate() {
-                let name = if n == 0 { fact.name } else { "" };
-                writeln!(f, "  {name:<w$}{line}", w = at - 2)?;
-            }
-        }
-        if let Some(wake_up) = &self.wake_up {
-            write!(f, "\n{wake_up}")?;
-        }
-        for finding in &self.findings {
-            write!(f, "\n{finding}")?;
-        }
-        let count = |severity, one: &str, more: &str| {
-            let n = self.count(severity);
-            format!("{n} {}", if n == 1 { one } else { more })
-        };
-        writeln!(
-            f,
-            "\n{}, {}, {}",
-            count(Severity::Bad, "bad", "bad"),
-            count(Severity::Warning, "warning", "warnings"),
-            count(Severity::Note, "note", "notes"),
-        )
+        f.write_str(&self.document().text(Some(COLUMNS)))
     }
 }
 
-impl Display for WakeUp {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let fifo = self.denials.is_empty();
-        writeln!(
-            f,
-            "Wake-up lateness in {} s, every {} in turns, {}{}:",
-            self.seconds,
-            duration::show(self.cycle_ns),
-            if fifo {
-                format!("SCHED_FIFO {}", self.priority)
-            } else {
-                "with restrictions".to_owned()
-            },
-            self.cpu.map_or(String::new(), |cpu| format!(", CPU {cpu}")),
-        )?;
-        writeln!(
-            f,
-            "  {:<12} {:>9} {:>9} {:>9} {:>9} {:>10} {:>7}",
-            "", "p50", "p99", "p99.9", "max", "interrupts", "stolen"
-        )?;
-        way(f, "sleep", &self.sleep)?;
-        way(f, "sleep + spin", &self.sleep_and_spin)?;
-        for (name, way) in [
+impl WakeUp {
+    fn add_to(&self, out: &mut Document) {
+        let policy = match self.denials.is_empty() {
+            true => format!("SCHED_FIFO {}", self.priority),
+            false => "with restrictions".to_owned(),
+        };
+        let cpu = self.cpu.map_or(String::new(), |cpu| format!(", CPU {cpu}"));
+        let (seconds, cycle) = (self.seconds, duration::show(self.cycle_ns));
+        out.heading(format!(
+            "Wake-up lateness in {seconds} s, every {cycle} in turns, {policy}{cpu}:"
+        ));
+        let mut table = Table::new("|p50|p99|p99.9|max|interrupts|stolen");
+        let methods = [
             ("sleep", &self.sleep),
             ("sleep + spin", &self.sleep_and_spin),
-        ] {
-            if way.involuntary_switches > 0 {
-                let text = format!(
+        ];
+        for (name, method) in methods {
+            let late = &method.lateness;
+            let [p50, p99, p99_9, max] =
+                [late.p50_ns, late.p99_ns, late.p99_9_ns, late.max_ns].map(time);
+            let stolen = method.stolen_ms.map(|ms| format!("{ms} ms"));
+            let interrupts = or_dash(method.interrupts);
+            table.row(cells![
+                name,
+                p50,
+                p99,
+                p99_9,
+                max,
+                interrupts,
+                or_dash(stolen)
+            ]);
+        }
+        out.table(table);
+        for (name, method) in methods {
+            if method.involuntary_switches > 0 {
+                out.line(format!(
                     "{name}: taken off its CPU {} times by threads of higher priority or throttling",
-                    way.involuntary_switches
-                );
-                prose_at(f, &text)?;
+                    method.involuntary_switches
+                ));
             }
         }
         for denial in &self.denials {
-            prose_at(f, denial)?;
+            out.line(denial);
         }
         let (most, all) = self.good_for();
         let cycle = |cycle: Option<u64>| match cycle {
             Some(cycle) => format!("cycles from {}", duration::show(cycle)),
             None => "no usual cycle".to_owned(),
         };
-        prose_at(
-            f,
-            &format!(
-                "The cycle waits by sleep + spin. If it may lose a quarter of its time to that, 99.9 % of these {} wake-ups would do for {}, all of them for {}. Rarer delays do not show in {} s: measure with the machine's usual load and `--seconds 600` before relying on it.",
-                self.sleep_and_spin.lateness.count,
-                cycle(most),
-                cycle(all),
-                self.seconds,
-            ),
-        )
-    }
-}
-
-fn prose_at(f: &mut Formatter<'_>, text: &str) -> fmt::Result {
-    let words = text.split_whitespace().map(str::to_owned);
-    for line in lines(words, COLUMNS - 2) {
-        writeln!(f, "  {line}")?;
-    }
-    Ok(())
-}
-
-fn way(f: &mut Formatter<'_>, name: &str, way: &WaitMethod) -> fmt::Result {
-    let or = |n: Option<u64>, unit: &str| n.map_or("-".to_owned(), |n| format!("{n}{unit}"));
-    let l = &way.lateness;
-    writeln!(
-        f,
-        "  {name:<12} {:>9} {:>9} {:>9} {:>9} {:>10} {:>7}",
-        time(l.p50_ns),
-        time(l.p99_ns),
-        time(l.p99_9_ns),
-        time(l.max_ns),
-        or(way.interrupts, ""),
-        or(way.stolen_ms, " ms"),
-    )
-}
-
-/// Formats a time with about three digits.
-fn time(ns: u64) -> String {
-    let micros = ns as f64 / 1e3;
-    match ns {
-        0..1_000 => format!("{ns} ns"),
-        1_000..100_000 => format!("{micros:.1} µs"),
-        100_000..10_000_000 => format!("{micros:.0} µs"),
-        _ => format!("{:.1} ms", micros / 1e3),
+        out.line(format!(
+            "The cycle waits by sleep + spin. If it may lose a quarter of its time to that, 99.9 % of these {} wake-ups would do for {}, all of them for {}. Rarer delays do not show in {} s: measure with the machine's usual load and `--seconds 600` before relying on it.",
+            self.sleep_and_spin.lateness.count,
+            cycle(most),
+            cycle(all),
+            self.seconds,
+        ));
     }
 }
 
@@ -296,7 +233,9 @@ warning: one thing is found here that takes more than one line to say, because
              word | sudo tee /etc/x
   fix      Or not.
 ";
-        assert_eq!(finding.to_string(), expected);
+        let mut document = Document::default();
+        finding.add_to(&mut document);
+        assert_eq!(document.text(Some(COLUMNS)), expected);
     }
 
     #[test]

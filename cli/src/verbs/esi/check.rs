@@ -1,6 +1,5 @@
 //! `ecaxis esi check`: lists all problems in an ESI file.
 
-use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use ecaxis_esi::{Finding, Severity, lint};
@@ -9,9 +8,7 @@ use serde_json::json;
 
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::page;
-use crate::render::result;
+use crate::render::{note, page, print_json};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -35,30 +32,17 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let findings = lint(&file);
     let count = |severity| findings.iter().filter(|f| f.severity == severity).count();
     let errors = count(Severity::Error);
-    let text = if args.json {
-        let findings: Vec<_> = findings.iter().map(as_json).collect();
-        format!("{:#}\n", json!({ "ok": errors == 0, "findings": findings }))
-    } else {
-        let mut text = String::new();
-        for f in &findings {
-            // Writing into a String cannot fail.
-            let _ = writeln!(
-                text,
-                "{}:{}: {}: {}: {}",
-                place(&args.file, f.file.as_deref()).display(),
-                f.position,
-                f.severity,
-                f.path,
-                f.message
-            );
-        }
-        text
-    };
     if args.json {
-        result(&text)
+        let findings: Vec<_> = findings.iter().map(as_json).collect();
+        print_json(&json!({ "ok": errors == 0, "findings": findings }))?;
     } else {
-        page(&text)
-    }?;
+        let lines = findings.iter().map(|f| {
+            let file = place(&args.file, f.file.as_deref());
+            let (file, at, severity) = (file.display(), f.position, f.severity);
+            format!("{file}:{at}: {severity}: {}: {}\n", f.path, f.message)
+        });
+        page(&lines.collect::<String>())?;
+    }
     let devices = pluralize(file.devices.len(), "device");
     let mut warnings = pluralize(count(Severity::Warning), "warning");
     match count(Severity::Note) {

@@ -4,14 +4,14 @@ use std::path::PathBuf;
 
 use ecaxis_esi::sii::{self, Difference, DifferenceKind, Sii, SiiOptions};
 use ecaxis_master::text::pluralize;
+use ecaxis_tools::cells;
+use ecaxis_tools::document::Table;
 use serde_json::json;
 
 use super::DeviceArgs;
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::report::Table;
-use crate::render::result;
+use crate::render::{note, print_json, print_table};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -52,16 +52,17 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     for warning in warnings.iter().filter(|_| !args.json) {
         note(&format!("warning: {name}: {warning}"));
     }
-    let text = if args.json {
+    if args.json {
         let all: Vec<_> = differences.iter().map(as_json).collect();
-        format!(
-            "{:#}\n",
-            json!({ "device": device.name, "differences": all, "warnings": warnings })
-        )
-    } else {
-        table(&differences)
-    };
-    result(&text)?;
+        let device = &device.name;
+        print_json(&json!({ "device": device, "differences": all, "warnings": warnings }))?;
+    } else if !differences.is_empty() {
+        let mut table = Table::new("of|field|ESI|image");
+        for d in &differences {
+            table.row(cells![aspect(d.aspect), d.field, d.expected, d.found]);
+        }
+        print_table(&table)?;
+    }
     let count = |aspect| differences.iter().filter(|d| d.aspect == aspect).count();
     let (identity, behaviour) = (
         count(DifferenceKind::Identity),
@@ -95,17 +96,6 @@ fn device<'e>(
         Some(device) => Ok(device),
         None => which.device(file),
     }
-}
-
-fn table(differences: &[Difference]) -> String {
-    if differences.is_empty() {
-        return String::new();
-    }
-    let mut table = Table::new(&["of", "field", "ESI", "image"]);
-    for d in differences {
-        table.row([aspect(d.aspect), &d.field, &d.expected, &d.found]);
-    }
-    table.shown(0) + "\n"
 }
 
 fn aspect(aspect: DifferenceKind) -> &'static str {

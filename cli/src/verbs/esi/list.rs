@@ -4,13 +4,13 @@ use std::path::PathBuf;
 
 use ecaxis_esi::Identity;
 use ecaxis_master::esi_library::{self, Library, LoadError, RevisionMatch};
-use serde_json::json;
+use ecaxis_tools::cells;
+use ecaxis_tools::document::Table;
+use ecaxis_tools::document::format::hex32;
 
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::report::Table;
-use crate::render::result;
+use crate::render::{note, print_json, print_table};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -73,24 +73,20 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         }
     };
     if args.json {
-        return result(&format!("{:#}\n", json!(entries)));
+        return print_json(&entries);
     }
     if entries.is_empty() {
         let message = format!("{} describes no such device", library.folder().display());
         return Err(Failure::new(hints::WRONG, message).hint(vendors(&library)));
     }
-    let mut table = Table::new(&["vendor", "product", "revision", "type", "name", "file"]);
+    let mut table = Table::new("vendor|product|revision|type|name|file");
     for e in &entries {
-        table.row([
-            &format!("0x{:08x} {}", e.vendor, e.vendor_name),
-            &format!("0x{:08x}", e.product),
-            &format!("0x{:08x}", e.revision),
-            &e.type_name,
-            &e.name,
-            &e.file.display().to_string(),
-        ]);
+        let vendor = format!("{} {}", hex32(e.vendor), e.vendor_name);
+        let (product, revision) = (hex32(e.product), hex32(e.revision));
+        let file = e.file.display();
+        table.row(cells![vendor, product, revision, e.type_name, e.name, file]);
     }
-    result(&(table.shown(0) + "\n"))
+    print_table(&table)
 }
 
 /// Lists the vendors in the library.

@@ -1,15 +1,17 @@
 //! `ecaxis esi objects`: shows the object dictionary of a device.
 
 use ecaxis_esi::{
-    Bytes, Dictionary, Mode, ObjectItem, PdoMapping, SelectOptions, Writable, address, select,
+    Dictionary, Mode, ObjectItem, PdoMapping, SelectOptions, Writable, address, select,
 };
-use serde_json::json;
+use ecaxis_tools::cells;
+use ecaxis_tools::document::Table;
+use ecaxis_tools::document::format::hex_bytes;
+use serde::Serialize;
 
 use super::DeviceArgs;
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::report::Table;
-use crate::render::result;
+use crate::render::{print_json, print_table};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -50,53 +52,64 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::new(hints::WRONG, message)
             .hint("`ecaxis esi show` has the objects in its PDOs"));
     }
-    result(&listed(&dictionary, args.json))
+    list(&dictionary, args.json)
 }
 
-/// Formats every subindex as a table or as JSON.
-pub(crate) fn listed(dictionary: &Dictionary, json: bool) -> String {
-    let mut table = Table::new(&[
-        "object", "type", "bits", "access", "PDO", "default", "min", "max", "name",
-    ]);
+/// One subindex.
+#[derive(Debug, Serialize)]
+struct Entry<'d> {
+    index: u16,
+    sub: u8,
+    name: &'d str,
+    object: &'d str,
+    #[serde(rename = "type")]
+    type_name: &'d str,
+    bits: u32,
+    access: String,
+    pdo: &'static str,
+    default: String,
+    min: String,
+    max: String,
+}
+
+/// Prints every subindex as a table or as JSON.
+pub(crate) fn list(dictionary: &Dictionary, json: bool) -> Result<(), Failure> {
+    let mut table = Table::new("object|type|bits|access|PDO|default|min|max|name");
     let mut all = Vec::new();
     for object in &dictionary.objects {
         for item in &object.items {
-            let name = if object.items.len() > 1 && item.sub > 0 {
-                format!("  {}", item.name)
-            } else {
-                object.name.to_string()
-            };
-            let index = address(object.index, item.sub).to_string();
             let shown = |bytes: &[u8]| value(&item.type_name, bytes);
-            let default = if item.has_default {
-                shown(&item.default)
-            } else {
-                String::new()
+            let shown = |bytes: Option<&[u8]>| bytes.map_or_else(String::new, shown);
+            let e = Entry {
+                index: object.index,
+                sub: item.sub,
+                name: &item.name,
+                object: &object.name,
+                type_name: &item.type_name,
+                bits: item.bit_len,
+                access: access(item),
+                pdo: mapping(item.pdo_mapping),
+                default: shown(item.has_default.then_some(&item.default)),
+                min: shown(item.min.as_deref()),
+                max: shown(item.max.as_deref()),
             };
-            let edge = |bytes: &Option<Bytes>| bytes.as_deref().map_or_else(String::new, shown);
-            let (min, max) = (edge(&item.min), edge(&item.max));
-            all.push(json!({
-                "index": object.index, "sub": item.sub, "name": &*item.name, "object": &*object.name,
-                "type": &*item.type_name, "bits": item.bit_len, "access": access(item),
-                "pdo": mapping(item.pdo_mapping), "default": default, "min": min, "max": max,
-            }));
-            table.row([
-                &index,
-                &item.type_name,
-                &item.bit_len.to_string(),
-                &access(item),
-                mapping(item.pdo_mapping),
-                &default,
-                &min,
-                &max,
-                &name,
+            let name = match object.items.len() > 1 && item.sub > 0 {
+                true => format!("  {}", item.name),
+                false => object.name.to_string(),
+            };
+            let at = address(e.index, e.sub);
+            let (ty, bits) = (e.type_name, e.bits);
+            table.row(cells![
+                at, ty, bits, e.access, e.pdo, e.default, e.min, e.max, name
             ]);
+            all.push(e);
         }
     }
     if json {
-        return format!("{:#}\n", serde_json::Value::Array(all));
+        print_json(&all)
+    } else {
+        print_table(&table)
     }
-    table.shown(0) + "\n"
 }
 
 fn access(item: &ObjectItem) -> String {
@@ -140,9 +153,8 @@ fn value(type_name: &str, bytes: &[u8]) -> String {
     match (bytes.len(), wide.get_mut(..bytes.len())) {
         (1..=8, Some(low)) => low.copy_from_slice(bytes),
         _ => {
-            let hex: Vec<String> = bytes.iter().take(8).map(|b| format!("{b:02x}")).collect();
             let more = if bytes.len() > 8 { " …" } else { "" };
-            return hex.join(" ") + more;
+            return hex_bytes(bytes.iter().take(8), " ") + more;
         }
     }
     let raw = u64::from_le_bytes(wide);

@@ -1,18 +1,16 @@
 //! An axis in `ecaxis explain`: units and their origin, limits, loops, supervision, homing.
 
-use std::fmt::Write;
-
 use ecaxis_axis::Mode;
 use ecaxis_axis::StopMethod;
 use ecaxis_axis::homing;
 use ecaxis_axis::scale::ModuloDirection;
 use ecaxis_axis::supervision::FaultReset;
 use ecaxis_master::config::{AxisSetup, HomingSetup, TorqueUnit, UnitSource, duration};
+use ecaxis_tools::cells;
+use ecaxis_tools::document::Table;
 
-use crate::render::report::Table;
-
-pub(super) fn axis(axis: &AxisSetup, out: &mut String) -> std::fmt::Result {
-    let mut table = Table::new(&["axis", "value", "from"]);
+pub(super) fn axis(axis: &AxisSetup) -> Table {
+    let mut table = Table::new("axis|value|from");
     units(axis, &mut table);
     limits(axis, &mut table);
     loops(axis, &mut table);
@@ -20,7 +18,7 @@ pub(super) fn axis(axis: &AxisSetup, out: &mut String) -> std::fmt::Result {
     if let Some(homing) = &axis.homing {
         self::homing(homing, &axis.unit, &mut table);
     }
-    writeln!(out, "\n{}", table.shown(2))
+    table
 }
 
 /// Rounds to six significant digits.
@@ -45,17 +43,17 @@ fn from(from: UnitSource, key: &'static str, object: &str) -> String {
 fn units(axis: &AxisSetup, table: &mut Table) {
     let (scale, unit) = (&axis.config.scale, &axis.unit);
     let counts = format!("{} counts a motor turn", scale.counts_per_turn());
-    table.row(["encoder", &counts, "`encoder`, held against 0x608F"]);
+    table.row(cells!["encoder", counts, "`encoder`, held against 0x608F"]);
     let way = format!("{} {unit} a motor turn", rounded(scale.units_per_turn()));
-    table.row(["per turn", &way, "`per_turn`, or `feed` and `gear`"]);
+    table.row(cells!["per turn", way, "`per_turn`, or `feed` and `gear`"]);
     let counts = format!("1 {unit} = {} counts", rounded(scale.counts_per_unit()));
-    table.row(["position", &counts, "encoder and way per turn"]);
+    table.row(cells!["position", counts, "encoder and way per turn"]);
     if scale.inverted() {
-        table.row(["direction", "inverted", "`invert`"]);
+        table.row(cells!["direction", "inverted", "`invert`"]);
     }
     if scale.offset() != 0.0 {
         let offset = format!("{} {unit} at count 0", scale.offset());
-        table.row(["offset", &offset, "`offset`"]);
+        table.row(cells!["offset", offset, "`offset`"]);
     }
     if let Some(length) = scale.modulo() {
         let way = match axis.way {
@@ -63,10 +61,10 @@ fn units(axis: &AxisSetup, table: &mut Table) {
             ModuloDirection::Negative => "always backwards",
             _ => "the shorter way",
         };
-        table.row([
+        table.row(cells![
             "modulo",
-            &format!("{length} {unit}, {way}"),
-            "`modulo`, `way`",
+            format!("{length} {unit}, {way}"),
+            "`modulo`, `way`"
         ]);
     }
     let velocity = format!(
@@ -75,31 +73,31 @@ fn units(axis: &AxisSetup, table: &mut Table) {
         rounded(scale.velocity_resolution())
     );
     let origin = from(axis.velocity_unit_from, "velocity_unit", "0x60A9");
-    table.row(["velocity", &velocity, &origin]);
+    table.row(cells!["velocity", velocity, origin]);
     let origin = match axis.acceleration_unit_from {
         UnitSource::Nothing => "that of the velocity, until the drive is asked".to_owned(),
         known => from(known, "acceleration_unit", "0x60AA"),
     };
     let acceleration = format!("in {}", scale.acceleration_unit());
-    table.row(["acceleration", &acceleration, &origin]);
+    table.row(cells!["acceleration", acceleration, origin]);
     let torque = &axis.torque;
     let shown = match torque.unit {
         TorqueUnit::Percent => "in % of rated torque".to_owned(),
         unit => format!("in {unit}"),
     };
-    table.row(["torque", &shown, "`torque_unit`"]);
+    table.row(cells!["torque", shown, "`torque_unit`"]);
     if torque.unit != TorqueUnit::Percent {
         let rated = torque
             .rated
             .map_or("not known yet".to_owned(), |n| format!("{} Nm", rounded(n)));
         let origin = from(torque.rated_from, "rated_torque", "0x6076");
-        table.row(["rated torque", &rated, &origin]);
+        table.row(cells!["rated torque", rated, origin]);
         let constant = torque.constant.map(|n| format!("{n} Nm/A"));
         if let Some(constant) = constant {
-            table.row(["torque constant", &constant, "`torque_constant`"]);
+            table.row(cells!["torque constant", constant, "`torque_constant`"]);
         } else if torque.unit == TorqueUnit::Amperes {
             let origin = "0x3001:05, the drive is asked";
-            table.row(["torque constant", "not known yet", origin]);
+            table.row(cells!["torque constant", "not known yet", origin]);
         }
     }
 }
@@ -111,18 +109,18 @@ fn limits(axis: &AxisSetup, table: &mut Table) {
         Some([low, high]) => format!("{low} to {high} {unit}"),
         None => "endless".to_owned(),
     };
-    table.row(["limits", &position, "`limits.position`"]);
+    table.row(cells!["limits", position, "`limits.position`"]);
     let rpm = rounded(limits.velocity / config.scale.units_per_turn() * 60.0);
     let velocity = format!("{} {unit}/s ({rpm} rpm)", limits.velocity);
-    table.row(["", &velocity, "`limits.velocity`"]);
+    table.row(cells!["", velocity, "`limits.velocity`"]);
     let acceleration = format!("{} {unit}/s²", limits.acceleration);
-    table.row(["", &acceleration, "`limits.acceleration`"]);
+    table.row(cells!["", acceleration, "`limits.acceleration`"]);
     let jerk = format!("{} {unit}/s³", rounded(limits.jerk()));
     let origin = match limits.jerk {
         Some(_) => "`limits.jerk`",
         None => "default: full acceleration in 50 ms",
     };
-    table.row(["", &jerk, origin]);
+    table.row(cells!["", jerk, origin]);
     let torque = rounded(axis.torque.shown(limits.torque));
     let percent = match axis.torque.unit {
         TorqueUnit::Percent => " of rated torque".to_owned(),
@@ -130,12 +128,12 @@ fn limits(axis: &AxisSetup, table: &mut Table) {
         _ => format!(" ({} % of rated)", rounded(limits.torque)),
     };
     let torque = format!("{torque} {}{percent}", axis.torque.unit);
-    table.row(["", &torque, "`limits.torque`, or rated torque"]);
+    table.row(cells!["", torque, "`limits.torque`, or rated torque"]);
     let following = match limits.following_error {
         Some(error) => format!("following error {error} {unit}"),
         None => "following error not supervised".to_owned(),
     };
-    table.row(["", &following, "`limits.following_error`"]);
+    table.row(cells!["", following, "`limits.following_error`"]);
 }
 
 fn loops(axis: &AxisSetup, table: &mut Table) {
@@ -152,33 +150,37 @@ fn loops(axis: &AxisSetup, table: &mut Table) {
         .into_iter()
         .filter(|mode| config.modes.contains(*mode));
     let modes: Vec<String> = modes.map(|mode| mode.to_string()).collect();
-    table.row(["modes", &modes.join(", "), "targets in the process data"]);
+    table.row(cells![
+        "modes",
+        modes.join(", "),
+        "targets in the process data"
+    ]);
     let csp = config.loops.csp;
     if csp.velocity != 0.0 || csp.acceleration != 0.0 {
         let offsets = format!(
             "{} of the velocity to 0x60B1, {} % per {unit}/s² to 0x60B2",
             csp.velocity, csp.acceleration
         );
-        table.row(["CSP", &offsets, "`csp`"]);
+        table.row(cells!["CSP", offsets, "`csp`"]);
     }
     if let Some(csv) = config.loops.csv {
         let gains = format!("Kv {} 1/s, feed-forward {}", csv.kv, csv.feed_forward);
-        table.row(["CSV", &gains, "`csv`"]);
+        table.row(cells!["CSV", gains, "`csv`"]);
     }
     if let Some(cst) = config.loops.cst {
         let tn = cst.tn_s.map_or("none".to_owned(), time);
         let gains = format!("Kp {} % per {unit}, Tn {tn}, Tv {}", cst.kp, time(cst.tv_s));
-        table.row(["CST", &gains, "`cst`"]);
+        table.row(cells!["CST", gains, "`cst`"]);
         if cst.acceleration != 0.0 {
             let gain = format!("{} % per {unit}/s²", cst.acceleration);
-            table.row(["", &gain, "`cst.acceleration`"]);
+            table.row(cells!["", gain, "`cst.acceleration`"]);
         }
     }
     let origin = match config.dead_time_s {
         0.0 => "default",
         _ => "`dead_time`",
     };
-    table.row(["dead time", &time(config.dead_time_s), origin]);
+    table.row(cells!["dead time", time(config.dead_time_s), origin]);
 }
 
 fn guards(axis: &AxisSetup, table: &mut Table) {
@@ -189,10 +191,10 @@ fn guards(axis: &AxisSetup, table: &mut Table) {
         rounded(config.target_window),
         time(watch.target_dwell_s)
     );
-    table.row([
+    table.row(cells![
         "in target",
-        &window,
-        "`target_window`, `supervise.target_time`",
+        window,
+        "`target_window`, `supervise.target_time`"
     ]);
     let standstill = watch
         .standstill
@@ -200,10 +202,10 @@ fn guards(axis: &AxisSetup, table: &mut Table) {
             format!("{v} {unit}/s")
         });
     let standstill = format!("{standstill} for {}", time(watch.standstill_dwell_s));
-    table.row([
+    table.row(cells![
         "standstill",
-        &standstill,
-        "`supervise.standstill`, `.standstill_time`",
+        standstill,
+        "`supervise.standstill`, `.standstill_time`"
     ]);
     if let Some(torque) = watch.torque {
         let shown = rounded(axis.torque.shown(torque.percent));
@@ -212,14 +214,18 @@ fn guards(axis: &AxisSetup, table: &mut Table) {
             axis.torque.unit,
             time(torque.time_s)
         );
-        table.row(["over torque", &torque, "`supervise.torque`, `.torque_time`"]);
+        table.row(cells![
+            "over torque",
+            torque,
+            "`supervise.torque`, `.torque_time`"
+        ]);
     }
     if let Some(acceleration) = watch.acceleration {
         let acceleration = format!("above {acceleration} {unit}/s²");
-        table.row([
+        table.row(cells![
             "over acceleration",
-            &acceleration,
-            "`supervise.acceleration`",
+            acceleration,
+            "`supervise.acceleration`"
         ]);
     }
     let reaction = match watch.reaction {
@@ -227,12 +233,12 @@ fn guards(axis: &AxisSetup, table: &mut Table) {
         StopMethod::Ramp => "by the acceleration limit, then no power",
         StopMethod::DisableVoltage => "no power at once",
     };
-    table.row(["on a trip", reaction, "`on_trip`"]);
+    table.row(cells!["on a trip", reaction, "`on_trip`"]);
     let emergency = match watch.emergency {
         StopMethod::Ramp | StopMethod::QuickStop => "the drive's quick stop",
         StopMethod::DisableVoltage => "no power at once",
     };
-    table.row(["on emergency", emergency, "`on_emergency`"]);
+    table.row(cells!["on emergency", emergency, "`on_emergency`"]);
     let full = config.stop_time_s(config.mode, config.limits.velocity);
     let (stop, origin) = match config.stop_timeout_s {
         Some(timeout) => (time(timeout), "`stop_timeout`"),
@@ -241,13 +247,13 @@ fn guards(axis: &AxisSetup, table: &mut Table) {
             "ramp and 1 s; longer while it slows",
         ),
     };
-    table.row(["stop time-out", &stop, origin]);
+    table.row(cells!["stop time-out", stop, origin]);
     if !config.follows_bit {
-        table.row(["Statusword bit 12", "ignored", "`follows_bit`"]);
+        table.row(cells!["Statusword bit 12", "ignored", "`follows_bit`"]);
     }
     if let Some(option) = config.quick_stop {
         let option = format!("option {}", option.0);
-        table.row(["quick stop", &option, "0x605A from `sdo` or the ESI"]);
+        table.row(cells!["quick stop", option, "0x605A from `sdo` or the ESI"]);
     }
     let reset = match config.fault_reset {
         FaultReset::Manual => "by a step or command".to_owned(),
@@ -255,7 +261,7 @@ fn guards(axis: &AxisSetup, table: &mut Table) {
             format!("by itself after {}, {tries} times", time(delay_s))
         }
     };
-    table.row(["fault reset", &reset, "`fault_reset`"]);
+    table.row(cells!["fault reset", reset, "`fault_reset`"]);
     let brake = config.brake;
     if brake.release_s > 0.0 || brake.engage_s > 0.0 || axis.brake_output.is_some() {
         let by = axis.brake_output.as_ref();
@@ -265,7 +271,7 @@ fn guards(axis: &AxisSetup, table: &mut Table) {
             time(brake.release_s),
             time(brake.engage_s)
         );
-        table.row(["brake", &times, "`brake`"]);
+        table.row(cells!["brake", times, "`brake`"]);
     }
 }
 
@@ -273,7 +279,7 @@ fn homing(setup: &HomingSetup, unit: &str, table: &mut Table) {
     let home = &setup.homing;
     let text = homing::method(home.method).map_or("", |method| method.text);
     let method = format!("{}: {text}", home.method);
-    table.row(["homing", &method, "`homing.method`, 0x6098"]);
+    table.row(cells!["homing", method, "`homing.method`, 0x6098"]);
     let threshold = home.threshold_ma.map(f64::from);
     for (what, value, suffix, origin) in [
         ("search", home.search_velocity, "/s", "`search`, 0x6099:01"),
@@ -294,13 +300,13 @@ fn homing(setup: &HomingSetup, unit: &str, table: &mut Table) {
     ] {
         if let Some(value) = value {
             let text = format!("{what} {value} {unit}{suffix}");
-            table.row(["", &text, origin]);
+            table.row(cells!["", text, origin]);
         }
     }
     if let Some(current) = threshold {
         let text = format!("mechanical end at {current} mA");
-        table.row(["", &text, "`threshold`, 0x30B2"]);
+        table.row(cells!["", text, "`threshold`, 0x30B2"]);
     }
     let timeout = format!("{} at most", duration::show(setup.timeout_ns));
-    table.row(["", &timeout, "`homing.timeout`"]);
+    table.row(cells!["", timeout, "`homing.timeout`"]);
 }

@@ -1,9 +1,8 @@
 //! `ecaxis explain`: everything derived from the ESI files, each with its source element.
 
-use std::fmt::Write;
 use std::path::PathBuf;
 
-use ecaxis_esi::SmLayout;
+use ecaxis_esi::{SmLayout, SmUse};
 use ecaxis_master::config::{
     self, Action, Bus, DeviceConfig, Exchange, Machine, Nic, Step, duration,
 };
@@ -12,15 +11,17 @@ use ecaxis_master::rt::exchange::LONGEST_LOOK;
 use ecaxis_master::rt::image::{self, Access, ImagePlan};
 use ecaxis_master::rt::spin::Spin;
 use ecaxis_master::text::pluralize;
+use ecaxis_tools::cells;
+use ecaxis_tools::document::format::{hex16, hex32, times};
+use ecaxis_tools::document::{Document, Table};
 
 mod axis;
 mod stop;
 
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::page;
 use crate::render::pdo_table::{fields, startup};
-use crate::render::report::Table;
+use crate::render::print;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -39,250 +40,200 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let machine = config::load(&args.file).map_err(|e| hints::config(&args.file, &e))?;
-    let mut text = String::new();
-    // Writing into a String cannot fail.
-    let _ = explain(&machine, &mut text);
-    page(&text)
+    print(&explain(&machine))
 }
 
-fn explain(machine: &Machine, out: &mut String) -> std::fmt::Result {
-    writeln!(out, "{}", machine.path.display())?;
-    bus(machine, out)?;
+fn explain(machine: &Machine) -> Document {
+    let mut out = Document::new(machine.path.display().to_string());
+    bus(machine, &mut out);
     for device in &machine.devices {
-        self::device(device, out)?;
+        self::device(device, &mut out);
     }
-    wire(machine, out)?;
-    stop::stop(machine, out)?;
-    program(machine, out)
+    wire(machine, &mut out);
+    stop::stop(machine, &mut out);
+    program(machine, &mut out);
+    out
 }
 
-fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
+fn bus(machine: &Machine, out: &mut Document) {
     let bus = &machine.bus;
-    let nic = match &bus.nic {
-        Nic::Sim => ["nic", "sim", "the simulated bus, from the same ESI files"],
-        Nic::Interface(name) => ["nic", name, ""],
-    };
-    let cpu = bus
-        .cpu
-        .map_or("any CPU".to_owned(), |cpu| format!("CPU {cpu}"));
     let written = |key: &str| bus.written.iter().find(|(written, _)| *written == key);
     let origin =
         |key: &str| written(key).map_or("default".to_owned(), |(_, line)| format!("line {line}"));
-    let mut table = Table::new(&["setting", "value", "from", "meaning"]);
-    let mut row = |[key, value, meaning]: [&str; 3]| {
-        table.row([key, value, &origin(key), meaning]);
+    let mut table = Table::new("setting|value|from|meaning");
+    let mut row = |key: &str, value: &str, meaning: &str| {
+        table.row(cells![key, value, origin(key), meaning]);
     };
-    row(nic);
-    row([
+    let time = duration::show;
+    match &bus.nic {
+        Nic::Sim => row("nic", "sim", "the simulated bus, from the same ESI files"),
+        Nic::Interface(name) => row("nic", name, ""),
+    }
+    let cycle = time(bus.cycle_ns);
+    row(
         "cycle",
-        &duration::show(bus.cycle_ns),
+        &cycle,
         "from frame to frame; also 0x60C2 and SYNC0",
-    ]);
-    let lost = bus.lost_frames.to_string();
-    row([
-        "lost_frames",
-        &lost,
-        "consecutive cycles without a valid answer stop the axes",
-    ]);
-    row(match bus.exchange {
-        Exchange::SameCycle => [
-            "exchange",
-            "same-cycle",
-            "answers are waited for within the cycle",
-        ],
-        Exchange::Pipelined => [
-            "exchange",
+    );
+    let meaning = "consecutive cycles without a valid answer stop the axes";
+    row("lost_frames", &bus.lost_frames.to_string(), meaning);
+    let (value, meaning) = match bus.exchange {
+        Exchange::SameCycle => ("same-cycle", "answers are waited for within the cycle"),
+        Exchange::Pipelined => (
             "pipelined",
             "answers are read in the next cycle, without waiting",
-        ],
-    });
+        ),
+    };
+    row("exchange", value, meaning);
     if matches!(bus.nic, Nic::Interface(_)) {
         let meaning = match bus.link {
             SocketKind::Ring => "frames are taken from memory that the kernel shares",
             SocketKind::Packet => "frames are taken by system calls",
         };
-        row(["link", bus.link.name(), meaning]);
+        row("link", bus.link.name(), meaning);
     }
-    row([
-        "priority",
-        &format!("SCHED_FIFO {}", bus.priority),
-        "of the real-time thread",
-    ]);
-    row(["cpu", &cpu, "where it runs"]);
-    row([
+    let priority = format!("SCHED_FIFO {}", bus.priority);
+    row("priority", &priority, "of the real-time thread");
+    let cpu = bus
+        .cpu
+        .map_or("any CPU".to_owned(), |cpu| format!("CPU {cpu}"));
+    row("cpu", &cpu, "where it runs");
+    let spin = match bus.spin {
+        Spin::Auto => "auto".to_owned(),
+        Spin::For(ns) => time(ns),
+    };
+    row(
         "spin",
-        &match bus.spin {
-            Spin::Auto => "auto".to_owned(),
-            Spin::For(ns) => duration::show(ns),
-        },
+        &spin,
         "before a cycle is due, sleeping becomes spinning",
-    ]);
-    row(if bus.awake {
-        [
+    );
+    match bus.awake {
+        true => row(
             "idle",
             "awake",
             "something of the lowest class keeps that CPU busy",
-        ]
-    } else {
-        ["idle", "sleep", "CPUs sleep between two cycles"]
-    });
-    let watchdog = duration::show(bus.watchdog_ns);
+        ),
+        false => row("idle", "sleep", "CPUs sleep between two cycles"),
+    }
     let registers = format!(
         "0x0420 = {}, 0x0400 = {}; of the PDI: 0x0410 = {}",
         bus.process_data_watchdog(),
         Bus::WATCHDOG_DIVIDER,
         Bus::PDI_WATCHDOG,
     );
-    row(["watchdog", &watchdog, &registers]);
+    row("watchdog", &time(bus.watchdog_ns), &registers);
     if machine.devices.iter().any(|d| d.selection.dc.is_some()) {
-        row([
+        let window = time(bus.clock_window_ns);
+        row(
             "clock_window",
-            &duration::show(bus.clock_window_ns),
+            &window,
             "a clock farther off is warned of (0x092C)",
-        ]);
+        );
     }
-    row([
-        "op_timeout",
-        &duration::show(bus.op_timeout_ns),
-        "from SafeOp to Op",
-    ]);
-    let enable = duration::show(bus.enable_timeout_ns);
-    row([
-        "enable_timeout",
-        &enable,
-        "until a drive reports Operation enabled",
-    ]);
-    writeln!(out, "\nbus\n{}", table.shown(2))
+    row("op_timeout", &time(bus.op_timeout_ns), "from SafeOp to Op");
+    let meaning = "until a drive reports Operation enabled";
+    row("enable_timeout", &time(bus.enable_timeout_ns), meaning);
+    out.heading("bus");
+    out.table(table);
 }
 
-fn device(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
+fn device(device: &DeviceConfig, out: &mut Document) {
     let selection = &device.selection;
     let esi = device.esi_path.display();
-    writeln!(
-        out,
-        "\ndevice `{}` at {} (line {})",
-        device.name, device.at, device.line
-    )?;
-    writeln!(
-        out,
-        "  {} {:?}, {esi}:{}",
-        device.device.type_name, selection.device_name, device.device.position
-    )?;
-    writeln!(out, "  {}", selection.identity)?;
+    let (at, line) = (&device.at, device.line);
+    out.heading(format!("device `{}` at {at} (line {line})", device.name));
+    let (name, type_name) = (&selection.device_name, &device.device.type_name);
+    out.line(format!(
+        "{type_name} {name:?}, {esi}:{}",
+        device.device.position
+    ));
+    out.line(selection.identity.to_string());
     if let Some(mode) = selection.mode {
-        writeln!(out, "  mode {mode} (0x6060 = {})", mode.code())?;
+        out.line(format!("mode {mode} (0x6060 = {})", mode.code()));
     }
     for module in &selection.modules {
-        writeln!(
-            out,
-            "  module {:?} (0x{:08x}) in slot {:?}, {esi}:{}",
+        out.line(format!(
+            "module {:?} (0x{:08x}) in slot {:?}, {esi}:{}",
             module.type_name, module.ident, module.slot_name, module.position,
-        )?;
+        ));
     }
     if let Some(assignment) = &selection.assignment {
-        writeln!(out, "  PDO assignment {assignment:?}")?;
+        out.line(format!("PDO assignment {assignment:?}"));
     }
     for note in &selection.notes {
-        writeln!(out, "  note: {note}")?;
+        out.item("note: ", note);
     }
     if let Some(axis) = &device.axis {
-        axis::axis(axis, out)?;
+        out.gap();
+        out.table(axis::axis(axis));
     }
-    sync_managers(device, out)?;
+    sync_managers(device, out);
     let layout = &selection.layout;
-    fields("outputs", layout.rx_bytes(), &layout.rx, out)?;
-    fields("inputs", layout.tx_bytes(), &layout.tx, out)?;
-    clock(device, out)?;
-    startup(&device.selection.startup, out)
+    fields("outputs", layout.rx_bytes(), &layout.rx, out);
+    fields("inputs", layout.tx_bytes(), &layout.tx, out);
+    clock(device, out);
+    startup(&device.selection.startup, out);
 }
 
-fn sync_managers(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
-    let mut table = Table::new(&["SM", "use", "address", "bytes", "control", "FMMU"]);
+fn sync_managers(device: &DeviceConfig, out: &mut Document) {
+    let mut table = Table::new("SM|use|address|bytes|control|FMMU");
     let layout = &device.selection.layout;
-    let process: Vec<(&str, &SmLayout)> = layout
-        .outputs
-        .iter()
-        .map(|sm| ("outputs", sm))
-        .chain(layout.inputs.iter().map(|sm| ("inputs", sm)))
-        .collect();
+    let outputs = layout.outputs.iter().map(|sm| ("outputs", sm));
+    let inputs = layout.inputs.iter().map(|sm| ("inputs", sm));
+    let process: Vec<(&str, &SmLayout)> = outputs.chain(inputs).collect();
     for (number, sm) in device.device.sync_managers.iter().enumerate() {
         let planned = process.iter().find(|(_, p)| usize::from(p.sm) == number);
-        let (usage, address, len, control, fmmu) = match planned {
-            Some((usage, p)) => {
-                let fmmu = p.fmmu.map_or("next free".to_owned(), |f| f.to_string());
-                (
-                    (*usage).to_owned(),
-                    p.start_address,
-                    p.len,
-                    p.control_byte,
-                    fmmu,
-                )
-            }
-            None => {
-                let usage = match sm.usage {
-                    ecaxis_esi::SmUse::MBoxOut => "mailbox out",
-                    ecaxis_esi::SmUse::MBoxIn => "mailbox in",
-                    _ => "unused",
-                };
-                (
-                    usage.to_owned(),
-                    sm.start_address,
-                    sm.default_size,
-                    sm.control_byte,
-                    String::new(),
-                )
-            }
+        let usage = match (planned, sm.usage) {
+            (Some((usage, _)), _) => usage,
+            (None, SmUse::MBoxOut) => "mailbox out",
+            (None, SmUse::MBoxIn) => "mailbox in",
+            (None, _) => "unused",
         };
-        table.row([
-            &number.to_string(),
-            &usage,
-            &format!("0x{address:04x}"),
-            &len.to_string(),
-            &format!("0x{control:02x}"),
-            &fmmu,
-        ]);
+        let (address, len, control, fmmu) = match planned {
+            Some((_, p)) => {
+                let fmmu = p.fmmu.map_or("next free".to_owned(), |f| f.to_string());
+                (p.start_address, p.len, p.control_byte, fmmu)
+            }
+            None => (
+                sm.start_address,
+                sm.default_size,
+                sm.control_byte,
+                String::new(),
+            ),
+        };
+        let (address, control) = (hex16(address), format!("0x{control:02x}"));
+        table.row(cells![number, usage, address, len, control, fmmu]);
     }
-    writeln!(out, "\n{}", table.shown(2))
+    out.gap();
+    out.table(table);
 }
 
-fn clock(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
+fn clock(device: &DeviceConfig, out: &mut Document) {
+    out.gap();
     let Some(dc) = &device.selection.dc else {
-        return writeln!(out, "\n  no distributed clock (0x0980 = 0x0000)");
+        out.line("no distributed clock (0x0980 = 0x0000)");
+        return;
     };
-    let sync = |cycle: u32, shift: i32| match cycle {
-        0 => "off".to_owned(),
+    let sync = |name: &str, cycle: u32, shift: i32| match cycle {
+        0 => format!("  {name} off"),
         cycle => {
             let sign = if shift < 0 { "-" } else { "" };
-            let shift = duration::show(u64::from(shift.unsigned_abs()));
-            format!(
-                "every {}, shifted by {sign}{shift}",
-                duration::show(u64::from(cycle))
-            )
+            let [cycle, shift] = [cycle, shift.unsigned_abs()].map(|ns| duration::show(ns.into()));
+            format!("  {name} every {cycle}, shifted by {sign}{shift}")
         }
     };
-    writeln!(
-        out,
-        "\n  distributed clock: OpMode {:?}, {}:{}",
-        dc.name,
-        device.esi_path.display(),
-        dc.position,
-    )?;
+    let (esi, position) = (device.esi_path.display(), &dc.position);
+    out.line(format!(
+        "distributed clock: OpMode {:?}, {esi}:{position}",
+        dc.name
+    ));
     let [low, high] = dc.assign_activate.to_le_bytes();
-    writeln!(
-        out,
-        "    AssignActivate 0x{:04x}: 0x0980 = 0x{low:02x}, 0x0981 = 0x{high:02x}",
+    out.line(format!(
+        "  AssignActivate 0x{:04x}: 0x0980 = 0x{low:02x}, 0x0981 = 0x{high:02x}",
         dc.assign_activate,
-    )?;
-    writeln!(
-        out,
-        "    SYNC0 {}",
-        sync(dc.sync0_cycle_ns, dc.sync0_shift_ns)
-    )?;
-    writeln!(
-        out,
-        "    SYNC1 {}",
-        sync(dc.sync1_cycle_ns, dc.sync1_shift_ns)
-    )
+    ));
+    out.line(sync("SYNC0", dc.sync0_cycle_ns, dc.sync0_shift_ns));
+    out.line(sync("SYNC1", dc.sync1_cycle_ns, dc.sync1_shift_ns));
 }
 
 /// Preamble, Ethernet header, FCS, gap.
@@ -309,62 +260,59 @@ fn frame_bytes(plan: &ImagePlan, clock: bool) -> Vec<usize> {
         .collect()
 }
 
-fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
+fn wire(machine: &Machine, out: &mut Document) {
     let plan = match image::of(machine) {
         Ok(plan) => plan,
-        Err(e) => return writeln!(out, "\nprocess image\n  {e}"),
+        Err(e) => {
+            out.heading("process image");
+            out.line(e.to_string());
+            return;
+        }
     };
-    writeln!(
-        out,
-        "\nprocess image: {}; outputs and inputs share addresses",
-        pluralize(plan.len, "byte")
-    )?;
-    let mut table = Table::new(&["device", "logical", "outputs", "inputs", "frame"]);
+    let bytes = pluralize(plan.len, "byte");
+    out.heading(format!(
+        "process image: {bytes}; outputs and inputs share addresses"
+    ));
+    let mut table = Table::new("device|logical|outputs|inputs|frame");
     for (device, region) in machine.devices.iter().zip(&plan.regions) {
         let Some(region) = region else { continue };
-        let at = format!("0x{:08x}", region.logical);
-        let (outputs, inputs) = (region.out_len.to_string(), region.in_len.to_string());
-        table.row([
-            &device.name,
-            &at,
-            &outputs,
-            &inputs,
-            &(region.frame + 1).to_string(),
+        let (at, frame) = (hex32(region.logical), region.frame + 1);
+        table.row(cells![
+            device.name,
+            at,
+            region.out_len,
+            region.in_len,
+            frame
         ]);
     }
-    writeln!(out, "{}", table.shown(2))?;
+    out.table(table);
     let clock = machine.devices.iter().any(|d| d.selection.dc.is_some());
     let frames = frame_bytes(&plan, clock);
     let total: usize = frames.iter().sum();
     let ns = (total - 12) * NS_PER_BYTE + machine.devices.len() * FORWARDING_NS;
-    let wkc: u32 = plan
-        .datagrams
-        .iter()
-        .map(|d| u32::from(d.expected_wkc))
-        .sum();
+    let wkc = plan.datagrams.iter().map(|d| u32::from(d.expected_wkc));
+    let wkc: u32 = wkc.sum();
     let clock = if clock { "FRMW 0x0910, " } else { "" };
     let process_data = commands(&plan);
     let ns = u64::try_from(ns).unwrap_or(u64::MAX);
     let percent = |ns: u64| ns as f64 * 100.0 / machine.bus.cycle_ns as f64;
-    writeln!(
-        out,
-        "\nframes a cycle: {} ({clock}{process_data}BRD 0x0130, one diagnostic read), at most {total} bytes on the wire",
+    out.heading(format!(
+        "frames a cycle: {} ({clock}{process_data}BRD 0x0130, one diagnostic read), at most {total} bytes on the wire",
         frames.len()
-    )?;
-    writeln!(
-        out,
-        "  about {} µs from the first bit sent to the last received at 100 Mbit/s, {:.1} % of the cycle",
+    ));
+    out.line(format!(
+        "about {} µs from the first bit sent to the last received at 100 Mbit/s, {:.1} % of the cycle",
         ns.div_ceil(1000),
         percent(ns),
-    )?;
-    writeln!(out, "  expected working counter {wkc}")?;
+    ));
+    out.line(format!("expected working counter {wkc}"));
     let (ns, why) = load(machine, ns);
-    writeln!(
-        out,
-        "  estimated load of the real-time thread: about {} µs, {:.1} % of its CPU\n    ({why}; `ecaxis bench` measures it)",
+    out.line(format!(
+        "estimated load of the real-time thread: about {} µs, {:.1} % of its CPU",
         ns.div_ceil(1000),
         percent(ns),
-    )
+    ));
+    out.line(format!("  ({why}; `ecaxis bench` measures it)"));
 }
 
 /// Returns the estimated CPU time per cycle in ns and its composition. The figures are measurements
@@ -407,40 +355,23 @@ fn commands(plan: &ImagePlan) -> String {
     text
 }
 
-fn program(machine: &Machine, out: &mut String) -> std::fmt::Result {
+fn program(machine: &Machine, out: &mut Document) {
     if machine.steps.is_empty() {
-        return writeln!(
-            out,
-            "\nno program: the axes are enabled and hold their positions"
-        );
+        out.heading("no program: the axes are enabled and hold their positions");
+        return;
     }
-    writeln!(out, "\nprogram, {}", times(machine.repeat))?;
-    steps(machine, &machine.steps, out)
+    out.heading(format!("program, {}", times(machine.repeat)));
+    steps(machine, &machine.steps, out);
 }
 
-fn steps(machine: &Machine, each: &[Step], out: &mut String) -> std::fmt::Result {
+fn steps(machine: &Machine, each: &[Step], out: &mut Document) {
     for step in each {
-        let depth = step.number.matches('.').count();
-        let text = machine.describe(&step.action);
-        writeln!(
-            out,
-            "{:indent$}{}. {text}",
-            "",
-            step.number,
-            indent = 2 + 3 * depth
-        )?;
+        let indent = " ".repeat(3 * step.number.matches('.').count());
+        let lead = format!("{indent}{}. ", step.number);
+        out.item(lead, machine.describe(&step.action));
         if let Action::Repeat { steps: inner, .. } = &step.action {
-            steps(machine, inner, out)?;
+            steps(machine, inner, out);
         }
-    }
-    Ok(())
-}
-
-fn times(n: u32) -> String {
-    if n == 1 {
-        "once".to_owned()
-    } else {
-        format!("{n} times")
     }
 }
 

@@ -1,13 +1,12 @@
 //! The stop reactions of the machine and its axis groups in `ecaxis explain`.
 
-use std::fmt::Write;
-
 use ecaxis_axis::StopMethod;
 use ecaxis_master::config::{GroupStopScope, Machine};
 
-use super::Table;
+use ecaxis_tools::cells;
+use ecaxis_tools::document::{Document, Table};
 
-pub(super) fn stop(machine: &Machine, out: &mut String) -> std::fmt::Result {
+pub(super) fn stop(machine: &Machine, out: &mut Document) {
     let stop = &machine.stop;
     let by_drive = match stop.bus_lost {
         StopMethod::Ramp | StopMethod::QuickStop => "the drives' quick stop",
@@ -22,19 +21,19 @@ pub(super) fn stop(machine: &Machine, out: &mut String) -> std::fmt::Result {
         "{} cycles: {by_drive}; if they answer, a ramp",
         machine.bus.lost_frames
     );
-    let mut table = Table::new(&["when", "what happens", "key"]);
-    table.row([
-        "an axis faults or trips",
-        &format!("the others: {}", way(stop.others)),
-        "`others`",
-    ]);
-    table.row(["no process data", &lost, "`bus_lost`"]);
-    table.row(["emergency stop", &emergency, "`emergency`"]);
-    writeln!(out, "\nstop\n{}", table.shown(2))?;
+    let mut table = Table::new("when|what happens|key");
+    let others = format!("the others: {}", way(stop.others));
+    table.row(cells!["an axis faults or trips", others, "`others`"]);
+    table.row(cells!["no process data", lost, "`bus_lost`"]);
+    table.row(cells!["emergency stop", emergency, "`emergency`"]);
+    out.heading("stop");
+    out.table(table);
     if stop.groups.is_empty() {
-        return writeln!(out, "\n  all axes stop together");
+        out.gap();
+        out.line("all axes stop together");
+        return;
     }
-    let mut table = Table::new(&["group", "axes", "devices", "others", "outside"]);
+    let mut table = Table::new("group|axes|devices|others|outside");
     let names = |axes: bool, group: usize| {
         let devices = machine.devices.iter().enumerate();
         let own = devices.filter(|(device, _)| machine.group_of(*device) == group);
@@ -47,22 +46,24 @@ pub(super) fn stop(machine: &Machine, out: &mut String) -> std::fmt::Result {
             GroupStopScope::Stop => "stops",
             GroupStopScope::Continue => "continues",
         };
-        table.row([
-            &group.name,
-            &names(true, index + 1),
-            &names(false, index + 1),
+        let (axes, devices) = (names(true, index + 1), names(false, index + 1));
+        table.row(cells![
+            group.name,
+            axes,
+            devices,
             way(group.others),
-            outside,
+            outside
         ]);
     }
-    table.row([
+    let (axes, devices) = (names(true, 0), names(false, 0));
+    table.row(cells![
         "(the rest)",
-        &names(true, 0),
-        &names(false, 0),
+        axes,
+        devices,
         way(stop.others),
-        "stops",
+        "stops"
     ]);
-    writeln!(out, "\n{}", table.shown(2))
+    out.table(table);
 }
 
 fn way(way: StopMethod) -> &'static str {

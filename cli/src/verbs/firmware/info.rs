@@ -7,7 +7,7 @@ use crate::args::bus;
 use crate::args::device::{self, Target};
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::result;
+use crate::render::{print, print_json};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -45,9 +45,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         firmware::examine(&wire, at, name).await
     })?;
     let examined = found.map_err(|error| hints::firmware(&error, &nic))?;
-    result(&if args.json {
-        format!("{:#}\n", show::as_json(&examined))
-    } else {
-        show::info(&examined)
-    })
+    match args.json {
+        true => print_json(&show::as_json(&examined)),
+        false => print(&show::info(&examined)),
+    }
 }

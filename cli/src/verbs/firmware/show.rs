@@ -1,9 +1,10 @@
 //! Formats a device and its software.
 
+use ecaxis_tools::cells;
+use ecaxis_tools::document::format::{hex32, or_dash};
+use ecaxis_tools::document::{Document, Table};
 use ecaxis_tools::firmware::{CoeIdentity, DeviceIdentity, RunningProgram, UpdateMethod};
 use serde_json::{Value, json};
-
-use crate::render::table::Table;
 
 const WAYS: [(UpdateMethod, &str); 2] = [
     (UpdateMethod::Foe, "foe"),
@@ -14,15 +15,19 @@ const WAYS: [(UpdateMethod, &str); 2] = [
 type Row = (&'static str, fn(&DeviceIdentity) -> Option<String>);
 
 const VERSION: [Row; 7] = [
-    ("product (0x1018:02)", |e| hex(spoken(e)?.identity[1])),
-    ("revision (0x1018:03)", |e| hex(spoken(e)?.identity[2])),
-    ("revision (EEPROM)", |e| {
-        hex((!e.in_use).then_some(e.sii.identity.revision))
+    ("product (0x1018:02)", |e| spoken(e)?.identity[1].map(hex32)),
+    ("revision (0x1018:03)", |e| {
+        spoken(e)?.identity[2].map(hex32)
     }),
-    ("device type (0x1000)", |e| hex(spoken(e)?.device_type)),
+    ("revision (EEPROM)", |e| {
+        (!e.in_use).then(|| hex32(e.sii.identity.revision))
+    }),
+    ("device type (0x1000)", |e| {
+        spoken(e)?.device_type.map(hex32)
+    }),
     ("software version (0x100A)", |e| spoken(e)?.software.clone()),
     ("software identification (0x1F56)", |e| {
-        hex(spoken(e)?.identification)
+        spoken(e)?.identification.map(hex32)
     }),
     ("program control (0x1F51)", |e| {
         spoken(e)?.control.map(|value| match value {
@@ -37,66 +42,51 @@ fn spoken(examined: &DeviceIdentity) -> Option<&CoeIdentity> {
     examined.spoken.as_ref()
 }
 
-fn hex(value: Option<u32>) -> Option<String> {
-    value.map(|value| format!("0x{value:08x}"))
-}
-
-fn shown(value: Option<String>) -> String {
-    value.unwrap_or_else(|| "-".to_owned())
-}
-
-/// Formats the properties before and after an update.
-pub(super) fn change(before: &DeviceIdentity, now: &DeviceIdentity) -> String {
-    let mut table = Table::new(&["", "before", "now"]);
+/// Adds the properties before and after an update.
+pub(super) fn change(before: &DeviceIdentity, now: &DeviceIdentity, out: &mut Document) {
+    let mut table = Table::new("|before|now");
     for (what, of) in VERSION {
         let (before, now) = (of(before), of(now));
         if before.is_some() || now.is_some() {
-            table.row([what, &shown(before), &shown(now)]);
+            table.row(cells![what, or_dash(before), or_dash(now)]);
         }
     }
-    let mut text = format!("{}\n", table.shown(2));
+    out.table(table);
     if VERSION.iter().all(|(_, of)| of(before) == of(now)) {
-        text += "It says the same of itself as before.\n";
+        out.line("It says the same of itself as before.");
     }
-    text
 }
 
-/// Formats all known properties.
-pub(super) fn info(examined: &DeviceIdentity) -> String {
+/// Returns all known properties.
+pub(super) fn info(examined: &DeviceIdentity) -> Document {
     let identity = examined.sii.identity;
-    let mut table = Table::new(&["", ""]);
-    let mut row = |what: &str, value: String| table.row([what, &value]);
-    row("state", state(examined));
-    row(
-        "what runs",
-        match examined.runs() {
-            RunningProgram::Program => "its program",
-            RunningProgram::BootLoader => "its boot loader alone",
-            RunningProgram::Unknown => "not known",
-        }
-        .to_owned(),
-    );
+    let mut table = Table::new("");
+    let mut row = |what: &str, value: &str| table.row(cells![what, value]);
+    row("state", &state(examined));
+    let runs = match examined.runs() {
+        RunningProgram::Program => "its program",
+        RunningProgram::BootLoader => "its boot loader alone",
+        RunningProgram::Unknown => "not known",
+    };
+    row("what runs", runs);
     if examined.in_use {
-        row("EEPROM", "left to the device, which is using it".to_owned());
+        row("EEPROM", "left to the device, which is using it");
     } else {
-        row("vendor (EEPROM)", format!("0x{:08x}", identity.vendor));
-        row("product (EEPROM)", format!("0x{:08x}", identity.product));
-        row("serial number (EEPROM)", examined.sii.serial.to_string());
+        row("vendor (EEPROM)", &hex32(identity.vendor));
+        row("product (EEPROM)", &hex32(identity.product));
+        row("serial number (EEPROM)", &examined.sii.serial.to_string());
     }
-    if let Some(spoken) = spoken(examined) {
-        for (what, text) in [
-            ("device name (0x1008)", &spoken.name),
-            ("hardware version (0x1009)", &spoken.hardware),
-        ] {
-            if let Some(text) = text {
-                row(what, text.clone());
-            }
+    if let Some(CoeIdentity { name, hardware, .. }) = spoken(examined) {
+        let texts = [
+            ("device name (0x1008)", name),
+            ("hardware version (0x1009)", hardware),
+        ];
+        for (what, text) in texts {
+            text.iter().for_each(|text| row(what, text));
         }
     }
     for (what, of) in VERSION {
-        if let Some(value) = of(examined) {
-            row(what, value);
-        }
+        of(examined).iter().for_each(|value| row(what, value));
     }
     for (via, _) in WAYS {
         let offered = match examined.offers(via) {
@@ -112,13 +102,14 @@ pub(super) fn info(examined: &DeviceIdentity) -> String {
             Ok(()) => "yes".to_owned(),
             Err(reason) => format!("no: {reason}"),
         };
-        row(&via.to_string(), offered);
+        row(&via.to_string(), &offered);
     }
-    let mut text = format!("{}\n{}\n", examined.device, table.shown(2));
+    let mut out = Document::new(examined.device.to_string());
+    out.table(table);
     if let Some(silent) = &examined.silent {
-        text += &format!("It does not speak: {silent}\n");
+        out.line(format!("It does not speak: {silent}"));
     }
-    text
+    out
 }
 
 fn state(examined: &DeviceIdentity) -> String {

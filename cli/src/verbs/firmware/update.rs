@@ -5,6 +5,7 @@ use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use clap::ValueEnum;
+use ecaxis_tools::document::Document;
 use ecaxis_tools::firmware::{
     self, DeviceIdentity, Expected, ReadBack, Step, UpdateMethod, UpdateProgress, UpdateReport,
     UpdateRequest,
@@ -17,10 +18,7 @@ use crate::args::bus;
 use crate::args::device::Target;
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::output;
-use crate::render::result;
-use crate::render::style;
+use crate::render::{note, output, print, print_json, style};
 use crate::verbs::esi::number;
 
 /// The maximum file size in bytes.
@@ -110,7 +108,7 @@ pub(crate) fn run(args: &Args, plain: bool) -> Result<(), Failure> {
             let report = json!({
                 "ok": false, "error": failure.message, "hints": failure.hints,
             });
-            result(&format!("{report:#}\n"))?;
+            print_json(&report)?;
             Err(failure)
         }
         done => done,
@@ -175,11 +173,10 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
     })?;
     let visited = visited?;
     let Some(done) = &visited.done else {
-        result(&if args.json {
-            format!("{:#}\n", planned_json(&visited, bytes, &path))
-        } else {
-            planned(&visited, bytes, &path)
-        })?;
+        match args.json {
+            true => print_json(&planned_json(&visited, bytes, &path))?,
+            false => print(&planned(&visited, bytes, &path))?,
+        }
         return if args.dry_run {
             Ok(())
         } else {
@@ -187,11 +184,10 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
                 .hint("add `--yes` to write it, or `--dry-run` where this was all you wanted"))
         };
     };
-    result(&if args.json {
-        format!("{:#}\n", done_json(&visited, done, bytes))
-    } else {
-        done_text(&visited, done, bytes)
-    })
+    match args.json {
+        true => print_json(&done_json(&visited, done, bytes)),
+        false => print(&done_text(&visited, done, bytes)),
+    }
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, Failure> {
@@ -204,13 +200,11 @@ fn read(path: &Path) -> Result<Vec<u8>, Failure> {
     Ok(file)
 }
 
-fn planned(visited: &UpdateOutcome, bytes: usize, path: &Path) -> String {
-    format!(
-        "{}{} ({bytes} bytes) would be written by {}.\n",
-        show::info(&visited.before),
-        path.display(),
-        visited.via
-    )
+fn planned(visited: &UpdateOutcome, bytes: usize, path: &Path) -> Document {
+    let mut out = show::info(&visited.before);
+    let (path, via) = (path.display(), visited.via);
+    out.line(format!("{path} ({bytes} bytes) would be written by {via}."));
+    out
 }
 
 fn planned_json(visited: &UpdateOutcome, bytes: usize, path: &Path) -> Value {
@@ -224,22 +218,22 @@ fn planned_json(visited: &UpdateOutcome, bytes: usize, path: &Path) -> Value {
     })
 }
 
-fn done_text(visited: &UpdateOutcome, done: &UpdateReport, bytes: usize) -> String {
+fn done_text(visited: &UpdateOutcome, done: &UpdateReport, bytes: usize) -> Document {
     let UpdateOutcome { before, via, .. } = visited;
-    let mut text = format!(
-        "{}: {bytes} bytes in {:.1} s, {}, by {via}\n{}",
-        done.after.device,
-        done.took.as_secs_f64(),
-        rate(bytes, done.took),
-        show::change(before, &done.after),
-    );
-    text += &match &done.read_back {
-        ReadBack::NotAsked => String::new(),
-        ReadBack::Same => "The device holds the file byte for byte.\n".to_owned(),
-        ReadBack::Refused(why) => format!("The file was not read back: {why}\n"),
-    };
-    text += &format!("It {} and is in {}.\n", done.after.runs(), done.after.state);
-    text
+    let (device, seconds) = (&done.after.device, done.took.as_secs_f64());
+    let rate = rate(bytes, done.took);
+    let mut out = Document::new(format!(
+        "{device}: {bytes} bytes in {seconds:.1} s, {rate}, by {via}"
+    ));
+    show::change(before, &done.after, &mut out);
+    match &done.read_back {
+        ReadBack::NotAsked => {}
+        ReadBack::Same => out.line("The device holds the file byte for byte."),
+        ReadBack::Refused(why) => out.line(format!("The file was not read back: {why}")),
+    }
+    let (runs, state) = (done.after.runs(), done.after.state);
+    out.line(format!("It {runs} and is in {state}."));
+    out
 }
 
 fn done_json(visited: &UpdateOutcome, done: &UpdateReport, bytes: usize) -> Value {

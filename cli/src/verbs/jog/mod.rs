@@ -31,8 +31,8 @@ use crate::args::record;
 use crate::args::signals;
 use crate::hints;
 use crate::hints::Failure;
+use crate::render::print;
 use crate::render::report;
-use crate::render::result;
 use crate::render::style;
 use crate::verbs::run;
 use draw::Screen;
@@ -128,8 +128,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         ..
     } = on(terminal, machine, options, &stop, args, &shared);
     let left = shared.left.load(Ordering::Relaxed);
-    let text = summary.as_ref().map(report::summary).unwrap_or_default();
-    let written = result(&text);
+    let document = summary.as_ref().map(report::summary).unwrap_or_default();
+    let written = print(&document);
     match ended {
         // Leaving with a key is not an interruption; closing the terminal is.
         Ok(()) | Err(RunError::Interrupted) if left => written,

@@ -9,8 +9,7 @@ use ecaxis_tools::scan::{self, EsiMatch, MainDeviceEvidence, Scan, esi_match};
 use crate::args::bus::{self, Bus};
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::result;
+use crate::render::{note, print_json, print_page, result};
 
 mod report;
 mod text;
@@ -84,13 +83,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if let Some(path) = &args.write {
         return write::machine_file(&seen, path, library.is_some());
     }
-    result(&if args.json {
-        format!("{:#}\n", report::json(&seen))
+    if args.json {
+        print_json(&report::json(&seen))
     } else if args.tree {
-        text::tree(&seen)
+        result(&text::tree(&seen))
     } else {
-        text::tables(&seen)
-    })
+        print_page(&text::document(&seen))
+    }
 }
 
 /// Scans a bus and shows the progress.

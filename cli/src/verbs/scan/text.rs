@@ -4,13 +4,13 @@ use ecaxis_axis::VelocityUnit;
 use ecaxis_ecat::al_status_code::al_status_text;
 use ecaxis_esi as esi;
 use ecaxis_master::acyclic::topology;
+use ecaxis_master::text::pluralize;
+use ecaxis_tools::cells;
+use ecaxis_tools::document::format::{hex16, hex32, names_of, or_dash};
+use ecaxis_tools::document::{Document, Table};
 use ecaxis_tools::scan::{CoeInfo, Device, EsiMatch};
 
 use super::ScanResult;
-use crate::render::table::Table;
-
-/// The page width for tables with long cells.
-const PAGE: usize = 80;
 
 /// Returns the type name from the ESI, else from the EEPROM.
 pub(super) fn type_name(device: &Device, described: Option<&EsiMatch>) -> String {
@@ -25,175 +25,109 @@ pub(super) fn is_drive(device: &Device, described: Option<&EsiMatch>) -> bool {
 }
 
 fn hex(number: Option<u32>) -> String {
-    number.map_or_else(|| "?".to_owned(), |number| format!("0x{number:08x}"))
+    number.map_or_else(|| "?".to_owned(), hex32)
 }
 
-fn or_dash<T: ToString>(value: Option<T>) -> String {
-    value.map_or_else(|| "-".to_owned(), |value| value.to_string())
-}
-
-pub(super) fn tables(seen: &ScanResult) -> String {
-    let mut text = head(seen);
-    for table in [identities(seen), places(seen), descriptions(seen)] {
-        text += &format!("\n{}\n", table.shown(2));
-    }
-    if seen.scan.asked {
-        text += &asked(seen);
-    }
-    text + &notes(seen)
-}
-
-fn head(seen: &ScanResult) -> String {
-    match seen.scan.devices.len() {
-        1 => format!("1 SubDevice on `{}`\n", seen.nic),
-        n => format!("{n} SubDevices on `{}`\n", seen.nic),
-    }
-}
-
-fn identities(seen: &ScanResult) -> Table {
-    let head = [
-        "pos", "type", "vendor", "product", "revision", "serial", "state",
-    ];
-    let mut table = Table::new(&head);
-    for (device, esi) in seen.devices() {
-        let identity = device.identity();
-        let error = if device.found.error { " + error" } else { "" };
-        table.row([
-            &device.position().to_string(),
-            &type_name(device, esi),
-            &hex(identity.map(|i| i.vendor)),
-            &hex(identity.map(|i| i.product)),
-            &hex(identity.map(|i| i.revision)),
-            &or_dash(device.serial().filter(|serial| *serial != 0)),
-            &format!("{}{error}", device.found.state),
-        ]);
-    }
-    table
-}
-
-fn places(seen: &ScanResult) -> Table {
-    let head = [
-        "pos",
-        "address",
-        "alias",
-        "id",
-        "at",
-        "open ports",
-        "delay",
-        "clock",
-        "mailbox",
-    ];
-    let mut table = Table::new(&head);
-    for (device, _) in seen.devices() {
-        let open = topology::open_ports(device.found.dl_status);
-        let open: Vec<String> = (0..)
-            .zip(open)
-            .filter(|(_, open)| *open)
-            .map(|(n, _): (u8, bool)| n.to_string())
-            .collect();
-        let at = device.uplink.map(|u| format!("{}:{}", u.device, u.port));
-        let protocols = device.protocols();
-        let clock = device.dc.then(|| device.controller.clock_bits());
-        table.row([
-            &device.position().to_string(),
-            &format!("0x{:04x}", device.found.station),
-            &or_dash((device.found.alias != 0).then_some(device.found.alias)),
-            &or_dash(device.id),
-            &or_dash(at),
-            &open.join(" "),
-            &or_dash(device.delay_ns.map(|ns| format!("{ns} ns"))),
-            &or_dash(clock.map(|bits| format!("{bits} bit"))),
-            &match protocols.is_empty() {
-                true => "-".to_owned(),
-                false => protocols.join(" "),
-            },
-        ]);
-    }
-    table
-}
-
-fn descriptions(seen: &ScanResult) -> Table {
-    let mut table = Table::new(&["pos", "ESI file", "revision", "out", "in", "axis"]);
+pub(super) fn document(seen: &ScanResult) -> Document {
+    let count = pluralize(seen.scan.devices.len(), "SubDevice");
+    let mut out = Document::new(format!("{count} on `{}`", seen.nic));
+    let mut identities = Table::new("pos|type|vendor|product|revision|serial|state");
+    let mut places = Table::new("pos|address|alias|id|at|open ports|delay|clock|mailbox");
+    let mut descriptions = Table::new("pos|ESI file|revision|out|in|axis");
+    let mut answers = Table::new("pos|name|hardware|software|modules");
+    let mut drives =
+        Table::new("pos|modes|counts/turn|velocity in|position range|speed|torque|window");
     for (device, described) in seen.devices() {
-        let both = described.and_then(EsiMatch::default_bytes);
-        let file = described.map(|d| {
-            let name = d.path.file_name().unwrap_or_default();
-            name.to_string_lossy().into_owned()
-        });
-        table.row([
-            &device.position().to_string(),
-            &file.unwrap_or_else(|| "none".to_owned()),
-            &or_dash(described.map(|d| fit(device, d))),
-            &or_dash(both.map(|(out, _)| format!("{out} B"))),
-            &or_dash(both.map(|(_, inp)| format!("{inp} B"))),
-            &axis(device, described),
-        ]);
+        identities.row(identity(device, described));
+        places.row(place(device));
+        descriptions.row(description(device, described));
+        if let Some(Ok(info)) = &device.answers {
+            answers.row(cells![
+                device.position(),
+                or_dash(info.name.as_ref()),
+                or_dash(info.hardware.as_ref()),
+                or_dash(info.software.as_ref()),
+                or_dash(modules(info, described)),
+            ]);
+            drives_row(device, info, &mut drives);
+        }
     }
-    table
-}
-
-/// Formats the answers of the mailboxes.
-fn asked(seen: &ScanResult) -> String {
-    let mut all = Table::new(&["pos", "name", "hardware", "software", "modules"]);
-    let mut drives = Table::new(&[
-        "pos",
-        "modes",
-        "counts/turn",
-        "velocity in",
-        "position range",
-        "speed",
-        "torque",
-        "window",
-    ]);
-    let (mut some, mut any_drive) = (false, false);
-    for (device, described) in seen.devices() {
-        let Some(Ok(answers)) = &device.answers else {
-            continue;
-        };
-        some = true;
-        let position = device.position().to_string();
-        all.row([
-            &position,
-            &or_dash(answers.name.clone()),
-            &or_dash(answers.hardware.clone()),
-            &or_dash(answers.software.clone()),
-            &or_dash(modules(answers, described)),
-        ]);
-        let Some(drive) = &answers.drive else {
-            continue;
-        };
-        any_drive = true;
-        let counts = drive.units.counts_per_turn().map(|(_, counts)| counts);
-        let velocity = drive.units.velocity_unit;
-        drives.row([
-            &position,
-            &or_dash(drive.supported_modes.map(mode_names)),
-            &or_dash(counts),
-            &or_dash(velocity.map(|code| match VelocityUnit::from_si_code(code) {
-                Some(unit) => unit.to_string(),
-                None => format!("0x{code:08x}"),
-            })),
-            &or_dash(drive.software_limits.map(range)),
-            &or_dash(drive.max_motor_speed.map(|rpm| format!("{rpm} rpm"))),
-            &or_dash(
-                drive
-                    .max_torque
-                    .map(|n| format!("{} %", f64::from(n) / 10.0)),
-            ),
-            &or_dash(drive.following_window),
-        ]);
+    out.gap();
+    for table in [identities, places, descriptions, answers] {
+        out.table_if_any(table);
     }
-    let mut text = String::new();
-    if some {
-        text += &format!("\n{}\n", all.within(2, PAGE));
-    }
-    if any_drive {
-        text += &format!(
-            "\n{}\n  ranges and windows in counts; 0x6502, 0x608F, 0x60A9, 0x607D, 0x6080, 0x6072,\n  0x6065\n",
-            drives.within(2, PAGE)
+    if !drives.is_empty() {
+        out.table(drives);
+        out.line(
+            "ranges and windows in counts; 0x6502, 0x608F, 0x60A9, 0x607D, 0x6080, 0x6072, 0x6065",
         );
     }
-    text
+    notes(seen, &mut out);
+    out
+}
+
+fn identity(device: &Device, esi: Option<&EsiMatch>) -> [String; 7] {
+    let identity = device.identity();
+    let error = if device.found.error { " + error" } else { "" };
+    cells![
+        device.position(),
+        type_name(device, esi),
+        hex(identity.map(|i| i.vendor)),
+        hex(identity.map(|i| i.product)),
+        hex(identity.map(|i| i.revision)),
+        or_dash(device.serial().filter(|serial| *serial != 0)),
+        format!("{}{error}", device.found.state),
+    ]
+}
+
+fn place(device: &Device) -> [String; 9] {
+    let open = topology::open_ports(device.found.dl_status);
+    let open: Vec<(bool, &str)> = open.into_iter().zip(["0", "1", "2", "3"]).collect();
+    let protocols = Some(device.protocols().join(" "));
+    let clock = device.dc.then(|| device.controller.clock_bits());
+    cells![
+        device.position(),
+        hex16(device.found.station),
+        or_dash((device.found.alias != 0).then_some(device.found.alias)),
+        or_dash(device.id),
+        or_dash(device.uplink.map(|u| format!("{}:{}", u.device, u.port))),
+        names_of(&open, " "),
+        or_dash(device.delay_ns.map(|ns| format!("{ns} ns"))),
+        or_dash(clock.map(|bits| format!("{bits} bit"))),
+        or_dash(protocols.filter(|names| !names.is_empty())),
+    ]
+}
+
+fn description(device: &Device, described: Option<&EsiMatch>) -> [String; 6] {
+    let both = described.and_then(EsiMatch::default_bytes);
+    let file = described.map(|d| d.path.file_name().unwrap_or_default().to_string_lossy());
+    cells![
+        device.position(),
+        file.unwrap_or("none".into()),
+        or_dash(described.map(|d| fit(device, d))),
+        or_dash(both.map(|(out, _)| format!("{out} B"))),
+        or_dash(both.map(|(_, inp)| format!("{inp} B"))),
+        axis(device, described),
+    ]
+}
+
+fn drives_row(device: &Device, info: &CoeInfo, table: &mut Table) {
+    let Some(drive) = &info.drive else { return };
+    let velocity = |code| match VelocityUnit::from_si_code(code) {
+        Some(unit) => unit.to_string(),
+        None => hex32(code),
+    };
+    let torque = drive.max_torque.map(f64::from);
+    table.row(cells![
+        device.position(),
+        or_dash(drive.supported_modes.map(mode_names)),
+        or_dash(drive.units.counts_per_turn().map(|(_, counts)| counts)),
+        or_dash(drive.units.velocity_unit.map(velocity)),
+        or_dash(drive.software_limits.map(range)),
+        or_dash(drive.max_motor_speed.map(|rpm| format!("{rpm} rpm"))),
+        or_dash(torque.map(|n| format!("{} %", n / 10.0))),
+        or_dash(drive.following_window),
+    ]);
 }
 
 /// Formats a position range. The full 32-bit range means no limits.
@@ -239,11 +173,10 @@ fn mode_names(bits: u32) -> String {
         (9, "cst"),
         (10, "cstca"),
     ];
-    let named = NAMES.iter().filter(|(bit, _)| bits >> bit & 1 != 0);
-    let names: Vec<&str> = named.map(|(_, name)| *name).collect();
-    match names.is_empty() {
-        true => format!("0x{bits:08x}"),
-        false => names.join(" "),
+    let names = NAMES.map(|(bit, name)| (bits >> bit & 1 != 0, name));
+    match names_of(&names, " ") {
+        none if none.is_empty() => format!("0x{bits:08x}"),
+        names => names,
     }
 }
 
@@ -270,26 +203,22 @@ fn axis(device: &Device, described: Option<&EsiMatch>) -> String {
     }
 }
 
-/// Formats remarks that need more than a table cell.
-fn notes(seen: &ScanResult) -> String {
-    let mut text = String::new();
-    for device in seen.scan.devices.iter().filter(|d| d.found.error) {
-        let (position, found) = (device.position(), &device.found);
-        text += &format!(
-            "  position {position}: in {} with AL status code 0x{:04x}: {}\n",
-            found.state,
-            found.code,
-            al_status_text(found.code)
-        );
-    }
+/// Adds remarks that need more than a table cell.
+fn notes(seen: &ScanResult, out: &mut Document) {
+    let wrong = seen.scan.devices.iter().filter(|d| d.found.error);
+    let wrong = wrong.map(|device| {
+        let (position, state, code) = (device.position(), device.found.state, device.found.code);
+        let text = al_status_text(code);
+        format!("position {position}: in {state} with AL status code 0x{code:04x}: {text}")
+    });
+    let mut notes: Vec<String> = wrong.collect();
     if !seen.scan.measured && seen.scan.devices.iter().any(|d| d.delay_ns.is_some()) {
-        text += "  delays are those that the other master wrote (0x0928)\n";
+        notes.push("delays are those that the other master wrote (0x0928)".to_owned());
     }
-    if text.is_empty() {
-        text
-    } else {
-        format!("\n{text}")
+    if !notes.is_empty() {
+        out.gap();
     }
+    notes.into_iter().for_each(|note| out.line(note));
 }
 
 /// Draws the topology from port to port.

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use ecaxis_master::config::{self, ConfigError};
+use ecaxis_master::text::pluralize;
 use ecaxis_tools::scan::write::{self, MARK, OutputPath};
 
 use super::ScanResult;
@@ -33,18 +34,14 @@ pub(super) fn machine_file(seen: &ScanResult, path: &Path, library: bool) -> Res
     replace(path, &text)?;
     let devices = seen.scan.devices.len();
     let axes = text.matches("[device.axis]").count();
-    let plural = |n: usize| if n == 1 { "" } else { "s" };
-    let mut reported = format!(
-        "{}: {devices} device{}, {axes} of them {}\n",
-        path.display(),
-        plural(devices),
-        if axes == 1 { "an axis" } else { "axes" },
-    );
+    let of_them = if axes == 1 { "an axis" } else { "axes" };
+    let file = path.display();
+    let devices = pluralize(devices, "device");
+    let mut reported = format!("{file}: {devices}, {axes} of them {of_them}\n");
     let checks = text.lines().filter(|line| line.contains(MARK));
     // The first lines of the file explain the mark.
     let checks = checks.filter(|line| !line.starts_with("# Written")).count();
     reported += &format!("{checks} lines are marked \"{MARK}\" and need a check\n");
-    let file = path.display();
     reported += &format!("next: `ecaxis check {file}`, then `ecaxis run {file} --no-enable`\n");
     if !seen.scan.asked {
         bus::warn("the devices were not asked: units, limits and modules in the file are guesses");
@@ -57,10 +54,9 @@ pub(super) fn machine_file(seen: &ScanResult, path: &Path, library: bool) -> Res
             "  = help: name the folder of ESI files with `--esi`"
         });
     } else if let Err(ConfigError::Problems(problems)) = config::load(path) {
+        let problems = pluralize(problems.len(), "problem");
         bus::warn(format_args!(
-            "the file has {} problem{}: `ecaxis check {file}` shows them",
-            problems.len(),
-            plural(problems.len()),
+            "the file has {problems}: `ecaxis check {file}` shows them"
         ));
     }
     result(&reported)

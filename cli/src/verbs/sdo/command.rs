@@ -7,8 +7,7 @@ use serde_json::json;
 use crate::args::device::{DeviceArgs, Open, no_more};
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::result;
+use crate::render::{note, print_json};
 
 const STORE_EXAMPLES: &str = "\
 Examples:
@@ -84,7 +83,7 @@ fn give(which: &Which, command: Command) -> Result<(), Failure> {
     })?;
     if which.json {
         let report = json!({ "ok": true, "device": device.name, "position": device.position });
-        return result(&format!("{report:#}\n"));
+        return print_json(&report);
     }
     note(&match command {
         Command::Store => format!("{device}: the parameters are kept over power cycles"),

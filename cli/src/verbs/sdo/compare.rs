@@ -3,11 +3,11 @@
 use std::path::Path;
 
 use super::dump::taken;
-use super::{Common, as_json, differences, load};
+use super::{Common, as_json, load, print_differences};
 use crate::args::device::Open;
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::result;
+use crate::render::print_json;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -62,10 +62,10 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
     let found =
         ecaxis_tools::parameters::compare::compare(&left.parameters, &right.parameters, args.all);
     let [first, second] = &names;
-    result(&match args.common.json {
-        true => format!("{:#}\n", as_json(&found)),
-        false => differences([first, second], &found),
-    })?;
+    match args.common.json {
+        true => print_json(&as_json(&found))?,
+        false => print_differences([first, second], &found)?,
+    }
     if found.is_empty() {
         return Ok(());
     }

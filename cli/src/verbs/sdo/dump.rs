@@ -12,8 +12,7 @@ use crate::args::device::{Open, address, counter};
 use crate::args::files::write_new;
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::result;
+use crate::render::{note, print_json};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -54,7 +53,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
         let report = json!({
             "file": path.display().to_string(), "parameters": dump.parameters.len(), "refused": refused.len(),
         });
-        return result(&format!("{report:#}\n"));
+        return print_json(&report);
     }
     note(&format!(
         "{}: {} parameters of {}",

@@ -3,7 +3,6 @@
 use super::Common;
 use crate::args::device::{Open, no_more};
 use crate::hints::Failure;
-use crate::render::result;
 use crate::verbs::esi::objects;
 
 const EXAMPLES: &str = "\
@@ -35,5 +34,5 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
         "asking for its objects",
         async move |open: &mut Open<'_>| open.dictionary(ask).await,
     )?;
-    result(&objects::listed(&dictionary, args.common.json))
+    objects::list(&dictionary, args.common.json)
 }

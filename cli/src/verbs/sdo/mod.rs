@@ -6,6 +6,9 @@ use std::path::{Path, PathBuf};
 use clap::Subcommand;
 use ecaxis_esi::Dictionary;
 use ecaxis_master::mailbox::{NamedObject, abort_text};
+use ecaxis_tools::cells;
+use ecaxis_tools::document::Table;
+use ecaxis_tools::document::format::or_dash;
 use ecaxis_tools::parameters::compare::Difference;
 use ecaxis_tools::parameters::dump::Dump;
 use ecaxis_tools::parameters::lookup::{FindError, ObjectQuery, find};
@@ -15,7 +18,7 @@ use crate::args::Verbosity;
 use crate::args::device::{DeviceArgs, Target, address};
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::table::Table;
+use crate::render::{print_table, result};
 
 mod command;
 mod compare;
@@ -143,7 +146,7 @@ struct Line {
     value: Result<(String, Option<String>), u32>,
 }
 
-fn lines(all: &[Line]) -> String {
+fn print_lines(all: &[Line]) -> Result<(), Failure> {
     if let [line] = all {
         let Line {
             at,
@@ -160,40 +163,43 @@ fn lines(all: &[Line]) -> String {
             Ok((value, None)) => value.clone(),
             Err(code) => refusal(*code),
         };
-        return format!("{}{name} ({data_type}) = {value}\n", address(*at));
+        return result(&format!("{}{name} ({data_type}) = {value}\n", address(*at)));
     }
-    let mut table = Table::new(&["object", "type", "value", "hex", "name"]);
+    let mut table = Table::new("object|type|value|hex|name");
     for line in all {
         let (value, hex) = match &line.value {
             Ok((value, hex)) => (value.clone(), hex.clone().unwrap_or_default()),
             Err(code) => (refusal(*code), String::new()),
         };
-        table.row([&address(line.at), &line.data_type, &value, &hex, &line.name]);
+        table.row(cells![
+            address(line.at),
+            line.data_type,
+            value,
+            hex,
+            line.name
+        ]);
     }
-    table.shown(0) + "\n"
+    print_table(&table)
 }
 
 fn refusal(code: u32) -> String {
     format!("refused with {code:#010x}: {}", abort_text(code))
 }
 
-/// Formats the differences between two sides as a table.
-fn differences(sides: [&str; 2], all: &[Difference]) -> String {
+/// Prints the differences between two sides as a table.
+fn print_differences(sides: [&str; 2], all: &[Difference]) -> Result<(), Failure> {
     if all.is_empty() {
-        return String::new();
+        return Ok(());
     }
+    // A file name may contain the separator of headings.
+    let mut table = Table::default();
     let [left, right] = sides;
-    let mut table = Table::new(&["object", left, right, "name"]);
-    let side = |value: &Option<String>| value.clone().unwrap_or_else(|| "-".to_owned());
-    for difference in all {
-        table.row([
-            &address(difference.at),
-            &side(&difference.left),
-            &side(&difference.right),
-            &difference.name,
-        ]);
+    table.row(cells!["object", left, right, "name"]);
+    for d in all {
+        let (left, right) = (or_dash(d.left.as_ref()), or_dash(d.right.as_ref()));
+        table.row(cells![address(d.at), left, right, d.name]);
     }
-    table.shown(0) + "\n"
+    print_table(&table)
 }
 
 fn as_json(all: &[Difference]) -> Value {

@@ -5,16 +5,17 @@ use std::path::PathBuf;
 use ecaxis_esi::Object;
 use ecaxis_master::acyclic::ServiceError;
 use ecaxis_master::mailbox::{NamedObject, SdoError, object_name};
+use ecaxis_master::text::pluralize;
+use ecaxis_tools::document::format::hex_bytes;
 use ecaxis_tools::parameters::lookup::ObjectQuery;
 use ecaxis_tools::parameters::{DataType, dictionary, name_of, type_of};
 use serde_json::json;
 
-use super::{Common, Line, wanted};
+use super::{Common, Line, print_lines, wanted};
 use crate::args::device::{Open, address};
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::result;
+use crate::render::{note, print_json};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -112,9 +113,9 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
             })
         });
         let all: serde_json::Value = each.collect();
-        result(&format!("{all:#}\n"))?;
+        print_json(&all)?;
     } else {
-        result(&super::lines(&lines))?;
+        print_lines(&lines)?;
     }
     if refused.is_empty() {
         return Ok(());
@@ -126,13 +127,12 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
 /// Returns a failure if a value's length differs from the requested type.
 fn misfit(given: DataType, values: &[Read]) -> Option<Failure> {
     let width = given.width()?;
-    let bytes = |n: usize| format!("{n} byte{}", if n == 1 { "" } else { "s" });
     values.iter().find_map(|(at, .., value)| {
         let found = value.as_ref().ok()?.len();
         let message = format!(
             "{} has {}, a {given} has {width}",
             address(*at),
-            bytes(found)
+            pluralize(found, "byte")
         );
         (found != width).then(|| {
             Failure::new(hints::WRONG, message).hint(
@@ -160,12 +160,7 @@ fn line((at, name, data_type, value): Read) -> Line {
 /// Formats a number of more than one bit in hexadecimal.
 pub(super) fn hex(data_type: DataType, bytes: &[u8]) -> Option<String> {
     data_type.integer(bytes).filter(|_| data_type.bits > 1)?;
-    let digits: String = bytes
-        .iter()
-        .rev()
-        .map(|byte| format!("{byte:02x}"))
-        .collect();
-    Some(format!("0x{digits}"))
+    Some(format!("0x{}", hex_bytes(bytes.iter().rev(), "")))
 }
 
 pub(super) fn data_type(name: Option<&str>) -> Result<Option<DataType>, Failure> {

@@ -5,13 +5,12 @@ use std::path::Path;
 use ecaxis_tools::parameters::restore::{Restored, restore};
 use serde_json::json;
 
-use super::{Common, as_json, differences, load, refusal};
+use super::{Common, as_json, load, print_differences, refusal};
 use crate::args::bus;
 use crate::args::device::{Open, address, counter};
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::result;
+use crate::render::{note, print_json};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -93,7 +92,7 @@ fn report(args: &Args, file: &str, done: &Restored) -> Result<(), Failure> {
             })).collect::<Vec<_>>(),
             "differing": as_json(&done.differing),
         });
-        return result(&format!("{report:#}\n"));
+        return print_json(&report);
     }
     for at in &done.missing {
         note(&format!("{at}: the device has no such setting"));
@@ -101,7 +100,7 @@ fn report(args: &Args, file: &str, done: &Restored) -> Result<(), Failure> {
     for (at, code) in &done.refused {
         note(&format!("{at}: {}", refusal(*code)));
     }
-    result(&differences([file, "device"], &done.differing))?;
+    print_differences([file, "device"], &done.differing)?;
     note(&format!(
         "{} settings written, {} had their value already",
         done.written, done.same

@@ -9,12 +9,11 @@ use ecaxis_tools::parameters::{DataType, ValueError};
 use serde_json::json;
 
 use super::read::{data_type, describe, hex, parts};
-use super::{Common, Line, lines};
+use super::{Common, Line, print_lines};
 use crate::args::device::{Open, address};
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::result;
+use crate::render::{note, print_json};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -115,7 +114,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
             "index": at.index, "sub": at.sub, "name": name, "type": data_type.to_string(),
             "written": shown(&value), "before": before.as_ref().map(shown), "after": after.as_ref().map(shown),
         });
-        return result(&format!("{report:#}\n"));
+        return print_json(&report);
     }
     if let Some(after) = after.as_ref().filter(|_| !kept) {
         note(&format!(
@@ -138,7 +137,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
             false => (shown(&value), hex(data_type, &value)),
         }),
     };
-    result(&lines(&[line]))
+    print_lines(&[line])
 }
 
 fn nothing() -> Failure {

@@ -1,7 +1,7 @@
 //! The problems of a report, worst first.
 
 use super::{CycleReport, Report, WkcRun, called};
-use crate::html::time;
+use crate::document::format::time;
 
 /// Clocks with a larger difference in ns are not synchronized.
 const CLOCK_NS: u64 = 10_000;

@@ -4,12 +4,13 @@ use ecaxis_esi::{
     Device, EsiFile, Field, Mode, Pdo, SelectError, SelectOptions, Selection, SmLayout, StartupSdo,
     offered_modes,
 };
+use ecaxis_tools::document::format::hex_bytes;
 use serde_json::{Value, json};
 
 use super::{head, offers};
 
-/// Formats a summary of the devices in a file.
-pub(super) fn devices(file: &EsiFile) -> String {
+/// Returns a summary of the devices in a file.
+pub(super) fn devices(file: &EsiFile) -> Value {
     let devices: Vec<Value> = file
         .devices
         .iter()
@@ -21,7 +22,7 @@ pub(super) fn devices(file: &EsiFile) -> String {
             value
         })
         .collect();
-    format!("{:#}\n", json!({ "devices": devices }))
+    json!({ "devices": devices })
 }
 
 pub(super) fn device(
@@ -29,7 +30,7 @@ pub(super) fn device(
     device: &Device,
     choice: &SelectOptions<'_>,
     selection: &Result<Selection, SelectError>,
-) -> String {
+) -> Value {
     let mut value = identity(file, device);
     value["line"] = json!(device.position.line);
     value["profile"] = json!(device.profile.map(|profile| profile & 0xffff));
@@ -67,7 +68,7 @@ pub(super) fn device(
         Ok(selection) => value["configuration"] = configuration(selection, choice.cycle_ns),
         Err(error) => value["error"] = json!(error.to_string()),
     }
-    format!("{value:#}\n")
+    value
 }
 
 fn identity(file: &EsiFile, device: &Device) -> Value {
@@ -141,10 +142,9 @@ fn field(field: &Field) -> Value {
 }
 
 fn sdo(sdo: &StartupSdo) -> Value {
-    let data: Vec<String> = sdo.data.iter().map(|byte| format!("{byte:02x}")).collect();
     json!({
         "transition": sdo.transition, "index": sdo.index, "sub": sdo.sub,
-        "complete_access": sdo.complete_access, "data": data.concat(), "name": sdo.name,
+        "complete_access": sdo.complete_access, "data": hex_bytes(&*sdo.data, ""), "name": sdo.name,
         "from": sdo.origin,
     })
 }

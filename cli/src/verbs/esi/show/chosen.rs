@@ -1,19 +1,19 @@
 //! One configuration: SyncManagers, process data with offsets, start-up list.
 
-use std::fmt::Write;
-
 use ecaxis_esi::{Device, SelectOptions, Selection, SmUse};
 use ecaxis_master::config::duration;
+use ecaxis_tools::cells;
+use ecaxis_tools::document::format::hex16;
+use ecaxis_tools::document::{Document, Table};
 
 use crate::render::pdo_table::{fields, startup};
-use crate::render::report::Table;
 
 pub(super) fn write(
     device: &Device,
     selection: &Selection,
     choice: &SelectOptions<'_>,
-    out: &mut String,
-) -> std::fmt::Result {
+    out: &mut Document,
+) {
     let what = match (selection.mode, selection.modules.as_slice()) {
         (Some(mode), _) => format!("mode {mode}"),
         (None, []) => "the default".to_owned(),
@@ -25,16 +25,13 @@ pub(super) fn write(
             format!("the default, {}", names.join(", "))
         }
     };
-    writeln!(
-        out,
-        "\nconfiguration: {what}, cycle {}",
-        duration::show(choice.cycle_ns)
-    )?;
+    let cycle = duration::show(choice.cycle_ns);
+    out.heading(format!("configuration: {what}, cycle {cycle}"));
     for note in &selection.notes {
-        writeln!(out, "  note: {note}")?;
+        out.item("note: ", note);
     }
     let layout = &selection.layout;
-    let mut table = Table::new(&["SM", "use", "address", "bytes", "control"]);
+    let mut table = Table::new("SM|use|address|bytes|control");
     for (number, sm) in device.sync_managers.iter().enumerate() {
         let mut process = layout.outputs.iter().chain(&layout.inputs);
         let used = process.find(|used| usize::from(used.sm) == number);
@@ -48,16 +45,12 @@ pub(super) fn write(
         let (len, control) = used.map_or((sm.default_size, sm.control_byte), |used| {
             (used.len, used.control_byte)
         });
-        table.row([
-            &number.to_string(),
-            usage,
-            &format!("0x{:04x}", sm.start_address),
-            &len.to_string(),
-            &format!("0x{control:02x}"),
-        ]);
+        let (address, control) = (hex16(sm.start_address), format!("0x{control:02x}"));
+        table.row(cells![number, usage, address, len, control]);
     }
-    writeln!(out, "\n{}", table.shown(2))?;
-    fields("outputs", layout.rx_bytes(), &layout.rx, out)?;
-    fields("inputs", layout.tx_bytes(), &layout.tx, out)?;
-    startup(&selection.startup, out)
+    out.gap();
+    out.table(table);
+    fields("outputs", layout.rx_bytes(), &layout.rx, out);
+    fields("inputs", layout.tx_bytes(), &layout.tx, out);
+    startup(&selection.startup, out);
 }

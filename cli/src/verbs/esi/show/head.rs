@@ -1,52 +1,54 @@
 //! Identity, interfaces and mailbox protocols of a device.
 
-use std::fmt::Write;
-
 use ecaxis_esi::{Device, EsiFile, Identification, Mailbox, PortKind, SmUse};
+use ecaxis_tools::cells;
+use ecaxis_tools::document::format::{hex32, names_of};
+use ecaxis_tools::document::{Document, Table};
 
-use crate::render::report::Table;
-
-pub(super) fn write(file: &EsiFile, device: &Device, out: &mut String) -> std::fmt::Result {
-    writeln!(out, "{} {:?}", device.type_name, device.name)?;
+/// Returns a document with the identity.
+pub(super) fn document(file: &EsiFile, device: &Device) -> Document {
+    let mut out = Document::new(format!("{} {:?}", device.type_name, device.name));
     let vendor = format!("{} (0x{:08x})", file.vendor.name, file.vendor.id);
-    let mut table = Table::new(&["vendor", &vendor]);
+    let mut table = Table::new("");
+    table.row(cells!["vendor", vendor]);
     let id = device.identity;
-    table.row(["product code", &format!("0x{:08x}", id.product)]);
-    table.row(["revision", &format!("0x{:08x}", id.revision)]);
+    table.row(cells!["product code", hex32(id.product)]);
+    table.row(cells!["revision", hex32(id.revision)]);
     if let Some(profile) = device.profile {
         let meaning = match profile & 0xffff {
             402 => " (CiA 402 drive)",
             5001 => " (modular device)",
             _ => "",
         };
-        table.row(["profile", &format!("{}{meaning}", profile & 0xffff)]);
+        table.row(cells!["profile", format!("{}{meaning}", profile & 0xffff)]);
     }
     if !device.hides.is_empty() {
         let hides = device.hides.iter().map(|hidden| match hidden.product {
             Some(product) if product != id.product => {
                 format!("0x{:08x} of product 0x{product:08x}", hidden.revision)
             }
-            _ => format!("0x{:08x}", hidden.revision),
+            _ => hex32(hidden.revision),
         });
         let hides: Vec<String> = hides.collect();
-        table.row(["stands for revision", &hides.join(", ")]);
+        table.row(cells!["stands for revision", hides.join(", ")]);
     }
-    table.row(["ports", &ports(device)]);
+    table.row(cells!["ports", ports(device)]);
     if let Some(mailbox) = &device.mailbox {
-        table.row(["mailbox", &mailbox_text(device, mailbox)]);
+        table.row(cells!["mailbox", mailbox_text(device, mailbox)]);
     } else {
-        table.row(["mailbox", "none"]);
+        table.row(cells!["mailbox", "none"]);
     }
     let info = &device.info;
     match info.identification {
         Identification::No => {}
-        Identification::Reg134 => {
-            table.row(["identification", "AL control bit 5, answer in 0x0134"])
-        }
-        Identification::Ado(ado) => table.row(["identification", &format!("at 0x{ado:04x}")]),
+        Identification::Reg134 => table.row(cells![
+            "identification",
+            "AL control bit 5, answer in 0x0134"
+        ]),
+        Identification::Ado(ado) => table.row(cells!["identification", format!("at 0x{ado:04x}")]),
     }
     if let Some(current) = info.ebus_current_ma {
-        table.row(["E-bus current", &format!("{current} mA")]);
+        table.row(cells!["E-bus current", format!("{current} mA")]);
     }
     let times = [
         ("to PreOp", info.preop_timeout_ms),
@@ -60,10 +62,11 @@ pub(super) fn write(file: &EsiFile, device: &Device, out: &mut String) -> std::f
         .filter_map(|(what, ms)| ms.map(|ms| format!("{what} {ms} ms")));
     let times: Vec<String> = times.collect();
     if !times.is_empty() {
-        table.row(["time limits", &times.join(", ")]);
+        table.row(cells!["time limits", times.join(", ")]);
     }
-    table.row(["line", &device.position.line.to_string()]);
-    writeln!(out, "{}", table.shown(2))
+    table.row(cells!["line", device.position.line.to_string()]);
+    out.table(table);
+    out
 }
 
 fn ports(device: &Device) -> String {
@@ -115,13 +118,9 @@ fn mailbox_text(device: &Device, mailbox: &Mailbox) -> String {
             (coe.sdo_info, "SDO Information"),
             (coe.diag_history, "diagnosis history"),
         ];
-        let can: Vec<&str> = can
-            .iter()
-            .filter(|(on, _)| *on)
-            .map(|(_, what)| *what)
-            .collect();
-        if !can.is_empty() {
-            let _ = write!(text, "; CoE allows {}", can.join(", "));
+        match names_of(&can, ", ") {
+            none if none.is_empty() => {}
+            can => text += &format!("; CoE allows {can}"),
         }
     }
     text
@@ -136,6 +135,5 @@ pub(super) fn protocols(mailbox: &Mailbox) -> String {
         (mailbox.aoe, "AoE"),
         (mailbox.voe, "VoE"),
     ];
-    let names = names.iter().filter(|(on, _)| *on).map(|(_, name)| *name);
-    names.collect::<Vec<_>>().join(" ")
+    names_of(&names, " ")
 }

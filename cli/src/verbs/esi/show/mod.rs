@@ -3,19 +3,17 @@
 //! `head` shows the identity, `offers` the options, `chosen` one configuration; `as_json` formats
 //! all as JSON.
 
-use std::fmt::Write;
-
 use ecaxis_esi::{EsiFile, Mode, SelectError, SelectOptions, offered_modes, select};
 use ecaxis_master::config::duration;
 use ecaxis_master::text::pluralize;
+use ecaxis_tools::cells;
+use ecaxis_tools::document::format::{hex16, hex32};
+use ecaxis_tools::document::{Document, Table};
 
 use super::DeviceArgs;
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::page;
-use crate::render::report::Table;
-use crate::render::result;
+use crate::render::{note, print, print_json};
 
 mod as_json;
 mod chosen;
@@ -64,12 +62,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         .all(|pair| pair[0].identity.product == pair[1].identity.product);
     if !args.which.says_which() && (file.devices.is_empty() || !one_product) {
         if args.json {
-            return result(&as_json::devices(&file));
+            return print_json(&as_json::devices(&file));
         }
-        let mut out = String::new();
-        // Writing into a String cannot fail.
-        let _ = devices(&file, &mut out);
-        return page(&out);
+        return print(&devices(&file));
     }
     let device = args.which.device(&file)?;
     let modules: Vec<&str> = args.modules.iter().map(String::as_str).collect();
@@ -95,82 +90,73 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         other => other,
     };
     if args.json {
-        return result(&as_json::device(&file, device, &choice, &selection));
+        return print_json(&as_json::device(&file, device, &choice, &selection));
     }
-    let mut out = String::new();
-    let _ = head::write(&file, device, &mut out);
+    let mut out = head::document(&file, device);
     let mailbox = device.mailbox.as_ref();
     let soe_alone = mailbox.is_some_and(|mailbox| mailbox.soe && mailbox.coe.is_none());
     if soe_alone {
-        let _ = writeln!(
-            out,
-            "\nnot usable: it speaks SoE and not CoE; IDNs set what its process data contains, and ecaxis does not \
-             speak SoE"
+        out.heading(
+            "not usable: it speaks SoE and not CoE; IDNs set what its process data contains, and ecaxis does not \
+             speak SoE",
         );
     }
-    let _ = offers::write(&file, device, &choice, &mut out);
+    offers::write(&file, device, &choice, &mut out);
     match &selection {
-        Ok(selection) if !soe_alone => {
-            let _ = chosen::write(device, selection, &choice, &mut out);
-        }
+        Ok(selection) if !soe_alone => chosen::write(device, selection, &choice, &mut out),
         Err(error) if !soe_alone => {
-            let _ = writeln!(out, "\nno default configuration: {error}");
+            out.heading(format!("no default configuration: {error}"));
             if matches!(error, SelectError::ModuleNeeded { .. }) {
                 note("help: `--modules` takes one module for each slot, `-` for none");
             }
         }
         _ => {}
     }
-    page(&out)
+    print(&out)
 }
 
-fn devices(file: &EsiFile, out: &mut String) -> std::fmt::Result {
-    writeln!(
-        out,
-        "{} (0x{:08x}): {}, {}\n",
+fn devices(file: &EsiFile) -> Document {
+    let mut out = Document::new(format!(
+        "{} (0x{:08x}): {}, {}",
         file.vendor.name,
         file.vendor.id,
         pluralize(file.devices.len(), "device"),
         pluralize(file.modules.len(), "module"),
-    )?;
+    ));
+    out.gap();
     if file.devices.is_empty() {
-        return modules(file, out);
+        out.table(modules(file));
+        return out;
     }
-    let head = ["type", "product", "revision", "modes", "mailbox", "name"];
-    let mut table = Table::new(&head);
+    let mut table = Table::new("type|product|revision|modes|mailbox|name");
     for device in &file.devices {
-        let modes: Vec<String> = offered_modes(file, device)
-            .iter()
-            .map(Mode::to_string)
-            .collect();
-        table.row([
-            &device.type_name,
-            &format!("0x{:08x}", device.identity.product),
-            &format!("0x{:08x}", device.identity.revision),
-            &modes.join(" "),
-            &device
+        let modes = offered_modes(file, device);
+        let modes: Vec<&str> = modes.iter().map(|mode| mode.name()).collect();
+        table.row(cells![
+            device.type_name,
+            hex32(device.identity.product),
+            hex32(device.identity.revision),
+            modes.join(" "),
+            device
                 .mailbox
                 .as_ref()
                 .map_or_else(String::new, head::protocols),
-            &device.name,
+            device.name,
         ]);
     }
-    writeln!(out, "{}", table.shown(0))?;
-    writeln!(out, "\n`--device TYPE` shows one of them.")
+    out.table(table);
+    out.heading("`--device TYPE` shows one of them.");
+    out
 }
 
 /// Shows a file that only contains modules for devices of another file.
-fn modules(file: &EsiFile, out: &mut String) -> std::fmt::Result {
-    let mut table = Table::new(&["module", "identity", "PDOs", "name"]);
+fn modules(file: &EsiFile) -> Table {
+    let mut table = Table::new("module|identity|PDOs|name");
     for module in &file.modules {
         let pdos = module.rx_pdos.iter().chain(&module.tx_pdos);
-        let pdos: Vec<String> = pdos.map(|pdo| format!("0x{:04x}", pdo.index)).collect();
-        table.row([
-            &module.type_name,
-            &format!("0x{:08x}", module.ident),
-            &pdos.join(" "),
-            &module.name,
-        ]);
+        let pdos: Vec<String> = pdos.map(|pdo| hex16(pdo.index)).collect();
+        let (ident, pdos) = (hex32(module.ident), pdos.join(" "));
+        table.row(cells![module.type_name, ident, pdos, module.name]);
     }
-    writeln!(out, "{}", table.shown(0))
+    table
 }

@@ -1,26 +1,25 @@
 //! The options of a device: modes, slots, assignments, clock modes, PDOs.
 
-use std::fmt::Write;
-
 use ecaxis_esi::{
     Device, EsiFile, Field, Layout, Mode, Pdo, SelectError, SelectOptions, Selection, SyncTime,
     address, offered_modes, select,
 };
 use ecaxis_master::config::duration;
-
-use crate::render::report::Table;
+use ecaxis_tools::cells;
+use ecaxis_tools::document::format::{hex16, hex32, names_of, or_dash};
+use ecaxis_tools::document::{Document, Table};
 
 pub(super) fn write(
     file: &EsiFile,
     device: &Device,
     choice: &SelectOptions<'_>,
-    out: &mut String,
-) -> std::fmt::Result {
-    modes(file, device, choice, out)?;
-    slots(file, device, out)?;
-    assignments(device, out)?;
-    clock_modes(device, out)?;
-    pdo_list(file, device, out)
+    out: &mut Document,
+) {
+    modes(file, device, choice, out);
+    slots(file, device, out);
+    section("PDO assignments by name", assignments(device), out);
+    section("clock modes", clock_modes(device), out);
+    pdo_list(file, device, out);
 }
 
 /// Returns the configuration of each mode, independent of the user's other choices.
@@ -43,129 +42,105 @@ pub(super) fn by_mode(
     modes.map(selected).collect()
 }
 
-fn modes(
-    file: &EsiFile,
-    device: &Device,
-    choice: &SelectOptions<'_>,
-    out: &mut String,
-) -> std::fmt::Result {
-    let offered = by_mode(file, device, choice);
-    if offered.is_empty() {
-        return Ok(());
+fn section(title: &str, table: Table, out: &mut Document) {
+    if !table.is_empty() {
+        out.heading(title);
+        out.table(table);
     }
-    let mut table = Table::new(&["mode", "0x6060", "module", "bytes out", "bytes in", "clock"]);
+}
+
+fn modes(file: &EsiFile, device: &Device, choice: &SelectOptions<'_>, out: &mut Document) {
+    let offered = by_mode(file, device, choice);
+    let mut table = Table::new("mode|0x6060|module|bytes out|bytes in|clock");
     for (mode, selection) in &offered {
-        let code = mode.code().to_string();
-        match selection {
+        table.row(match selection {
             Ok(selection) => {
                 let modules = selection.modules.iter().map(|m| m.type_name.as_str());
-                table.row([
-                    mode.name(),
-                    &code,
-                    &modules.collect::<Vec<_>>().join(", "),
-                    &selection.layout.rx_bytes().to_string(),
-                    &selection.layout.tx_bytes().to_string(),
-                    selection.dc.as_ref().map_or("none", |dc| dc.name.as_str()),
-                ]);
+                let modules = modules.collect::<Vec<_>>().join(", ");
+                let (rx, tx) = (selection.layout.rx_bytes(), selection.layout.tx_bytes());
+                let clock = selection.dc.as_ref().map_or("none", |dc| dc.name.as_str());
+                cells![mode, mode.code(), modules, rx, tx, clock]
             }
-            Err(error) => table.row([mode.name(), &code, &error.to_string(), "", "", ""]),
-        }
+            Err(error) => cells![mode, mode.code(), error, "", "", ""],
+        });
     }
-    writeln!(out, "\nmodes\n{}", table.shown(2))?;
-    let usable: Vec<(Mode, &Layout)> = offered
-        .iter()
-        .filter_map(|(mode, selection)| Some((*mode, &selection.as_ref().ok()?.layout)))
-        .collect();
-    let differ = usable.windows(2).any(|pair| pair[0].1 != pair[1].1);
-    if differ {
-        let modes: Vec<Mode> = usable.iter().map(|(mode, _)| *mode).collect();
-        let of = |fields: fn(&Layout) -> &[Field]| {
-            usable.iter().map(|(_, layout)| fields(layout)).collect()
-        };
-        mapped("outputs", &modes, of(|layout| &layout.rx), out)?;
-        mapped("inputs", &modes, of(|layout| &layout.tx), out)?;
+    section("modes", table, out);
+    let usable = offered.iter();
+    let usable = usable.filter_map(|(mode, of)| Some((*mode, &of.as_ref().ok()?.layout)));
+    let usable: Vec<(Mode, &Layout)> = usable.collect();
+    if usable.windows(2).any(|pair| pair[0].1 != pair[1].1) {
+        mapped("outputs", &usable, |layout| &layout.rx, out);
+        mapped("inputs", &usable, |layout| &layout.tx, out);
     }
-    Ok(())
 }
 
 /// Shows the mapped objects of each mode with their byte offsets.
-fn mapped(what: &str, modes: &[Mode], fields: Vec<&[Field]>, out: &mut String) -> std::fmt::Result {
-    let mut head = vec![what.to_owned(), "bits".to_owned()];
-    head.extend(modes.iter().map(Mode::to_string));
-    head.push("name".to_owned());
-    let mut rows: Vec<(u16, u8, Vec<String>)> = Vec::new();
-    for field in fields.iter().copied().flatten() {
-        let known = |row: &(u16, u8, Vec<String>)| (row.0, row.1) == (field.index, field.sub);
-        if rows.iter().any(known) {
+fn mapped(
+    what: &str,
+    modes: &[(Mode, &Layout)],
+    fields: fn(&Layout) -> &[Field],
+    out: &mut Document,
+) {
+    let names: Vec<String> = modes.iter().map(|(mode, _)| mode.to_string()).collect();
+    let mut table = Table::new(&format!("{what}|bits|{}|name", names.join("|")));
+    let mut known = Vec::new();
+    for field in modes.iter().flat_map(|(_, layout)| fields(layout)) {
+        let same = |f: &&Field| (f.index, f.sub) == (field.index, field.sub);
+        if known.iter().copied().any(|f| same(&f)) {
             continue;
         }
-        let mut cells = vec![
-            address(field.index, field.sub).to_string(),
-            field.bit_len.to_string(),
-        ];
-        cells.extend(fields.iter().map(|fields| {
-            let here = |f: &&Field| (f.index, f.sub) == (field.index, field.sub);
-            match fields.iter().find(here).map(|f| f.bit_offset) {
-                Some(bit) if bit % 8 == 0 => (bit / 8).to_string(),
-                Some(bit) => format!("{}.{}", bit / 8, bit % 8),
-                None => "-".to_owned(),
-            }
+        known.push(field);
+        let object = address(field.index, field.sub).to_string();
+        let mut cells = vec![object, field.bit_len.to_string()];
+        cells.extend(modes.iter().map(|(_, layout)| {
+            let bit = fields(layout).iter().find(same).map(|f| f.bit_offset);
+            or_dash(bit.map(|bit| match bit % 8 {
+                0 => (bit / 8).to_string(),
+                rest => format!("{}.{rest}", bit / 8),
+            }))
         }));
-        cells.push(field.name.clone());
-        rows.push((field.index, field.sub, cells));
-    }
-    let head: Vec<&str> = head.iter().map(String::as_str).collect();
-    let mut table = Table::new(&head);
-    for (_, _, cells) in rows {
+        cells.push(field.name.to_string());
         table.line(cells);
     }
-    writeln!(out, "\n  at byte, by mode\n{}", table.shown(2))
+    out.gap();
+    out.line("at byte, by mode");
+    out.table(table);
 }
 
-fn assignments(device: &Device, out: &mut String) -> std::fmt::Result {
-    if device.sm_mappings.is_empty() {
-        return Ok(());
-    }
-    let mut table = Table::new(&["name", "PDOs", ""]);
+fn assignments(device: &Device) -> Table {
+    let mut table = Table::new("name|PDOs|");
     for mapping in &device.sm_mappings {
         let of_sm = mapping.sync_managers.iter().map(|(sm, pdos)| {
             let pdos: Vec<String> = pdos.iter().map(|pdo| format!("{pdo:04x}")).collect();
             format!("SM {sm}: {}", pdos.join(" "))
         });
+        let of_sm = of_sm.collect::<Vec<_>>().join("; ");
         let default = if mapping.default { "default" } else { "" };
-        let of_sm: Vec<String> = of_sm.collect();
-        table.row([&mapping.name, &of_sm.join("; "), default]);
+        table.row(cells![mapping.name, of_sm, default]);
     }
-    writeln!(out, "\nPDO assignments by name\n{}", table.shown(2))
+    table
 }
 
-fn clock_modes(device: &Device, out: &mut String) -> std::fmt::Result {
-    if device.dc_modes.is_empty() {
-        return Ok(());
-    }
-    let mut table = Table::new(&["name", "AssignActivate", "SYNC0", "SYNC1", "meaning"]);
+fn clock_modes(device: &Device) -> Table {
+    let mut table = Table::new("name|AssignActivate|SYNC0|SYNC1|meaning");
     for mode in &device.dc_modes {
-        table.row([
-            &mode.name,
-            &format!("0x{:04x}", mode.assign_activate),
-            &sync(mode.sync0, mode.assign_activate & 0x0200 != 0),
-            &sync(mode.sync1, mode.assign_activate & 0x0400 != 0),
-            &mode.description,
+        let activate = mode.assign_activate;
+        let sync0 = sync(mode.sync0, activate & 0x0200 != 0);
+        let sync1 = sync(mode.sync1, activate & 0x0400 != 0);
+        table.row(cells![
+            mode.name,
+            hex16(activate),
+            sync0,
+            sync1,
+            mode.description
         ]);
     }
-    writeln!(out, "\nclock modes\n{}", table.shown(2))
+    table
 }
 
-fn slots(file: &EsiFile, device: &Device, out: &mut String) -> std::fmt::Result {
-    let Some(slots) = device
-        .slots
-        .as_ref()
-        .filter(|slots| !slots.slots.is_empty())
-    else {
-        return Ok(());
-    };
+fn slots(file: &EsiFile, device: &Device, out: &mut Document) {
     let mut rows: Vec<[String; 3]> = Vec::new();
-    for slot in &slots.slots {
+    for slot in device.slots.iter().flat_map(|slots| &slots.slots) {
         let count = match (slot.min_instances, slot.max_instances) {
             (min, max) if min == max => min.to_string(),
             (min, max) => format!("{min} to {max}"),
@@ -176,7 +151,7 @@ fn slots(file: &EsiFile, device: &Device, out: &mut String) -> std::fmt::Result 
         };
         let named = slot.module_idents.iter().map(|(ident, default)| {
             let module = file.modules.iter().find(|module| module.ident == *ident);
-            let name = module.map_or_else(|| format!("0x{ident:08x}"), |m| m.type_name.clone());
+            let name = module.map_or_else(|| hex32(*ident), |m| m.type_name.to_string());
             let mark = if *default { " (default)" } else { "" };
             format!("{name}{mark}")
         });
@@ -196,11 +171,9 @@ fn slots(file: &EsiFile, device: &Device, out: &mut String) -> std::fmt::Result 
             _ => rows.push([slot.name.clone(), count, takes]),
         }
     }
-    let mut table = Table::new(&["slot", "modules", "takes"]);
-    for [name, count, takes] in &rows {
-        table.row([name, count, takes]);
-    }
-    writeln!(out, "\nslots\n{}", table.shown(2))
+    let mut table = Table::new("slot|modules|takes");
+    rows.into_iter().for_each(|row| table.row(row));
+    section("slots", table, out);
 }
 
 fn sync(time: SyncTime, on: bool) -> String {
@@ -222,15 +195,15 @@ fn sync(time: SyncTime, on: bool) -> String {
         (ns, _) => format!("every {}", signed(ns)),
     };
     if time.shift_ns != 0 {
-        let _ = write!(text, ", shift {}", signed(time.shift_ns));
+        text += &format!(", shift {}", signed(time.shift_ns));
     }
     if time.shift_factor != 0 {
-        let _ = write!(text, ", shift {}", scaled(time.shift_factor));
+        text += &format!(", shift {}", scaled(time.shift_factor));
     }
     text
 }
 
-fn pdo_list(file: &EsiFile, device: &Device, out: &mut String) -> std::fmt::Result {
+fn pdo_list(file: &EsiFile, device: &Device, out: &mut Document) {
     let of_modules = file.modules.iter().filter(|module| {
         let slots = device.slots.iter().flat_map(|slots| &slots.slots);
         slots
@@ -248,9 +221,9 @@ fn pdo_list(file: &EsiFile, device: &Device, out: &mut String) -> std::fmt::Resu
     });
     let all: Vec<(&str, &Pdo)> = device_pdos.chain(module_pdos).collect();
     if all.is_empty() {
-        return writeln!(out, "\nno PDOs");
+        out.heading("no PDOs");
     }
-    let mut table = Table::new(&["PDO", "SM", "bits", "kind", "module", "objects", "name"]);
+    let mut table = Table::new("PDO|SM|bits|kind|module|objects|name");
     for (module, pdo) in all {
         let kind = [
             (pdo.fixed, "fixed"),
@@ -259,30 +232,24 @@ fn pdo_list(file: &EsiFile, device: &Device, out: &mut String) -> std::fmt::Resu
             (pdo.overwritten_by_module, "by module"),
             (!pdo.exclude.is_empty(), "excludes others"),
         ];
-        let kind: Vec<&str> = kind
-            .iter()
-            .filter(|(on, _)| *on)
-            .map(|(_, name)| *name)
-            .collect();
         let objects = pdo.entries.iter().filter(|entry| !entry.is_gap());
-        let objects: Vec<String> = objects
-            // Without `0x`, because the column holds only objects.
-            .map(|e| address(e.index, e.sub).to_string().split_off(2))
-            .collect();
-        let more = objects.len().saturating_sub(6);
-        let mut objects = objects.into_iter().take(6).collect::<Vec<_>>().join(" ");
-        if more > 0 {
-            let _ = write!(objects, " … {more} more");
-        }
-        table.row([
-            &format!("0x{:04x}", pdo.index),
-            &pdo.sm.map_or_else(|| "-".to_owned(), |sm| sm.to_string()),
-            &pdo.bit_len().to_string(),
-            &kind.join(", "),
+        // Without `0x`, because the column holds only objects.
+        let objects = objects.map(|e| address(e.index, e.sub).to_string().split_off(2));
+        let objects: Vec<String> = objects.collect();
+        let more = match objects.len().saturating_sub(6) {
+            0 => String::new(),
+            more => format!(" … {more} more"),
+        };
+        let objects: Vec<String> = objects.into_iter().take(6).collect();
+        table.row(cells![
+            hex16(pdo.index),
+            or_dash(pdo.sm),
+            pdo.bit_len(),
+            names_of(&kind, ", "),
             module,
-            &objects,
-            &pdo.name,
+            objects.join(" ") + &more,
+            pdo.name,
         ]);
     }
-    writeln!(out, "\nPDOs\n{}", table.shown(2))
+    section("PDOs", table, out);
 }

@@ -4,15 +4,12 @@ use std::path::{Path, PathBuf};
 
 use ecaxis_master::text::pluralize;
 use ecaxis_master::{config, recording};
-use ecaxis_tools::analyze::{self as analysis, Context, DeviceReport};
+use ecaxis_tools::analyze::{self as analysis, Context, DeviceReport, Report, called};
 
 use crate::args::files::{check_output, unwritable};
 use crate::hints;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::result;
-
-mod text;
+use crate::render::{note, print_json, print_page};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -91,23 +88,40 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     {
         note(&format!("note: {}: {odd}", file.display()));
     }
+    let advice = advice(&report);
     if let Some(path) = &args.html {
-        std::fs::write(path, analysis::html(&name, &report)).map_err(|e| unwritable(path, &e))?;
+        let page = analysis::document(&name, &report, &advice, false).html();
+        std::fs::write(path, page).map_err(|e| unwritable(path, &e))?;
         note(&format!("written: {}", path.display()));
     }
-    let text = if args.json {
-        let json = serde_json::to_string_pretty(&report);
-        json.map_err(|e| Failure::new(hints::FAILED, format!("cannot write the result: {e}")))?
-            + "\n"
+    if args.json {
+        print_json(&report)?;
     } else {
-        text::page(&name, &report, args.all)
-    };
-    result(&text)?;
+        print_page(&analysis::document(&name, &report, &advice, args.all))?;
+    }
     if report.file.ethercat_frames == 0 {
         let failure = Failure::new(hints::FAILED, format!("there is no EtherCAT in {name}"));
         return Err(hints::no_ethercat(failure, args.interface.is_some()));
     }
     Ok(())
+}
+
+/// Returns the advice for each error code.
+fn advice(report: &Report) -> Vec<String> {
+    let devices = report.devices.iter().enumerate();
+    let of_device = |(place, device): (usize, &DeviceReport)| {
+        let name = called(place, device);
+        let states = device
+            .al_errors
+            .iter()
+            .map(|code| (*code, hints::al_status(*code)));
+        let emergencies = device.emergency_codes.iter();
+        let emergencies = emergencies.map(|code| (*code, hints::emergency(*code)));
+        let advice = states.chain(emergencies);
+        let advice = advice.map(|(code, hint)| format!("{name}, {code:#06x}: {hint}"));
+        advice.collect::<Vec<_>>()
+    };
+    devices.flat_map(of_device).collect()
 }
 
 /// A machine file and the names of its devices.
