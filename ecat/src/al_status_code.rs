@@ -1,5 +1,12 @@
 //! AL status codes (register 0x0134): why a SubDevice refused a state change or left a state. The
 //! texts paraphrase the tables of ETG.1000.6 and ETG.1020.
+//!
+//! ```
+//! use ecaxis_ecat::al_status_code::{al_status_hint, al_status_text};
+//!
+//! assert_eq!(al_status_text(0x0020), "the device needs a cold start");
+//! assert_eq!(al_status_hint(0x0020), Some("switch the device off and on again"));
+//! ```
 
 /// Returns the text of an AL status code. Codes from 0x8000 on are vendor-specific.
 pub fn al_status_text(code: u16) -> &'static str {
