@@ -1,8 +1,8 @@
 //! The EEPROM image (SII, ETG.2010): the self-description of a SubDevice, readable without its ESI.
 //!
 //! `image` derives the contents from an ESI device, `emit` writes the bytes and `parse` reads them.
-//! `strings` and `crc` are helpers for both. `warning` lists problems in one image, `compare` lists
-//! differences between two images.
+//! `strings` helps both. `warning` lists problems in one image, `compare` lists differences between
+//! two images.
 //!
 //! [`Sii`] is the common type. `parse(emit(sii))` returns the same value if its texts are ASCII
 //! with at most 63 characters.
@@ -21,8 +21,6 @@
 //! ```
 
 mod compare;
-mod crc;
-mod datatype;
 mod emit;
 mod image;
 mod parse;
@@ -30,7 +28,7 @@ mod strings;
 mod warning;
 
 pub use compare::{Difference, DifferenceKind, compare};
-pub use crc::checksum;
+pub use emit::checksum;
 pub use image::SiiOptions;
 pub use parse::SiiError;
 pub use warning::{SiiWarning, WarningKind};

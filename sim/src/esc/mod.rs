@@ -30,12 +30,13 @@ mod sm_tests;
 mod write_protection;
 
 use crate::Nanos;
+use crate::random::Jitter;
 use access::Shadow;
 use al::AlState;
 pub use chip::EscInfo;
 use datagram::Frame;
 use dc::sync::Edges;
-use dc::{Clock, Dc, Jitter, Width};
+use dc::{Clock, Dc, Width};
 use eeprom::Eeprom;
 use fmmu::Fmmus;
 use ports::Ports;

@@ -72,47 +72,6 @@ impl Clock {
     }
 }
 
-/// Seeded noise on time stamps, as caused by PHYs and clock domains.
-#[derive(Debug, Clone)]
-pub struct Jitter {
-    amplitude: u32,
-    state: u64,
-}
-
-impl Jitter {
-    /// Creates noise that is uniformly distributed over ±`amplitude` ns.
-    #[must_use]
-    pub fn new(amplitude: u32, seed: u64) -> Self {
-        Self {
-            amplitude,
-            state: seed,
-        }
-    }
-
-    /// True if time stamps are exact.
-    #[must_use]
-    pub fn is_none(&self) -> bool {
-        self.amplitude == 0
-    }
-
-    /// Returns a noisy time stamp of `local`.
-    pub fn stamp(&mut self, local: u64) -> u64 {
-        if self.amplitude == 0 {
-            return local;
-        }
-        // The splitmix64 generator.
-        self.state = self.state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.state;
-        z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-        let span = u64::from(self.amplitude) * 2 + 1;
-        let noise = (z ^ z >> 31) % span;
-        local
-            .saturating_add(noise)
-            .saturating_sub(u64::from(self.amplitude))
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -124,23 +83,5 @@ mod tests {
         assert_eq!(clock.local(1_000_001_000), 1_000_050_499);
         let back = clock.true_time(1_000_050_500);
         assert!(back.abs_diff(1_000_001_000) <= 1, "{back}");
-    }
-
-    #[test]
-    fn jitter_fills_its_span_and_repeats_from_its_seed() {
-        let stamps = |seed| {
-            let mut jitter = Jitter::new(5, seed);
-            (0..1_000)
-                .map(|_| jitter.stamp(1_000))
-                .collect::<Vec<u64>>()
-        };
-        let seen = stamps(7);
-        assert_eq!(
-            (seen.iter().min(), seen.iter().max()),
-            (Some(&995), Some(&1_005))
-        );
-        assert_eq!(seen, stamps(7));
-        assert_ne!(seen, stamps(8));
-        assert_eq!(Jitter::new(0, 1).stamp(42), 42);
     }
 }

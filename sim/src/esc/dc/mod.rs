@@ -14,7 +14,7 @@ pub mod latch;
 pub mod sync;
 
 use crate::Nanos;
-pub use clock::{Clock, Jitter};
+pub use clock::Clock;
 use latch::Latch;
 use sync::SyncUnit;
 
