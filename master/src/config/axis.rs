@@ -16,9 +16,6 @@ use super::raw::{RawAxis, RawLimits, RawSdo, SdoValue};
 use super::units::unit;
 use super::{AxisSetup, TorqueSetup, TorqueUnit};
 
-/// maxon's vendor ID.
-const MAXON: u32 = 0xfb;
-
 pub(crate) fn setup(
     raw: &RawAxis,
     sdos: &[RawSdo],

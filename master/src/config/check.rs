@@ -50,22 +50,12 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         devices.push(device::check(raw, at, &mut files, &all, p));
     }
     // Steps use the machine's device indices, so the order is determined first.
-    if devices.iter().all(|d| {
-        matches!(
-            d,
-            Some(DeviceConfig {
-                at: Locator::Position(_),
-                ..
-            })
-        )
-    }) {
-        devices.sort_by_key(|d| match d {
-            Some(DeviceConfig {
-                at: Locator::Position(n),
-                ..
-            }) => *n,
-            _ => 0,
-        });
+    let position = |device: &Option<DeviceConfig>| match device.as_ref()?.at {
+        Locator::Position(n) => Some(n),
+        _ => None,
+    };
+    if devices.iter().all(|device| position(device).is_some()) {
+        devices.sort_by_key(position);
     }
     let known: Vec<ResolvedDevice<'_>> = devices
         .iter()

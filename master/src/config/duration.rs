@@ -1,5 +1,7 @@
 //! Durations in text form (`250us`, `1.5 s`), as whole nanoseconds.
 
+use std::ops::Range;
+
 use super::problem::suggestion;
 
 const UNITS: [(&str, u64); 7] = [
@@ -18,7 +20,7 @@ pub struct DurationError {
     pub message: String,
     pub hint: String,
     /// The byte range of the error in the text.
-    pub at: std::ops::Range<usize>,
+    pub at: Range<usize>,
 }
 
 /// Reads a duration: a decimal number and a unit.
@@ -26,67 +28,47 @@ pub struct DurationError {
 /// # Errors
 /// Returns the invalid part of the text.
 pub fn parse(text: &str) -> Result<u64, DurationError> {
-    let error = |at: std::ops::Range<usize>, message: String, hint: &str| DurationError {
-        message,
-        hint: hint.to_owned(),
-        at: if at.is_empty() { 0..text.len() } else { at },
-    };
     let example = "a number and a unit, such as \"1ms\" or \"250us\"";
+    let all = 0..text.len();
+    let error = |at: Range<usize>, message: String, hint: &str| {
+        let hint = hint.to_owned();
+        Err(DurationError { message, hint, at })
+    };
     let digits = text
         .find(|c: char| !(c.is_ascii_digit() || c == '.' || c == '_'))
         .unwrap_or(text.len());
     let (number, rest) = text.split_at(digits);
     let unit = rest.trim();
-    let unit_at = text.len() - rest.trim_start().len()..text.trim_end().len();
     if number.is_empty() {
-        return Err(error(
-            0..text.len(),
-            format!("\"{text}\" is not a duration"),
-            example,
-        ));
+        return error(all, format!("\"{text}\" is not a duration"), example);
     }
     if unit.is_empty() {
-        return Err(error(
-            0..text.len(),
-            format!("\"{text}\" has no unit"),
-            example,
-        ));
+        return error(all, format!("\"{text}\" has no unit"), example);
     }
     let Some((_, scale)) = UNITS.iter().find(|(name, _)| *name == unit) else {
-        let known = UNITS.iter().map(|(name, _)| *name);
-        let hint = suggestion(unit, known, "units");
-        return Err(error(
-            unit_at,
-            format!("unknown unit of time `{unit}`"),
-            &hint,
-        ));
+        let hint = suggestion(unit, UNITS.iter().map(|(name, _)| *name), "units");
+        let at = text.len() - rest.trim_start().len()..text.trim_end().len();
+        return error(at, format!("unknown unit of time `{unit}`"), &hint);
     };
-    nanoseconds(number, *scale).ok_or_else(|| {
-        error(
-            0..digits,
-            format!("\"{text}\" is not a whole number of nanoseconds, or too long"),
-            example,
-        )
-    })
+    nanoseconds(number, *scale).map_or_else(
+        || {
+            let message = format!("\"{text}\" is not a whole number of nanoseconds, or too long");
+            error(0..digits, message, example)
+        },
+        Ok,
+    )
 }
 
+/// Reads digits with at most one point.
 fn nanoseconds(number: &str, scale: u64) -> Option<u64> {
     let number = number.replace('_', "");
     let (whole, fraction) = number.split_once('.').unwrap_or((&number, ""));
     let fraction = fraction.trim_end_matches('0');
-    if whole.is_empty() || fraction.contains('.') {
-        return None;
-    }
-    let mut ns = whole.parse::<u64>().ok()?.checked_mul(scale)?;
-    if !fraction.is_empty() {
-        let ten = 10_u64.checked_pow(u32::try_from(fraction.len()).ok()?)?;
-        let part = u128::from(fraction.parse::<u64>().ok()?) * u128::from(scale);
-        if part % u128::from(ten) != 0 {
-            return None;
-        }
-        ns = ns.checked_add(u64::try_from(part / u128::from(ten)).ok()?)?;
-    }
-    Some(ns)
+    let ten = 10_u128.checked_pow(u32::try_from(fraction.len()).ok()?)?;
+    let digits: u128 = format!("{whole}{fraction}").parse().ok()?;
+    let ns = digits.checked_mul(scale.into())?;
+    let is_whole = !whole.is_empty() && ns % ten == 0;
+    is_whole.then(|| u64::try_from(ns / ten).ok())?
 }
 
 /// Returns the shortest exact text of a duration.

@@ -60,7 +60,7 @@ const POSITION_OFFSET: u16 = 0x60b0;
 
 /// The direction of a signal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum SignalDirection {
+pub(crate) enum SignalDirection {
     In,
     Out,
 }
@@ -142,24 +142,6 @@ fn address(text: &str) -> Option<(u16, u8)> {
     ))
 }
 
-/// Returns an input of the machine.
-pub(crate) fn input(
-    raw: &RawSignal,
-    devices: &[ResolvedDevice<'_>],
-    p: &mut Problems<'_>,
-) -> Option<Signal> {
-    resolve(raw, devices, SignalDirection::In, p)
-}
-
-/// Returns an output of the machine that no axis writes.
-pub(crate) fn output(
-    raw: &RawSignal,
-    devices: &[ResolvedDevice<'_>],
-    p: &mut Problems<'_>,
-) -> Option<Signal> {
-    resolve(raw, devices, SignalDirection::Out, p)
-}
-
 /// Returns an output that no axis writes, from a text such as `io.Output 3`.
 pub(crate) fn output_of_text(
     text: &Spanned<String>,
@@ -191,10 +173,11 @@ pub(crate) fn output_of_text(
         device: Spanned::new(text.span(), word[..split].to_owned()),
         name: Spanned::new(text.span(), word[split + 1..].to_owned()),
     };
-    output(&raw, devices, p)
+    resolve(&raw, devices, SignalDirection::Out, p)
 }
 
-fn resolve(
+/// Returns an input of the machine, or an output that no axis writes.
+pub(crate) fn resolve(
     raw: &RawSignal,
     devices: &[ResolvedDevice<'_>],
     way: SignalDirection,

@@ -16,6 +16,7 @@ mod target;
 use super::fields::{Key, KeyExt};
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawAction, RawAxes, RawCondition, RawSignal, RawStep, RawStop};
+use super::signal::SignalDirection;
 use super::{
     Action, AxisSetup, Condition, DeviceConfig, Signal, Step, StopSetup, TableFile, signal,
 };
@@ -303,7 +304,7 @@ impl ProgramChecker<'_> {
     }
 
     fn condition(&mut self, raw: &RawCondition, p: &mut Problems<'_>) -> Option<Condition> {
-        let input = signal::input(&raw.signal, self.devices, p)?;
+        let input = signal::resolve(&raw.signal, self.devices, SignalDirection::In, p)?;
         let bounds = [&raw.equal, &raw.above, &raw.below].map(|bound| bound.as_ref());
         if let Some(equal) = &raw.equal {
             possible(&input, equal, p)?;
@@ -334,7 +335,7 @@ impl ProgramChecker<'_> {
         value: &Spanned<f64>,
         p: &mut Problems<'_>,
     ) -> Option<(usize, f64)> {
-        let output = signal::output(raw, self.devices, p)?;
+        let output = signal::resolve(raw, self.devices, SignalDirection::Out, p)?;
         possible(&output, value, p)?;
         Some((signal::known(&mut self.outputs, output), *value.get_ref()))
     }

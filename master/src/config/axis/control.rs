@@ -10,7 +10,7 @@ use super::super::fields::{Key, KeyExt, Ns};
 use super::super::problem::Problems;
 use super::super::raw::{RawAxis, RawHoming};
 use super::super::{HomingSetup, TorqueSetup};
-use super::{MAXON, positive};
+use super::{is_maxon, positive};
 
 /// The default time in s for which torque may exceed its supervised limit.
 const TORQUE_TIME_S: f64 = 0.1;
@@ -187,10 +187,8 @@ pub(super) fn homing(
         );
         return None;
     }
-    let maxon =
-        selection.dictionary.item(0x30b0, 0).is_some() || selection.identity.vendor == MAXON;
     let startup = homing
-        .objects(&config.scale, maxon)
+        .objects(&config.scale, is_maxon(selection))
         .map(|object| {
             let bytes = object.value.to_le_bytes();
             let name = selection

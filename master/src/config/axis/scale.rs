@@ -12,7 +12,7 @@ use super::super::problem::Problems;
 use super::super::raw::{RawAxis, RawSdo, SdoValue};
 use super::super::units::is_turn;
 use super::super::{TorqueSetup, TorqueUnit, UnitSource};
-use super::{MAXON, positive};
+use super::positive;
 
 /// The maximum number of counts per motor turn.
 const MOST_COUNTS: f64 = 2_147_483_648.0;
@@ -286,6 +286,7 @@ fn counts_per_newton_metre(selection: Option<&esi::Selection>) -> f64 {
 
 /// Returns `true` if the device has maxon's objects.
 pub(crate) fn is_maxon(selection: &esi::Selection) -> bool {
+    const MAXON: u32 = 0xfb;
     selection.dictionary.item(0x30b0, 0).is_some() || selection.identity.vendor == MAXON
 }
 
