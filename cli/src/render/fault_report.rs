@@ -14,8 +14,7 @@ use ecaxis_tools::document::format::{civil, hex16, times, utc};
 use ecaxis_tools::document::{Document, Table};
 
 use super::report;
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::note;
 
 /// The page width in columns.
@@ -79,20 +78,13 @@ pub(crate) fn page(story: &FaultReport, hints: &[String]) -> Document {
         .map_or(usize::MAX, |stop| stop + 10)
         .min(story.events.len());
     let events = report::events(&story.events[until.saturating_sub(40)..until]);
-    section(&mut out, "What happened, in order", events);
+    out.section("What happened, in order", events);
     devices(story, &mut out);
     axes(story, &mut out);
-    section(&mut out, "This computer", host(story));
+    out.section("This computer", host(story));
     bus_cycles(story, &mut out);
     axis_cycles(story, &mut out);
     out
-}
-
-fn section(out: &mut Document, title: impl Into<String>, table: Table) {
-    if !table.is_empty() {
-        out.heading(title);
-        out.table(table);
-    }
 }
 
 fn devices(story: &FaultReport, out: &mut Document) {
@@ -120,13 +112,13 @@ fn devices(story: &FaultReport, out: &mut Document) {
         let errors = [of.invalid_frames, of.rx_errors, of.forwarded, of.lost_links];
         report::port_rows(&mut ports, &device.name, errors);
     }
-    section(out, "SubDevices", table);
+    out.section("SubDevices", table);
     for device in &story.devices {
         for line in details(device) {
             out.line(format!("{}: {line}", device.name));
         }
     }
-    section(out, "Error counters that grew, by port", ports);
+    out.section("Error counters that grew, by port", ports);
 }
 
 /// Returns the unusual values of a device.
@@ -192,7 +184,7 @@ fn axes(story: &FaultReport, out: &mut Document) {
         let why: Vec<&str> = why.map(String::as_str).collect();
         table.row(cells![axis.name, axis.state, why.join("; ")]);
     }
-    section(out, "Axes", table);
+    out.section("Axes", table);
 }
 
 fn host(story: &FaultReport) -> Table {
@@ -271,7 +263,7 @@ fn bus_cycles(story: &FaultReport, out: &mut Document) {
     }
     let count = story.cycles.len();
     let title = format!("The last {count} cycles: those in which something on the bus changed");
-    section(out, title, table);
+    out.section(title, table);
 }
 
 fn axis_cycles(story: &FaultReport, out: &mut Document) {
@@ -314,7 +306,7 @@ fn axis_cycles(story: &FaultReport, out: &mut Document) {
             break;
         }
     }
-    section(out, "Axes in these cycles: where a word changed", table);
+    out.section("Axes in these cycles: where a word changed", table);
 }
 
 /// CSV and PV (0x6060), whose actual value is the velocity.

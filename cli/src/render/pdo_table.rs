@@ -1,13 +1,46 @@
 //! Tables that several subcommands use.
 
-use ecaxis_esi::{Field, StartupSdo, address};
+use ecaxis_esi::{Device, Field, Layout, SmLayout, SmUse, StartupSdo, address};
 use ecaxis_master::text::pluralize;
 use ecaxis_tools::cells;
 use ecaxis_tools::document::format::{hex_bytes, hex16};
 use ecaxis_tools::document::{Document, Table};
 
+/// Adds the SyncManagers and the offset of each object.
+pub(crate) fn process_data(device: &Device, layout: &Layout, out: &mut Document) {
+    let mut table = Table::new("SM|use|address|bytes|control|FMMU");
+    for (number, sm) in device.sync_managers.iter().enumerate() {
+        let mut planned = layout.outputs.iter().chain(&layout.inputs);
+        let planned = planned.find(|planned| usize::from(planned.sm) == number);
+        let usage = match (sm.usage, planned) {
+            (SmUse::MBoxOut, _) => "mailbox out",
+            (SmUse::MBoxIn, _) => "mailbox in",
+            (SmUse::Outputs, Some(_)) => "outputs",
+            (SmUse::Inputs, Some(_)) => "inputs",
+            _ => "unused",
+        };
+        let own = (sm.start_address, sm.default_size, sm.control_byte);
+        let of = |p: &SmLayout| (p.start_address, p.len, p.control_byte);
+        let (address, len, control) = planned.map_or(own, of);
+        let fmmu = planned.map(|p| p.fmmu.map_or("next free".to_owned(), |f| f.to_string()));
+        let (address, control) = (hex16(address), format!("0x{control:02x}"));
+        table.row(cells![
+            number,
+            usage,
+            address,
+            len,
+            control,
+            fmmu.unwrap_or_default()
+        ]);
+    }
+    out.gap();
+    out.table(table);
+    fields("outputs", layout.rx_bytes(), &layout.rx, out);
+    fields("inputs", layout.tx_bytes(), &layout.tx, out);
+}
+
 /// Adds the offset of each object of one direction.
-pub(crate) fn fields(what: &str, bytes: usize, fields: &[Field], out: &mut Document) {
+fn fields(what: &str, bytes: usize, fields: &[Field], out: &mut Document) {
     out.gap();
     out.line(format!("{what}: {}", pluralize(bytes, "byte")));
     if fields.is_empty() {

@@ -10,9 +10,7 @@ use ecaxis_master::session::{AxisLine, Observer, Progress, Status};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::hints;
-use crate::render::note;
-use crate::render::output;
-use crate::render::style;
+use crate::render::{note, output, style};
 
 /// The minimum interval between status lines. In virtual time, an hour of status passes in seconds.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);

@@ -38,9 +38,7 @@ pub(crate) fn summary(summary: &Summary) -> Document {
         self::thread(thread, summary.counters.cycles, &mut out);
     }
     axes(summary, &mut out);
-    if !summary.probes.is_empty() {
-        out.gap();
-    }
+    out.gap();
     for found in &summary.probes {
         let times = match found.times {
             1 => String::new(),
@@ -48,13 +46,9 @@ pub(crate) fn summary(summary: &Summary) -> Document {
         };
         out.line(format!("step {}: {found}{times}", found.step));
     }
-    if !summary.errors.is_empty() {
-        out.gap();
-        out.table(errors(&summary.errors));
-    }
-    if !summary.emergencies.is_empty() {
-        emergencies(&summary.emergencies, summary.more_emergencies, &mut out);
-    }
+    out.gap();
+    out.table(errors(&summary.errors));
+    emergencies(&summary.emergencies, summary.more_emergencies, &mut out);
     if summary.events.iter().any(|event| event.failure) {
         out.gap();
         let last = summary.events.len().saturating_sub(EVENTS);
@@ -264,10 +258,8 @@ fn axes(summary: &Summary, out: &mut Document) {
     for axis in &summary.axes {
         table.row(self::axis(axis));
     }
-    if !table.is_empty() {
-        out.gap();
-        out.table(table);
-    }
+    out.gap();
+    out.table(table);
     for axis in &summary.axes {
         for what in [&axis.fault, &axis.trip].into_iter().flatten() {
             out.line(format!("{}: {what}", axis.name));

@@ -7,8 +7,7 @@ use ecaxis_master::{config, recording};
 use ecaxis_tools::analyze::{self as analysis, Context, DeviceReport, Report, called};
 
 use crate::args::files::{check_output, unwritable};
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{note, print_json, print_page};
 
 const EXAMPLES: &str = "\

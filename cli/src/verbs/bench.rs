@@ -18,8 +18,7 @@ use ecaxis_tools::bench::{document, fixture, host, veth};
 
 use crate::args::files::{check_output, unwritable};
 use crate::args::signals;
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::progress::ProgressPrinter;
 use crate::render::{note, print_json, print_page};
 

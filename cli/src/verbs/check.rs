@@ -7,9 +7,8 @@ use ecaxis_master::text::pluralize;
 use ecaxis_tools::document::Document;
 use serde_json::json;
 
-use crate::hints;
-use crate::hints::Failure;
-use crate::render::{print, print_json};
+use crate::hints::{self, Failure};
+use crate::render::{print, print_json, result};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -32,7 +31,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let loaded = config::load(&args.file);
     let written = match &loaded {
         _ if args.json => print_json(&as_json(&args.file, &loaded)),
-        Ok(machine) => print(&summary(machine)),
+        Ok(machine) => print(&summary(machine)).and_then(|()| result("no problems\n")),
         Err(_) => Ok(()),
     };
     loaded.map_err(|e| hints::config(&args.file, &e))?;
@@ -111,6 +110,5 @@ fn summary(machine: &Machine) -> Document {
             );
         }
     }
-    out.line("no problems");
     out
 }

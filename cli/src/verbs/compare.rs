@@ -12,8 +12,7 @@ use serde_json::{Value, json};
 
 use crate::args::bus::{self, Bus};
 use crate::args::files::{back_up, replace};
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{note, page, print_json};
 use crate::verbs::scan::{ScanResult, open};
 

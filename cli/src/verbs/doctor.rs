@@ -7,8 +7,7 @@ use ecaxis_master::link::OpenError;
 use ecaxis_master::rt::spin::Spin;
 use ecaxis_tools::doctor::{self, Host, Measurements, RunProfile, Severity, ethtool, wakeup};
 
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{note, print_json, print_page, stderr_is_terminal};
 
 const EXAMPLES: &str = "\

@@ -15,8 +15,7 @@ use crate::args::Verbosity;
 use crate::args::bus;
 use crate::args::device::{DeviceArgs, DeviceError, OpenDevice, counter};
 use crate::args::files::write_new;
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{note, print_json, result};
 
 const EXAMPLES: &str = "\

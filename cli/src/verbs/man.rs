@@ -8,8 +8,7 @@ use clap_mangen::Man;
 use crate::args::files::unwritable;
 use crate::command;
 use crate::hints::Failure;
-use crate::render::note;
-use crate::render::result;
+use crate::render::{note, result};
 
 const EXAMPLES: &str = "\
 Examples:

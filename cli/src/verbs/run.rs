@@ -14,12 +14,10 @@ use serde_json::{Value, json};
 use crate::args::files::check_output;
 use crate::args::record;
 use crate::args::signals;
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::fault_report::{self, ReportDestination};
 use crate::render::progress::ProgressPrinter;
-use crate::render::report;
-use crate::render::{note, print, print_json};
+use crate::render::{note, print, print_json, report};
 use crate::verbs::check;
 
 const EXAMPLES: &str = "\

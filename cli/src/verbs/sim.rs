@@ -14,13 +14,13 @@ use ecaxis_master::sys::rt_thread;
 use ecaxis_sim::{SecondPort, Segment, ServeStats, Server};
 use serde_json::{Value, json};
 
+use ecaxis_master::text::pluralize;
+
 use crate::args::files::{check_output, unwritable, write_new};
 use crate::args::signals;
 use crate::args::trace::Trace;
-use crate::hints;
-use crate::hints::Failure;
-use crate::render::note;
-use crate::render::result;
+use crate::hints::{self, Failure};
+use crate::render::{note, result};
 use crate::verbs::run;
 
 /// SCHED_FIFO priority of the simulated bus, below that of a master on the same computer.
@@ -136,12 +136,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let pid = std::process::id();
         note(&format!("`kill -USR1 {pid}` begins the fault script"));
     }
-    note(&format!(
-        "{devices} simulated SubDevice{} answer{} on `{}`; Ctrl-C ends it",
-        if devices == 1 { "" } else { "s" },
-        if devices == 1 { "s" } else { "" },
+    let answer = if devices == 1 { "answers" } else { "answer" };
+    let (devices, nics) = (
+        pluralize(devices, "simulated SubDevice"),
         nics.join("` and `"),
-    ));
+    );
+    note(&format!("{devices} {answer} on `{nics}`; Ctrl-C ends it"));
     // Real devices answer independently of the computer's load.
     for denied in rt_thread::become_realtime(PRIORITY, None) {
         note(&format!("warning: {denied}"));

@@ -105,13 +105,10 @@ fn devices(report: &Report, all: bool, out: &mut Document) {
             managers.row(cells![place, sm.number, hex16(sm.start), sm.len, sm.usage]);
         }
     }
-    out.table_if_any(table);
-    if !configured.is_empty() {
-        out.heading("Configured");
-        out.table(configured);
-        if all {
-            out.table(managers);
-        }
+    out.table(table);
+    out.section("Configured", configured);
+    if all {
+        out.table(managers);
     }
 }
 
@@ -148,14 +145,12 @@ fn events(report: &Report, all: bool, out: &mut Document) {
         let text = format!("{}: {}{times}", names(line, &report.devices), line.text);
         table.row(cells![format!("{:>11.6} s", line.at), text]);
     }
-    if table.is_empty() {
-        return;
-    }
-    out.heading("What happened");
-    match all {
-        true => out.table(table),
-        false => out.table(table.shorten(EVENTS.0, EVENTS.1)),
-    }
+    let table = if all {
+        table
+    } else {
+        table.shorten(EVENTS.0, EVENTS.1)
+    };
+    out.section("What happened", table);
     if all && report.more_events > 0 {
         out.line(format!("… {} more were not kept", report.more_events));
     }
@@ -199,9 +194,7 @@ fn transfers(report: &Report, all: bool, out: &mut Document) {
 fn cycle(report: &Report, all: bool, out: &mut Document) {
     if report.cycle.is_empty() {
         out.heading("Cycle: no process data");
-        return;
     }
-    out.heading("Cycle");
     let mut table = Table::new("datagram|bytes|sent|usual|p1|p99|longest|lost|WKC");
     let mut lines = Vec::new();
     for cycle in &report.cycle {
@@ -225,7 +218,7 @@ fn cycle(report: &Report, all: bool, out: &mut Document) {
             or_dash(cycle.usual_wkc),
         ]);
     }
-    out.table(table);
+    out.section("Cycle", table);
     lines.into_iter().for_each(|line| out.line(line));
 }
 
@@ -274,14 +267,10 @@ fn clocks(report: &Report, out: &mut Document) {
             format!("{} ns", clock.last_ns),
         ]);
     }
-    out.table_if_any(table);
+    out.table(table);
 }
 
 fn axes(report: &Report, all: bool, out: &mut Document) {
-    if report.axes.is_empty() {
-        return;
-    }
-    out.heading("Axes");
     let mut table = Table::new("axis|cycles|state|mode|least|greatest|error|unit");
     for axis in &report.axes {
         let number = |value: Option<f64>| {
@@ -299,7 +288,7 @@ fn axes(report: &Report, all: bool, out: &mut Document) {
             axis.unit,
         ]);
     }
-    out.table(table);
+    out.section("Axes", table);
     for axis in report.axes.iter().filter(|_| all) {
         for (at, mode) in &axis.modes {
             out.line(format!("{at:>11.6} s  {}: mode {mode}", axis.name));

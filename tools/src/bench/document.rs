@@ -11,10 +11,8 @@ use crate::document::{Axis, Chart, Document, Series, Shape, Table};
 #[must_use]
 pub fn document(report: &Report) -> Document {
     let mut out = Document::new("Timing of an EtherCAT cycle");
-    out.heading("Measured");
-    out.table(facts(&report.settings));
-    out.heading("Computer");
-    out.table(facts(&report.facts));
+    out.section("Measured", facts(&report.settings));
+    out.section("Computer", facts(&report.facts));
     for (title, explanation, get) in MEASURES {
         measure(&mut out, report, title, explanation, get);
     }
@@ -157,7 +155,6 @@ fn chart(title: &str, variants: &[Variant], get: Get) -> Chart {
 }
 
 fn counters(out: &mut Document, report: &Report) {
-    out.heading("Per cycle");
     let mut table = Table::new("|CPU|of a CPU|switches|spinning");
     for v in &report.variants {
         table.row(cells![
@@ -175,8 +172,7 @@ fn counters(out: &mut Document, report: &Report) {
             table.row(cells![name, value, "", "", ""]);
         }
     }
-    out.table(table);
-    out.heading("Counted");
+    out.section("Per cycle", table);
     let mut table = Table::new("|cycles|lost|late|overruns");
     for v in &report.variants {
         table.row(cells![
@@ -187,7 +183,7 @@ fn counters(out: &mut Document, report: &Report) {
             or_dash(v.counters.map(|c| c.overruns)),
         ]);
     }
-    out.table(table);
+    out.section("Counted", table);
     for v in &report.variants {
         out.item(format!("{}: ", v.name), details(v).join("; "));
     }

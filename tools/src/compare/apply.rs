@@ -5,6 +5,7 @@ use std::path::Path;
 use toml_edit::{Array, ArrayOfTables, DocumentMut, Item, Table, TableLike, Value};
 
 use super::{Comparison, Difference};
+use crate::document::format::quoted;
 use crate::scan::write::{self, OutputPath};
 use crate::scan::{EsiMatch, Scan};
 use ecaxis_master::config::{self, ConfigError, Locator, Machine};
@@ -147,10 +148,6 @@ fn set(table: &mut Table, key: &str, value: &str) {
             table.insert(key, Item::Value(value));
         }
     }
-}
-
-fn quoted(text: &str) -> String {
-    Value::from(text).to_string()
 }
 
 /// Returns sections for the devices that the file does not have.

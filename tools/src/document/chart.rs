@@ -152,7 +152,7 @@ impl Chart {
                     for mark in marks {
                         let at = x(*mark);
                         let mark = format!("M{at:.1} {floor:.1}v5");
-                        path(&mut svg, &mark, colour, "none\" stroke-width=\"2");
+                        path(&mut svg, &mark, colour, r#"stroke-width="2""#);
                     }
                 }
                 Shape::Bands(states) => bands(&mut svg, states, self.x.high, &x),
@@ -170,7 +170,7 @@ impl Chart {
 fn line(svg: &mut String, (x1, y1): (f64, f64), (x2, y2): (f64, f64)) {
     let _ = writeln!(
         svg,
-        "<line x1=\"{x1:.1}\" y1=\"{y1:.1}\" x2=\"{x2:.1}\" y2=\"{y2:.1}\" class=\"grid\"/>"
+        r#"<line x1="{x1:.1}" y1="{y1:.1}" x2="{x2:.1}" y2="{y2:.1}" class="grid"/>"#
     );
 }
 
@@ -178,15 +178,14 @@ fn text(svg: &mut String, (x, y): (f64, f64), anchor: &str, text: &str) {
     let text = escape(text);
     let _ = writeln!(
         svg,
-        "<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\">{text}</text>"
+        r#"<text x="{x:.1}" y="{y:.1}" text-anchor="{anchor}">{text}</text>"#
     );
 }
 
-/// Draws a path; `fill` may go on with further attributes.
-fn path(svg: &mut String, path: &str, colour: &str, fill: &str) {
+fn path(svg: &mut String, path: &str, colour: &str, attributes: &str) {
     let _ = writeln!(
         svg,
-        "<path d=\"{path}\" stroke=\"{colour}\" stroke-linejoin=\"round\" fill=\"{fill}\"/>"
+        r#"<path d="{path}" stroke="{colour}" fill="{colour}" {attributes}/>"#
     );
 }
 
@@ -201,7 +200,8 @@ fn curve(svg: &mut String, points: &[(f64, f64, f64)], colour: &str, x: Place<'_
             let _ = write!(way, "V{:.1}", y(*greatest));
         }
     }
-    path(svg, &way, colour, "none\" stroke-width=\"1.5");
+    let line = r#"fill-opacity="0" stroke-width="1.5" stroke-linejoin="round""#;
+    path(svg, &way, colour, line);
 }
 
 /// Draws the outline of the steps; a gap between two of them falls to the axis.
@@ -225,8 +225,8 @@ fn outline(
         let _ = write!(way, "V{top:.1}H{to:.1}");
         end = Some(to);
     }
-    let fill = format!("{colour}\" fill-opacity=\"0.14\" stroke-width=\"1.3");
-    path(svg, &format!("{way}V{floor:.1}"), colour, &fill);
+    let area = r#"fill-opacity="0.14" stroke-width="1.3""#;
+    path(svg, &format!("{way}V{floor:.1}"), colour, area);
 }
 
 /// Draws the states as bands, with their names if there is room.

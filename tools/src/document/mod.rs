@@ -57,17 +57,21 @@ impl Document {
         self.item("", text);
     }
 
-    /// Adds a table; an empty line separates it from a table before it.
+    /// Adds a table unless it has no rows; an empty line separates it from a table before it.
     pub fn table(&mut self, table: Table) {
+        if table.rows.is_empty() {
+            return;
+        }
         if let Some(Block::Table(_)) = self.blocks.last() {
             self.gap();
         }
         self.blocks.push(Block::Table(table));
     }
 
-    /// Adds a table unless it has no rows.
-    pub fn table_if_any(&mut self, table: Table) {
+    /// Adds a heading and a table unless the table has no rows.
+    pub fn section(&mut self, heading: impl Into<String>, table: Table) {
         if !table.rows.is_empty() {
+            self.heading(heading);
             self.table(table);
         }
     }
@@ -77,7 +81,7 @@ impl Document {
         self.blocks.push(Block::Chart(chart));
     }
 
-    /// Adds an empty line.
+    /// Adds an empty line before the next block, if one follows.
     pub fn gap(&mut self) {
         self.blocks.push(Block::Gap);
     }

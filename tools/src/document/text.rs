@@ -17,21 +17,24 @@ impl Document {
     pub fn text(&self, columns: Option<usize>) -> String {
         let mut out = String::new();
         item(&mut out, "", "  ", &self.title, columns);
+        let mut gap = false;
         for block in &self.blocks {
+            gap |= matches!(block, Block::Gap | Block::Heading(_));
+            if matches!(block, Block::Gap | Block::Chart(_)) {
+                continue;
+            }
+            if std::mem::take(&mut gap) && !out.is_empty() {
+                out.push('\n');
+            }
             match block {
-                // The first line of a text is not empty.
-                Block::Heading(_) | Block::Gap if out.is_empty() => {}
-                Block::Gap | Block::Heading(_) => out.push('\n'),
-                Block::Chart(_) => {}
+                Block::Heading(text) => item(&mut out, "", "  ", text, columns),
                 Block::Item { lead, text } => {
                     let lead = format!("  {lead}");
                     let hanging = " ".repeat(lead.chars().count());
                     item(&mut out, &lead, &hanging, text, columns);
                 }
                 Block::Table(table) => table.write(&mut out, 2, columns),
-            }
-            if let Block::Heading(text) = block {
-                item(&mut out, "", "  ", text, columns);
+                Block::Chart(_) | Block::Gap => {}
             }
         }
         out

@@ -17,6 +17,7 @@ use ecaxis_esi::{Address, Identity};
 use serde::Deserialize;
 
 use super::{DataType, Parameter};
+use crate::document::format::quoted;
 use ecaxis_master::mailbox::NamedObject;
 
 /// The device of the parameters.
@@ -222,8 +223,4 @@ fn value(parameter: &Parameter) -> String {
         _ => false,
     };
     if bare { shown } else { quoted(&shown) }
-}
-
-fn quoted(text: &str) -> String {
-    toml::Value::String(text.to_owned()).to_string()
 }

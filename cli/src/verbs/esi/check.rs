@@ -6,8 +6,7 @@ use ecaxis_esi::{Finding, Severity, lint};
 use ecaxis_master::text::pluralize;
 use serde_json::json;
 
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{note, page, print_json};
 
 const EXAMPLES: &str = "\

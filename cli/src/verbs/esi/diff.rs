@@ -9,8 +9,7 @@ use ecaxis_tools::document::Table;
 use serde_json::json;
 
 use super::DeviceArgs;
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{note, print_json, print_table};
 
 const EXAMPLES: &str = "\

@@ -8,8 +8,7 @@ use ecaxis_tools::cells;
 use ecaxis_tools::document::Table;
 use ecaxis_tools::document::format::hex32;
 
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{note, print_json, print_table};
 
 const EXAMPLES: &str = "\

@@ -8,8 +8,7 @@ use ecaxis_master::config::nearest;
 use ecaxis_master::esi_library::{self, LoadError};
 use ecaxis_master::text::pluralize;
 
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::note;
 
 mod check;

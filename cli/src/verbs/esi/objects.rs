@@ -9,8 +9,7 @@ use ecaxis_tools::document::format::hex_bytes;
 use serde::Serialize;
 
 use super::DeviceArgs;
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{print_json, print_table};
 
 const EXAMPLES: &str = "\

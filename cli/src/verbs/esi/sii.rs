@@ -5,8 +5,7 @@ use std::path::PathBuf;
 use ecaxis_esi::sii::{self, SiiOptions};
 
 use super::DeviceArgs;
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::note;
 
 const EXAMPLES: &str = "\

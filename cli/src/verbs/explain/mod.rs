@@ -2,7 +2,6 @@
 
 use std::path::PathBuf;
 
-use ecaxis_esi::{SmLayout, SmUse};
 use ecaxis_master::config::{
     self, Action, Bus, DeviceConfig, Exchange, Machine, Nic, Step, duration,
 };
@@ -12,15 +11,14 @@ use ecaxis_master::rt::image::{self, Access, ImagePlan};
 use ecaxis_master::rt::spin::Spin;
 use ecaxis_master::text::pluralize;
 use ecaxis_tools::cells;
-use ecaxis_tools::document::format::{hex16, hex32, times};
+use ecaxis_tools::document::format::{hex32, times};
 use ecaxis_tools::document::{Document, Table};
 
 mod axis;
 mod stop;
 
-use crate::hints;
-use crate::hints::Failure;
-use crate::render::pdo_table::{fields, startup};
+use crate::hints::{self, Failure};
+use crate::render::pdo_table::{process_data, startup};
 use crate::render::print;
 
 const EXAMPLES: &str = "\
@@ -133,8 +131,7 @@ fn bus(machine: &Machine, out: &mut Document) {
     row("op_timeout", &time(bus.op_timeout_ns), "from SafeOp to Op");
     let meaning = "until a drive reports Operation enabled";
     row("enable_timeout", &time(bus.enable_timeout_ns), meaning);
-    out.heading("bus");
-    out.table(table);
+    out.section("bus", table);
 }
 
 fn device(device: &DeviceConfig, out: &mut Document) {
@@ -167,45 +164,9 @@ fn device(device: &DeviceConfig, out: &mut Document) {
         out.gap();
         out.table(axis::axis(axis));
     }
-    sync_managers(device, out);
-    let layout = &selection.layout;
-    fields("outputs", layout.rx_bytes(), &layout.rx, out);
-    fields("inputs", layout.tx_bytes(), &layout.tx, out);
+    process_data(&device.device, &selection.layout, out);
     clock(device, out);
     startup(&device.selection.startup, out);
-}
-
-fn sync_managers(device: &DeviceConfig, out: &mut Document) {
-    let mut table = Table::new("SM|use|address|bytes|control|FMMU");
-    let layout = &device.selection.layout;
-    let outputs = layout.outputs.iter().map(|sm| ("outputs", sm));
-    let inputs = layout.inputs.iter().map(|sm| ("inputs", sm));
-    let process: Vec<(&str, &SmLayout)> = outputs.chain(inputs).collect();
-    for (number, sm) in device.device.sync_managers.iter().enumerate() {
-        let planned = process.iter().find(|(_, p)| usize::from(p.sm) == number);
-        let usage = match (planned, sm.usage) {
-            (Some((usage, _)), _) => usage,
-            (None, SmUse::MBoxOut) => "mailbox out",
-            (None, SmUse::MBoxIn) => "mailbox in",
-            (None, _) => "unused",
-        };
-        let (address, len, control, fmmu) = match planned {
-            Some((_, p)) => {
-                let fmmu = p.fmmu.map_or("next free".to_owned(), |f| f.to_string());
-                (p.start_address, p.len, p.control_byte, fmmu)
-            }
-            None => (
-                sm.start_address,
-                sm.default_size,
-                sm.control_byte,
-                String::new(),
-            ),
-        };
-        let (address, control) = (hex16(address), format!("0x{control:02x}"));
-        table.row(cells![number, usage, address, len, control, fmmu]);
-    }
-    out.gap();
-    out.table(table);
 }
 
 fn clock(device: &DeviceConfig, out: &mut Document) {

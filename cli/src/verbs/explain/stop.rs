@@ -26,8 +26,7 @@ pub(super) fn stop(machine: &Machine, out: &mut Document) {
     table.row(cells!["an axis faults or trips", others, "`others`"]);
     table.row(cells!["no process data", lost, "`bus_lost`"]);
     table.row(cells!["emergency stop", emergency, "`emergency`"]);
-    out.heading("stop");
-    out.table(table);
+    out.section("stop", table);
     if stop.groups.is_empty() {
         out.gap();
         out.line("all axes stop together");

@@ -5,8 +5,7 @@ use ecaxis_tools::firmware;
 use super::{TargetArgs, show};
 use crate::args::bus;
 use crate::args::device::{self, Target};
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{print, print_json};
 
 const EXAMPLES: &str = "\

@@ -7,8 +7,7 @@ use ecaxis_sim::FirmwareHeader;
 
 use crate::args::device::named;
 use crate::args::files::write_new;
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::note;
 use crate::verbs::esi::number;
 

@@ -16,8 +16,7 @@ use serde_json::{Value, json};
 use super::{TargetArgs, show, wrong};
 use crate::args::bus;
 use crate::args::device::Target;
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{note, output, print, print_json, style};
 use crate::verbs::esi::number;
 

@@ -7,8 +7,7 @@ use ecaxis_master::esi_library::{self, Library};
 use ecaxis_tools::scan::{self, EsiMatch, MainDeviceEvidence, Scan, esi_match};
 
 use crate::args::bus::{self, Bus};
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{note, print_json, print_page, result};
 
 mod report;

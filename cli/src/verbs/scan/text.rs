@@ -54,7 +54,7 @@ pub(super) fn document(seen: &ScanResult) -> Document {
     }
     out.gap();
     for table in [identities, places, descriptions, answers] {
-        out.table_if_any(table);
+        out.table(table);
     }
     if !drives.is_empty() {
         out.table(drives);
@@ -206,19 +206,17 @@ fn axis(device: &Device, described: Option<&EsiMatch>) -> String {
 /// Adds remarks that need more than a table cell.
 fn notes(seen: &ScanResult, out: &mut Document) {
     let wrong = seen.scan.devices.iter().filter(|d| d.found.error);
-    let wrong = wrong.map(|device| {
+    out.gap();
+    for device in wrong {
         let (position, state, code) = (device.position(), device.found.state, device.found.code);
         let text = al_status_text(code);
-        format!("position {position}: in {state} with AL status code 0x{code:04x}: {text}")
-    });
-    let mut notes: Vec<String> = wrong.collect();
+        out.line(format!(
+            "position {position}: in {state} with AL status code 0x{code:04x}: {text}"
+        ));
+    }
     if !seen.scan.measured && seen.scan.devices.iter().any(|d| d.delay_ns.is_some()) {
-        notes.push("delays are those that the other master wrote (0x0928)".to_owned());
+        out.line("delays are those that the other master wrote (0x0928)");
     }
-    if !notes.is_empty() {
-        out.gap();
-    }
-    notes.into_iter().for_each(|note| out.line(note));
 }
 
 /// Draws the topology from port to port.

@@ -9,10 +9,8 @@ use ecaxis_tools::scan::write::{self, MARK, OutputPath};
 use super::ScanResult;
 use crate::args::bus;
 use crate::args::files::replace;
-use crate::hints;
-use crate::hints::Failure;
-use crate::render::note;
-use crate::render::result;
+use crate::hints::{self, Failure};
+use crate::render::{note, result};
 
 /// Fails if the file exists, because it may contain manual changes.
 pub(super) fn refuse(path: &Path, force: bool) -> Result<(), Failure> {

@@ -5,8 +5,7 @@ use ecaxis_tools::parameters::command::Command;
 use serde_json::json;
 
 use crate::args::device::{DeviceArgs, Open, no_more};
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{note, print_json};
 
 const STORE_EXAMPLES: &str = "\

@@ -5,8 +5,7 @@ use std::path::Path;
 use super::dump::taken;
 use super::{Common, as_json, load, print_differences};
 use crate::args::device::Open;
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::print_json;
 
 const EXAMPLES: &str = "\

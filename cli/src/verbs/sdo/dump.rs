@@ -10,8 +10,7 @@ use super::{Common, refusal};
 use crate::args::bus;
 use crate::args::device::{Open, address, counter};
 use crate::args::files::write_new;
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{note, print_json};
 
 const EXAMPLES: &str = "\

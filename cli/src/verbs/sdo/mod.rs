@@ -16,8 +16,7 @@ use serde_json::{Value, json};
 
 use crate::args::Verbosity;
 use crate::args::device::{DeviceArgs, Target, address};
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{print_table, result};
 
 mod command;

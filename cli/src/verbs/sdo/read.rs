@@ -13,8 +13,7 @@ use serde_json::json;
 
 use super::{Common, Line, print_lines, wanted};
 use crate::args::device::{Open, address};
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{note, print_json};
 
 const EXAMPLES: &str = "\

@@ -8,8 +8,7 @@ use serde_json::json;
 use super::{Common, as_json, load, print_differences, refusal};
 use crate::args::bus;
 use crate::args::device::{Open, address, counter};
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
 use crate::render::{note, print_json};
 
 const EXAMPLES: &str = "\

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use ecaxis_esi as esi;
 
 use super::{Device, EsiMatch, Scan};
+use crate::document::format::quoted;
 use ecaxis_master::config::duration;
 use ecaxis_master::esi_library::RevisionMatch;
 
@@ -400,9 +401,4 @@ pub(crate) fn relative(file: &Path, folder: &Path) -> PathBuf {
     let up = std::iter::repeat_n(Path::new(".."), ups);
     up.chain(to.map(|part| Path::new(part.as_os_str())))
         .collect()
-}
-
-/// Quotes a text for TOML.
-fn quoted(text: &str) -> String {
-    toml::Value::String(text.to_owned()).to_string()
 }

@@ -1,9 +1,10 @@
 //! `ecaxis esi show`: shows a device.
 //!
-//! `head` shows the identity, `offers` the options, `chosen` one configuration; `as_json` formats
-//! all as JSON.
+//! `head` shows the identity, `offers` the options; `as_json` formats all as JSON.
 
-use ecaxis_esi::{EsiFile, Mode, SelectError, SelectOptions, offered_modes, select};
+use ecaxis_esi::{
+    Device, EsiFile, Mode, SelectError, SelectOptions, Selection, offered_modes, select,
+};
 use ecaxis_master::config::duration;
 use ecaxis_master::text::pluralize;
 use ecaxis_tools::cells;
@@ -11,12 +12,11 @@ use ecaxis_tools::document::format::{hex16, hex32};
 use ecaxis_tools::document::{Document, Table};
 
 use super::DeviceArgs;
-use crate::hints;
-use crate::hints::Failure;
+use crate::hints::{self, Failure};
+use crate::render::pdo_table::{process_data, startup};
 use crate::render::{note, print, print_json};
 
 mod as_json;
-mod chosen;
 mod head;
 mod offers;
 
@@ -103,7 +103,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     offers::write(&file, device, &choice, &mut out);
     match &selection {
-        Ok(selection) if !soe_alone => chosen::write(device, selection, &choice, &mut out),
+        Ok(selection) if !soe_alone => configuration(device, selection, &choice, &mut out),
         Err(error) if !soe_alone => {
             out.heading(format!("no default configuration: {error}"));
             if matches!(error, SelectError::ModuleNeeded { .. }) {
@@ -113,6 +113,33 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         _ => {}
     }
     print(&out)
+}
+
+/// Adds one configuration: SyncManagers, process data with offsets, start-up list.
+fn configuration(
+    device: &Device,
+    selection: &Selection,
+    choice: &SelectOptions<'_>,
+    out: &mut Document,
+) {
+    let what = match (selection.mode, selection.modules.as_slice()) {
+        (Some(mode), _) => format!("mode {mode}"),
+        (None, []) => "the default".to_owned(),
+        (None, modules) => {
+            let names: Vec<String> = modules
+                .iter()
+                .map(|m| format!("{:?} in slot {:?}", m.type_name, m.slot_name))
+                .collect();
+            format!("the default, {}", names.join(", "))
+        }
+    };
+    let cycle = duration::show(choice.cycle_ns);
+    out.heading(format!("configuration: {what}, cycle {cycle}"));
+    for note in &selection.notes {
+        out.item("note: ", note);
+    }
+    process_data(device, &selection.layout, out);
+    startup(&selection.startup, out);
 }
 
 fn devices(file: &EsiFile) -> Document {

@@ -17,8 +17,8 @@ pub(super) fn write(
 ) {
     modes(file, device, choice, out);
     slots(file, device, out);
-    section("PDO assignments by name", assignments(device), out);
-    section("clock modes", clock_modes(device), out);
+    out.section("PDO assignments by name", assignments(device));
+    out.section("clock modes", clock_modes(device));
     pdo_list(file, device, out);
 }
 
@@ -42,13 +42,6 @@ pub(super) fn by_mode(
     modes.map(selected).collect()
 }
 
-fn section(title: &str, table: Table, out: &mut Document) {
-    if !table.is_empty() {
-        out.heading(title);
-        out.table(table);
-    }
-}
-
 fn modes(file: &EsiFile, device: &Device, choice: &SelectOptions<'_>, out: &mut Document) {
     let offered = by_mode(file, device, choice);
     let mut table = Table::new("mode|0x6060|module|bytes out|bytes in|clock");
@@ -64,7 +57,7 @@ fn modes(file: &EsiFile, device: &Device, choice: &SelectOptions<'_>, out: &mut 
             Err(error) => cells![mode, mode.code(), error, "", "", ""],
         });
     }
-    section("modes", table, out);
+    out.section("modes", table);
     let usable = offered.iter();
     let usable = usable.filter_map(|(mode, of)| Some((*mode, &of.as_ref().ok()?.layout)));
     let usable: Vec<(Mode, &Layout)> = usable.collect();
@@ -173,7 +166,7 @@ fn slots(file: &EsiFile, device: &Device, out: &mut Document) {
     }
     let mut table = Table::new("slot|modules|takes");
     rows.into_iter().for_each(|row| table.row(row));
-    section("slots", table, out);
+    out.section("slots", table);
 }
 
 fn sync(time: SyncTime, on: bool) -> String {
@@ -251,5 +244,5 @@ fn pdo_list(file: &EsiFile, device: &Device, out: &mut Document) {
             pdo.name,
         ]);
     }
-    section("PDOs", table, out);
+    out.section("PDOs", table);
 }
