@@ -1,4 +1,4 @@
-//! Typed tables of the machine file. [`table!`] declares a table once: its keys with their types,
+//! Typed tables of the machine file. `table!` declares a table once: its keys with their types,
 //! ranges and examples. An invalid value becomes a problem and a `None`. Reading continues, so that
 //! one check finds all problems.
 
@@ -52,7 +52,7 @@ pub(crate) trait Domain<T> {
     fn read(&self, value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<T>;
 }
 
-/// A type of fields in [`table!`].
+/// A type of fields in `table!`.
 pub(crate) trait Field: Sized {
     type Value;
 
