@@ -1,15 +1,15 @@
 //! The shortest and longest cycle times, on the simulated bus in virtual time.
 
-use ecaxis_master::config;
-use ecaxis_test_support::{axes, machine, root, run_badly, run_well, virtual_time};
+use ecaxis_master::config::Machine;
+use ecaxis_test_support::bench::Bench;
+use ecaxis_test_support::{axes, machine, run_badly, run_well, virtual_time};
 
 /// Returns the machine of `axes` with another cycle.
 fn at(cycle: &str) -> String {
     axes(2).replace("\"1ms\"", &format!("\"{cycle}\""))
 }
 
-fn moves(text: &str, cycle_ns: u64) {
-    let machine = machine(text);
+fn moves(machine: Machine, cycle_ns: u64) {
     assert_eq!(machine.bus.cycle_ns, cycle_ns);
     let summary = run_well(machine, virtual_time());
     assert_eq!(summary.cycle_ns, cycle_ns);
@@ -32,32 +32,24 @@ fn moves(text: &str, cycle_ns: u64) {
 
 #[test]
 fn axes_move_at_four_kilohertz() {
-    moves(&at("250us"), 250_000);
+    moves(machine(&at("250us")), 250_000);
 }
 
 #[test]
 fn axes_move_at_fifty_hertz() {
     // A drive at 50 turns/s lags one turn behind a target that changes every 20 ms.
     let text = at("20ms").replace("following_error = 1.0", "following_error = 4.0");
-    moves(&text, 20_000_000);
+    moves(machine(&text), 20_000_000);
 }
 
 /// A cycle that 0x60C2 cannot express is rejected, except for drives without this object.
 fn moves_without_interpolation_time(cycle: &str, cycle_ns: u64, refused: &str) {
     let text = at(cycle);
-    let path = root().join("configs/test.toml");
-    let error = config::parse(&path, &text).expect_err("EPOS4 has 0x60C2");
-    let error = error.to_string();
+    let bench = Bench::new();
+    let error = bench.parse(&text).expect_err("EPOS4 has 0x60C2");
     assert!(error.contains(refused), "{error}");
-
-    let folder = tempfile::tempdir().expect("a folder");
-    let esi = std::fs::read_to_string(root().join("configs/esi/EPOS4.xml")).expect("an ESI file");
-    let without = folder.path().join("without.xml");
-    std::fs::write(&without, esi.replace("#x60C2", "#x2FFF")).expect("written");
-    moves(
-        &text.replace("esi/EPOS4.xml", without.to_str().expect("UTF-8")),
-        cycle_ns,
-    );
+    bench.change("esi/EPOS4.xml", |esi| esi.replace("#x60C2", "#x2FFF"));
+    moves(bench.machine(&text), cycle_ns);
 }
 
 /// 62.5 µs is 625 × 10⁻⁷ s, and 0x60C2 has only 8 bits for the value 625.

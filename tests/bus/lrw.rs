@@ -3,26 +3,25 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use ecaxis_master::config::{self, Machine};
-use ecaxis_master::session::Options;
-use ecaxis_sim::FaultScript;
+use ecaxis_master::config::Machine;
+use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::recordings::{LRD, LRW, LWR, frames};
-use ecaxis_test_support::{root, run_badly, run_well, virtual_time};
+use ecaxis_test_support::{faults, recorded, run_badly, run_well, virtual_time};
 
 /// Returns three drives that move; the ESI files of the named ones exclude LRW.
-fn bus(folder: &Path, without: &[&str], exchange: &str) -> Machine {
-    let esi = std::fs::read_to_string(root().join("configs/esi/EPOS4.xml")).expect("an ESI file");
+fn bus(without: &[&str], exchange: &str) -> Machine {
+    let bench = Bench::new();
     let type_ = "<Type ProductCode=\"#x45500004\"";
-    assert!(esi.contains(type_));
-    std::fs::write(folder.join("lrw.xml"), &esi).expect("written");
-    let without_lrw = esi.replace(type_, &format!("{type_} UseLrdLwr=\"1\""));
-    std::fs::write(folder.join("no_lrw.xml"), without_lrw).expect("written");
+    bench.write("no_lrw.xml", &bench.read("esi/EPOS4.xml"));
+    bench.change("no_lrw.xml", |esi| {
+        esi.replace(type_, &format!("{type_} UseLrdLwr=\"1\""))
+    });
     let mut text = format!("[bus]\nnic = \"sim\"\ncycle = \"1ms\"\nexchange = \"{exchange}\"\n");
     for (position, name) in ["x", "y", "z"].into_iter().enumerate() {
         let file = if without.contains(&name) {
             "no_lrw.xml"
         } else {
-            "lrw.xml"
+            "esi/EPOS4.xml"
         };
         text += &format!(
             "[[device]]\nname = \"{name}\"\nesi = \"{file}\"\nposition = {position}\nmode = \"csp\"\n\
@@ -31,7 +30,7 @@ fn bus(folder: &Path, without: &[&str], exchange: &str) -> Machine {
         );
     }
     text += "[[step]]\nmove = { x = 20.0, y = -10.0, z = 5.0 }\n[[step]]\ndwell = \"1s\"\n";
-    config::parse(&folder.join("m.toml"), &text).unwrap_or_else(|error| panic!("{error}"))
+    bench.machine(&text)
 }
 
 /// Returns the working counters of each logical command per cyclic frame. Datagrams of one command
@@ -63,12 +62,8 @@ fn each_device_is_reached_by_a_supported_command() {
     ] {
         for exchange in ["same-cycle", "pipelined"] {
             let folder = tempfile::tempdir().expect("a temporary folder");
-            let recording = folder.path().join("r.pcapng");
-            let options = Options {
-                record: Some(recording.clone()),
-                ..virtual_time()
-            };
-            let summary = run_well(bus(folder.path(), without, exchange), options);
+            let (options, recording) = recorded(virtual_time(), folder.path());
+            let summary = run_well(bus(without, exchange), options);
             let counters = summary.counters;
             assert_eq!(
                 (counters.wkc_errors, counters.lost_frames),
@@ -112,13 +107,8 @@ fn each_device_is_reached_by_a_supported_command() {
 #[test]
 fn a_missing_device_without_lrw_stops_the_machine() {
     for without in ["x", "z"] {
-        let folder = tempfile::tempdir().expect("a temporary folder");
         let script = "[[fault]]\nkind = \"absent\"\ndevice = 2\nat = \"1200ms\"\n";
-        let options = Options {
-            faults: Some(FaultScript::parse(script).expect("a script")),
-            ..virtual_time()
-        };
-        let (error, _) = run_badly(bus(folder.path(), &[without], "same-cycle"), options);
+        let (error, _) = run_badly(bus(&[without], "same-cycle"), faults(script));
         assert!(
             error.contains("`z`") && error.contains("no longer answers"),
             "{error}"

@@ -5,11 +5,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use ecaxis_master::bringup::Step;
+use ecaxis_master::config::Machine;
 use ecaxis_master::mailbox::{MailboxError, Mailboxes, SdoError};
 use ecaxis_master::session::{
     self, EmergencyReport, Observer, Options, Outcome, Progress, RunError,
 };
-use ecaxis_test_support::{Heard, axes, faults, machine, root, run, virtual_time};
+use ecaxis_test_support::bench::Bench;
+use ecaxis_test_support::{Heard, axes, faults, machine, run, virtual_time};
 
 fn emergencies(heard: &Heard) -> Vec<&EmergencyReport> {
     let each = heard.0.iter().filter_map(|progress| match progress {
@@ -30,34 +32,19 @@ fn script(times: &[(&str, u32, u16)]) -> String {
 
 /// Returns the devices of `configs/` with mailbox status in the process image, and the same devices
 /// without it.
-fn with_and_without_status_fmmu() -> [(&'static str, String); 2] {
-    let with = axes(2);
-    let without = with.replace("esi/EPOS4.xml", "NO_STATUS");
-    [("with status FMMU", with), ("without", without)]
+fn with_and_without_status_fmmu() -> [(&'static str, Machine); 2] {
+    let without = with_esi(&axes(2), "<Fmmu>MBoxState</Fmmu>", "");
+    [
+        ("with status FMMU", machine(&axes(2))),
+        ("without", without),
+    ]
 }
 
-/// Parses a machine file. `NO_STATUS` stands for the demonstration drive's ESI without its third
-/// FMMU.
-fn parsed(text: &str) -> (ecaxis_master::config::Machine, tempfile::TempDir) {
-    with_esi(text, "NO_STATUS", "<Fmmu>MBoxState</Fmmu>", "")
-}
-
-/// Parses a machine file in which `name` is a changed copy of the demonstration drive's ESI, in a
-/// temporary folder.
-fn with_esi(
-    text: &str,
-    name: &str,
-    old: &str,
-    new: &str,
-) -> (ecaxis_master::config::Machine, tempfile::TempDir) {
-    let folder = tempfile::tempdir().expect("a folder");
-    let configs = root().join("configs");
-    let esi = std::fs::read_to_string(configs.join("esi/EPOS4.xml")).expect("an ESI file");
-    assert_eq!(esi.matches(old).count(), 1);
-    let path = folder.path().join("EPOS4.xml");
-    std::fs::write(&path, esi.replace(old, new)).expect("written");
-    let text = text.replace(name, &path.display().to_string());
-    (machine(&text), folder)
+/// Parses a machine file with a changed ESI of its drives.
+fn with_esi(text: &str, old: &str, new: &str) -> Machine {
+    let bench = Bench::new();
+    bench.change("esi/EPOS4.xml", |esi| esi.replace(old, new));
+    bench.machine(text)
 }
 
 #[test]
@@ -72,8 +59,7 @@ fn every_emergency_is_reported_once_from_bring_up_to_the_end() {
         ("1501ms", 0, 0x1006),
         ("2500ms", 1, 0x1007),
     ];
-    for (way, text) in with_and_without_status_fmmu() {
-        let (machine, _folder) = parsed(&text);
+    for (way, machine) in with_and_without_status_fmmu() {
         let (outcome, heard) = run(machine, faults(&script(&sent)));
         outcome
             .result
@@ -108,9 +94,8 @@ fn every_emergency_is_reported_once_from_bring_up_to_the_end() {
 #[test]
 fn emergencies_have_the_time_of_their_arrival() {
     let script = script(&[("1500ms", 1, 0x5000), ("1750ms", 1, 0x5001)]);
-    let many = ("thirty status FMMUs", axes(30));
-    for (way, text) in with_and_without_status_fmmu().into_iter().chain([many]) {
-        let (machine, _folder) = parsed(&text);
+    let many = ("thirty status FMMUs", machine(&axes(30)));
+    for (way, machine) in with_and_without_status_fmmu().into_iter().chain([many]) {
         let (outcome, heard) = run(machine, faults(&script));
         outcome.result.expect("emergencies alone stop nothing");
         let reported = emergencies(&heard);
@@ -150,9 +135,8 @@ fn a_fault_report_contains_the_emergency_of_the_drive() {
 
 #[test]
 fn the_diagnosis_history_of_a_faulty_device_is_read() {
-    let text = axes(2).replace("esi/EPOS4.xml", "KEEPS");
     let coe = "<CoE SdoInfo=\"1\" PdoAssign=\"1\"";
-    let (machine, _folder) = with_esi(&text, "KEEPS", coe, &format!("{coe} DiagHistory=\"1\""));
+    let machine = with_esi(&axes(2), coe, &format!("{coe} DiagHistory=\"1\""));
     let emergencies = (0..9).map(|n| (format!("{}ms", 1000 + 20 * n), 0x6100 + n));
     let mut script: String = emergencies
         .map(|(at, code)| {
@@ -351,7 +335,7 @@ fn mailbox_access_fails_after_the_run() {
 }
 
 /// Returns the devices of `axes` with additional keys in each table.
-fn with_start_up(more: &str) -> ecaxis_master::config::Machine {
+fn with_start_up(more: &str) -> Machine {
     let text = axes(2);
     let mode = "mode = \"csp\"\n";
     assert!(text.contains(mode), "{text}");

@@ -1,9 +1,10 @@
 //! Drives with units other than those of the machine file: adopted values, rejections and warnings.
 
 use ecaxis_master::bringup::Step;
-use ecaxis_master::config::{self, Machine};
+use ecaxis_master::config::Machine;
 use ecaxis_master::session::Progress;
-use ecaxis_test_support::{machine, root, run, run_badly, run_well, virtual_time};
+use ecaxis_test_support::bench::Bench;
+use ecaxis_test_support::{machine, run, run_badly, run_well, virtual_time};
 
 const HEAD: &str = r#"
 [bus]
@@ -30,19 +31,9 @@ const BEFORE_0X60A8: &str = "<Object>\n                <Index>#x60A8</Index>";
 
 /// Returns a machine with a changed ESI file, which also defines its simulated drive.
 fn with_esi(from: &str, to: &str, text: &str) -> Machine {
-    let folder = tempfile::tempdir().expect("a folder");
-    std::fs::create_dir(folder.path().join("esi")).expect("a folder");
-    let esi = std::fs::read_to_string(root().join("configs/esi/EPOS4.xml")).expect("is there");
-    assert!(esi.contains(from), "{from}");
-    std::fs::write(
-        folder.path().join("esi/EPOS4.xml"),
-        esi.replacen(from, to, 1),
-    )
-    .expect("written");
-    match config::parse(&folder.path().join("m.toml"), text) {
-        Ok(machine) => machine,
-        Err(error) => panic!("{error}"),
-    }
+    let bench = Bench::new();
+    bench.change("esi/EPOS4.xml", |esi| esi.replacen(from, to, 1));
+    bench.machine(text)
 }
 
 /// Adds an object to the drive.
@@ -133,18 +124,16 @@ fn a_different_encoder_resolution_is_rejected() {
         <SubItem><SubIdx>0</SubIdx><Name>Highest</Name><Type>USINT</Type><BitSize>8</BitSize><BitOffs>0</BitOffs></SubItem>\
         <SubItem><SubIdx>1</SubIdx><Name>Increments</Name><Type>UDINT</Type><BitSize>32</BitSize><BitOffs>16</BitOffs></SubItem>\
         <SubItem><SubIdx>2</SubIdx><Name>Turns</Name><Type>UDINT</Type><BitSize>32</BitSize><BitOffs>48</BitOffs></SubItem></DataType>";
-    let folder = tempfile::tempdir().expect("a folder");
-    let esi = std::fs::read_to_string(root().join("configs/esi/EPOS4.xml")).expect("is there");
     let object =
         format!("<Object>{encoder}<Flags><Access>rw</Access></Flags></Object>{BEFORE_0X60A8}");
-    let esi = esi.replacen(BEFORE_0X60A8, &object, 1);
-    let esi = esi.replacen("<DataTypes>", &format!("<DataTypes>{data_type}"), 1);
-    std::fs::create_dir(folder.path().join("esi")).expect("a folder");
-    std::fs::write(folder.path().join("esi/EPOS4.xml"), esi).expect("written");
+    let bench = Bench::new();
+    bench.change("esi/EPOS4.xml", |esi| {
+        let esi = esi.replacen(BEFORE_0X60A8, &object, 1);
+        esi.replacen("<DataTypes>", &format!("<DataTypes>{data_type}"), 1)
+    });
     let run_with = |counts: &str| {
         let text = format!("{HEAD}{AXIS}{MOVE}").replace("2000", counts);
-        let machine = config::parse(&folder.path().join("m.toml"), &text).expect("right");
-        run(machine, virtual_time()).0.result
+        run(bench.machine(&text), virtual_time()).0.result
     };
     let error = run_with("2000").expect_err("twice the way").to_string();
     assert!(

@@ -268,9 +268,13 @@ fn a_run_leaves_the_bus_unchanged() {
 fn unread_mailbox_data_are_reported_as_unknown() {
     over_a_pair(|pair| {
         let bench = bench();
-        bench.copy("commissioning.toml", "machine.toml");
+        let block = "[[device]]\nname = \"block\"\nesi = \"esi/MIO2.xml\"\nposition = 9\nmodules = [\"IN8\", \"OUT8\"]\n";
+        bench.write(
+            "machine.toml",
+            &format!("{}\n{block}", bench.read("bench.toml")),
+        );
         // The terminal's controller keeps the state that another MainDevice requested.
-        let _served = serve(&bench, &pair, "bench.toml");
+        let _served = serve(&bench, &pair, "machine.toml");
         led_to_safe_op(&pair, 1);
         let compare = ["compare", "machine.toml", "--nic", &pair.b];
         let ran = bench.ecaxis(&compare);

@@ -3,39 +3,9 @@
 
 use std::path::Path;
 
-use ecaxis_master::config::{self, Machine};
-use ecaxis_test_support::program;
+use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::recordings::{FPRD, FPWR, LRW, datagrams};
-use ecaxis_test_support::{Heard, assert_contains, faults, recorded, root, run, virtual_time};
-
-/// A machine with ESI files in a temporary folder.
-struct Bench {
-    folder: tempfile::TempDir,
-}
-
-impl Bench {
-    fn new() -> Self {
-        let folder = tempfile::tempdir().expect("a folder");
-        std::fs::create_dir(folder.path().join("esi")).expect("a folder");
-        Self { folder }
-    }
-
-    /// Writes a changed copy of a file of `configs/esi`.
-    fn esi(&self, name: &str, change: impl Fn(String) -> String) {
-        let text = std::fs::read_to_string(root().join("configs/esi").join(name));
-        let changed = change(text.expect("an ESI file"));
-        std::fs::write(self.folder.path().join("esi").join(name), changed).expect("written");
-    }
-
-    fn parse(&self, text: &str) -> Result<Machine, String> {
-        let path = self.folder.path().join("machine.toml");
-        config::parse(&path, text).map_err(|error| error.to_string())
-    }
-
-    fn machine(&self, text: &str) -> Machine {
-        self.parse(text).unwrap_or_else(|error| panic!("{error}"))
-    }
-}
+use ecaxis_test_support::{Heard, assert_contains, faults, recorded, run, virtual_time};
 
 const SV1_CSV: &str = r#"
 [bus]
@@ -60,13 +30,11 @@ dwell = "3s"
 #[test]
 fn an_axis_has_a_watchdog_with_any_esi() {
     let bench = Bench::new();
-    bench.esi("SV1.xml", |text| {
-        let changed = text.replace("ControlByte=\"#x64\"", "ControlByte=\"#x24\"");
-        assert_ne!(changed, text);
-        changed
+    bench.change("esi/SV1.xml", |text| {
+        text.replace("ControlByte=\"#x64\"", "ControlByte=\"#x24\"")
     });
     let silent = "[[fault]]\nkind = \"silent\"\nat = \"2s\"\nfor = \"250ms\"\n";
-    let (options, path) = recorded(faults(silent), bench.folder.path());
+    let (options, path) = recorded(faults(silent), bench.path());
     let (outcome, _) = run(bench.machine(SV1_CSV), options);
     outcome.result.expect_err("the bus was silent");
     let all = datagrams(&path);
@@ -125,10 +93,6 @@ dwell = "50ms"
     )
 }
 
-fn same(text: String) -> String {
-    text
-}
-
 /// Replaces the default of one of the ESI's objects, after its index.
 fn default(text: &str, index: &str, from: &str, to: &str) -> String {
     let at = text
@@ -143,7 +107,6 @@ fn default(text: &str, index: &str, from: &str, to: &str) -> String {
 #[test]
 fn a_limit_above_a_startup_sdo_is_rejected() {
     let bench = Bench::new();
-    bench.esi("EPOS4.xml", same);
     let wide = "position = [-20.0, 20.0], velocity = 40.0, acceleration = 200.0, torque = 120.0, following_error = 0.5";
     for (sdo, expected) in [
         (
@@ -184,7 +147,7 @@ fn a_limit_above_a_startup_sdo_is_rejected() {
 fn a_drive_limit_below_the_file_limit_causes_a_warning() {
     let bench = Bench::new();
     // The 0x6080 of the simulated motor is 6000 rpm.
-    bench.esi("EPOS4.xml", |text| default(&text, "6065", "2000", "400"));
+    bench.change("esi/EPOS4.xml", |text| default(text, "6065", "2000", "400"));
     let limits =
         "position = [-20.0, 20.0], velocity = 1000.0, acceleration = 200.0, following_error = 0.5";
     let machine = bench.machine(&epos4("", limits));
@@ -212,15 +175,11 @@ fn a_drive_limit_below_the_file_limit_causes_a_warning() {
 #[test]
 fn a_trip_names_the_drive_limit_that_held_the_axis_back() {
     let bench = Bench::new();
-    bench.esi("EPOS4.xml", same);
     let limits = "velocity = 150.0, acceleration = 1500.0, following_error = 0.5";
     let text = epos4("", limits) + "[[step]]\nmove_by = { x = 80.0 }\n";
-    let file = bench.folder.path().join("machine.toml");
-    std::fs::write(&file, text).expect("written");
-    let file = file.to_str().expect("UTF-8");
-    let said = program::run(["run", file, "--sim", "--virtual"])
-        .exits(1)
-        .err;
+    bench.write("machine.toml", &text);
+    let run = ["run", "machine.toml", "--sim", "--virtual"];
+    let said = bench.ecaxis(&run).exits(1).err;
     let hint = said.split("help:").nth(1).unwrap_or_default();
     let hint = hint.split_whitespace().collect::<Vec<_>>().join(" ");
     let limit = ["0x6080:00", "allows 100 turn/s", "`limits.velocity`"];
@@ -239,7 +198,7 @@ pdo.rx = [\"0x6040\", \"0x607A\", \"0x60B0\", \"0x6840\", \"0x68FF\"]\n\
 pdo.tx = [\"0x6041\", \"0x6061\", \"0x6064\"]";
 
 /// Returns a drive with an offset, and with power and velocity for a second axis.
-fn two_axes(text: String) -> String {
+fn two_axes(text: &str) -> String {
     let object = |index: &str, name: &str, kind: &str, bits: u8, value: u32| {
         format!(
             "<Object><Index>#x{index}</Index><Name>{name}</Name><Type>{kind}</Type><BitSize>{bits}</BitSize>\
@@ -247,7 +206,7 @@ fn two_axes(text: String) -> String {
              <Flags><Access>rw</Access><PdoMapping>R</PdoMapping></Flags></Object>"
         )
     };
-    let text = default(&text, "60B0", "0", "1900");
+    let text = default(text, "60B0", "0", "1900");
     let more = object("6840", "Controlword 2", "UINT", 16, 0x0f)
         + &object("68FF", "Target velocity 2", "DINT", 32, 5000);
     text.replacen("</Objects>", &(more + "</Objects>"), 1)
@@ -259,12 +218,12 @@ const LIMITS: &str =
 #[test]
 fn offsets_and_outputs_of_a_second_axis_stay_zero() {
     let bench = Bench::new();
-    bench.esi("EPOS4.xml", two_axes);
+    bench.change("esi/EPOS4.xml", two_axes);
     let text = epos4(OFFSET_AND_SECOND_AXIS, LIMITS);
     let machine = bench.machine(&(text.clone() + "[[step]]\nmove = { x = 2.0 }\n"));
     let notes = machine.devices[0].selection.notes.join("\n");
     assert!(notes.contains("axis 2 of the drive"), "{notes}");
-    let (options, path) = recorded(virtual_time(), bench.folder.path());
+    let (options, path) = recorded(virtual_time(), bench.path());
     run(machine, options).0.result.expect("it moves");
     let cycles = outputs(&path);
     assert!(cycles.len() > 100, "{} cycles", cycles.len());
@@ -282,7 +241,7 @@ fn offsets_and_outputs_of_a_second_axis_stay_zero() {
 #[test]
 fn offsets_of_targets_are_rejected_or_set_to_zero() {
     let bench = Bench::new();
-    bench.esi("EPOS4.xml", two_axes);
+    bench.change("esi/EPOS4.xml", two_axes);
     for index in ["0x60B0", "0x60B1", "0x60B2"] {
         let sdo = |value: i32| {
             epos4(
@@ -295,7 +254,7 @@ fn offsets_of_targets_are_rejected_or_set_to_zero() {
         bench.machine(&sdo(0));
     }
     // The drive holds the offset, but the object is not in its process data.
-    let (options, path) = recorded(virtual_time(), bench.folder.path());
+    let (options, path) = recorded(virtual_time(), bench.path());
     let (outcome, heard) = run(bench.machine(&epos4("", LIMITS)), options);
     outcome.result.expect("nothing moves");
     let warnings = heard.warnings();
@@ -311,14 +270,13 @@ fn offsets_of_targets_are_rejected_or_set_to_zero() {
 #[test]
 fn interpolation_time_equals_the_cycle_if_csp_or_csv_is_possible() {
     let bench = Bench::new();
-    bench.esi("EPOS4.xml", same);
     let csp = "pdo.rx = [\"0x6040\", \"0x6060\", \"0x607A\", \"0x6071\"]\n\
                pdo.tx = [\"0x6041\", \"0x6061\", \"0x6064\", \"0x606C\", \"0x6077\"]";
     let alone = "";
     for (pdo, expected) in [(csp, (2, -3)), (alone, (0, 0))] {
         let text = epos4(pdo, "velocity = 40.0, acceleration = 200.0");
         let text = text.replace("\"csp\"", "\"cst\"").replace("1ms", "2ms");
-        let (options, path) = recorded(virtual_time(), bench.folder.path());
+        let (options, path) = recorded(virtual_time(), bench.path());
         let (outcome, _) = run(bench.machine(&text), options);
         outcome.result.expect("nothing moves");
         let all = datagrams(&path);
@@ -348,7 +306,6 @@ fn terminals(count: usize) -> String {
 #[test]
 fn bring_up_supports_more_than_128_devices_and_rejects_more_than_512() {
     let bench = Bench::new();
-    bench.esi("IO8.xml", same);
     let (outcome, _) = run(bench.machine(&terminals(130)), virtual_time());
     outcome.result.expect("it runs");
     let error = bench.parse(&terminals(513)).expect_err("one too many");

@@ -4,6 +4,8 @@ use std::ffi::OsStr;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
+use ecaxis_master::config::{self, Machine};
+
 use crate::program::{Ran, ecaxis};
 use crate::root;
 
@@ -35,6 +37,25 @@ impl Bench {
 
     pub fn read(&self, name: &str) -> String {
         std::fs::read_to_string(self.path().join(name)).expect("a text file")
+    }
+
+    /// Changes a file.
+    #[track_caller]
+    pub fn change(&self, name: &str, change: impl FnOnce(&str) -> String) {
+        let text = self.read(name);
+        let changed = change(&text);
+        assert_ne!(changed, text, "{name}");
+        self.write(name, &changed);
+    }
+
+    /// Parses a machine file in the folder.
+    pub fn parse(&self, text: &str) -> Result<Machine, String> {
+        config::parse(&self.path().join("machine.toml"), text).map_err(|error| error.to_string())
+    }
+
+    #[track_caller]
+    pub fn machine(&self, text: &str) -> Machine {
+        self.parse(text).unwrap_or_else(|error| panic!("{error}"))
     }
 
     /// Copies one of `configs` under another name.
