@@ -58,15 +58,9 @@ impl CancelToken {
     /// Runs `work` until it completes. Returns `None` if the token is cancelled while no inner
     /// section is shielded.
     pub async fn run_until_cancelled<F: Future>(&self, work: F) -> Option<F::Output> {
-        let mut work = pin!(work);
-        let outside = self.held.load(Ordering::Relaxed);
-        poll_fn(|context| {
-            if self.is_cancelled() && self.held.load(Ordering::Relaxed) == outside {
-                return Poll::Ready(None);
-            }
-            work.as_mut().poll(context).map(Some)
-        })
-        .await
+        let held = || self.held.load(Ordering::Relaxed);
+        let outside = held();
+        run_until(|| self.is_cancelled() && held() == outside, work).await
     }
 
     /// Runs `work` to completion even if the token is cancelled.
@@ -85,6 +79,25 @@ impl CancelToken {
             work.as_mut().poll(context)
         })
         .await
+    }
+}
+
+/// Runs `work` until it completes; returns `None` once `stop` is set, even in a shielded section.
+pub(crate) async fn run_until_set<F: Future>(stop: &AtomicBool, work: F) -> Option<F::Output> {
+    run_until(|| stop.load(Ordering::Relaxed), work).await
+}
+
+/// Runs `work` until it completes; returns `None` once `ends` returns true. Every executor here
+/// polls again soon, so nothing is woken.
+async fn run_until<F: Future>(ends: impl Fn() -> bool, work: F) -> Option<F::Output> {
+    let ends = poll_fn(|_| match ends() {
+        true => Poll::Ready(()),
+        false => Poll::Pending,
+    });
+    tokio::select! {
+        biased;
+        () = ends => None,
+        output = work => Some(output),
     }
 }
 

@@ -109,6 +109,15 @@ pub async fn delay(duration: Duration) {
     .await;
 }
 
+/// Runs `work` until it completes; returns `None` if it takes longer than `duration`.
+pub async fn timeout<F: Future>(duration: Duration, work: F) -> Option<F::Output> {
+    tokio::select! {
+        biased;
+        output = work => Some(output),
+        () = delay(duration) => None,
+    }
+}
+
 #[derive(Debug)]
 struct Driver;
 

@@ -77,7 +77,8 @@ pub(super) async fn explain_scan(
     }
 }
 
-fn name_at(machine: &Machine, position: u16) -> String {
+/// Returns the name of the device that the machine file assigns to `position`, or a generic name.
+pub(crate) fn name_at(machine: &Machine, position: u16) -> String {
     let device = machine
         .devices
         .iter()

@@ -37,6 +37,7 @@ mod limits;
 mod mailbox;
 mod mapping;
 mod output_defaults;
+pub(crate) use identify::name_at;
 mod watchdog;
 
 pub use al::{AlState, StateError};

@@ -2,9 +2,7 @@
 //! shift the others. Searches a device without its address between those that have theirs. Never
 //! writes. MAY BLOCK AND ALLOCATE; bounded in time.
 
-use std::future::Future;
-use std::pin::pin;
-use std::task::Poll;
+use std::time::Duration;
 
 use ecaxis_ecat::registers;
 use serde::Serialize;
@@ -17,8 +15,8 @@ use crate::rt::exchange::ErrorCounters;
 
 /// The timeout in ns for all devices together.
 pub const PATIENCE: Nanos = 500_000_000;
-/// The timeout in ns for one object of one device.
-const MAILBOX_PATIENCE: Nanos = 200_000_000;
+/// The timeout for one object of one device.
+const MAILBOX_TIMEOUT: Duration = Duration::from_millis(200);
 /// The number of consecutive lost frames after which reading ends.
 const SILENT: u32 = 2;
 /// The number of attempts per frame.
@@ -169,14 +167,17 @@ pub async fn read_objects(
     look: &mut DeviceSnapshot,
 ) {
     if ask.error_code
-        && let Some(Ok(bytes)) = with_timeout(mailbox.upload(ERROR_CODE, 0)).await
+        && let Some(Ok(bytes)) =
+            clock::timeout(MAILBOX_TIMEOUT, mailbox.upload(ERROR_CODE, 0)).await
         && let [low, high] = *bytes
     {
         look.error_code = Some(u16::from_le_bytes([low, high]));
     }
     if ask.interpolation
-        && let Some(Ok(value)) = with_timeout(mailbox.upload(INTERPOLATION_TIME, 1)).await
-        && let Some(Ok(index)) = with_timeout(mailbox.upload(INTERPOLATION_TIME, 2)).await
+        && let Some(Ok(value)) =
+            clock::timeout(MAILBOX_TIMEOUT, mailbox.upload(INTERPOLATION_TIME, 1)).await
+        && let Some(Ok(index)) =
+            clock::timeout(MAILBOX_TIMEOUT, mailbox.upload(INTERPOLATION_TIME, 2)).await
         && let (&[value], &[index]) = (&*value, &*index)
     {
         look.interpolation_ns = interpolation(value, index as i8);
@@ -187,18 +188,6 @@ pub async fn read_objects(
 fn interpolation(value: u8, index: i8) -> Option<u64> {
     let exponent = u32::try_from(i32::from(index) + 9).ok()?;
     u64::from(value).checked_mul(10u64.checked_pow(exponent)?)
-}
-
-/// Returns `None` on a timeout.
-async fn with_timeout<F: Future>(future: F) -> Option<F::Output> {
-    let end = clock::now().saturating_add(MAILBOX_PATIENCE);
-    let mut future = pin!(future);
-    std::future::poll_fn(|context| match future.as_mut().poll(context) {
-        Poll::Ready(output) => Poll::Ready(Some(output)),
-        Poll::Pending if clock::now() >= end => Poll::Ready(None),
-        Poll::Pending => Poll::Pending,
-    })
-    .await
 }
 
 /// The result of one read.

@@ -5,9 +5,9 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use super::events::EventLine;
 use super::{Options, RunError};
 use crate::acyclic::topology::{self, ParentPort};
-use crate::bringup::{Bus, DeviceRef};
+use crate::bringup::{Bus, DeviceRef, name_at};
 use crate::clock::{Clock, Nanos};
-use crate::config::{Locator, Machine};
+use crate::config::Machine;
 use crate::link::LinkStats;
 use crate::post_mortem::evidence::Stopped;
 use crate::post_mortem::report::{AxisSection, CycleRecord, DeviceSection, Stop};
@@ -74,7 +74,11 @@ pub(super) fn of_bring_up(
     let parents = parents(seen.looks.iter().map(|look| look.dl_status.unwrap_or(0)));
     let devices = seen.looks.into_iter().zip(parents).zip(0u16..);
     let devices = devices.map(|((look, parent), position)| DeviceEvidence {
-        at: expected_at(machine, position),
+        at: DeviceRef {
+            name: name_at(machine, position),
+            position,
+            station: 0,
+        },
         // Assumes that a device without an answer follows the last one that answered.
         parent: parent.or_else(|| Some((usize::from(position.checked_sub(1)?), 1))),
         grown: ErrorCounters {
@@ -102,20 +106,6 @@ fn parents(dl_status: impl Iterator<Item = u16>) -> Vec<Option<(usize, u8)>> {
     let parents = topology::parents(dl_status).into_iter();
     let place = |parent: ParentPort| (usize::from(parent.device), parent.port);
     parents.map(|parent| parent.map(place)).collect()
-}
-
-/// Returns the device that the machine file assigns to `position`, or a generic name.
-fn expected_at(machine: &Machine, position: u16) -> DeviceRef {
-    let mut devices = machine.devices.iter();
-    let named = devices.find(|device| device.at == Locator::Position(position));
-    DeviceRef {
-        name: named.map_or_else(
-            || format!("device {position}"),
-            |device| device.name.clone(),
-        ),
-        position,
-        station: 0,
-    }
 }
 
 /// Returns the fault report of a failed run. `None` if the user interrupted the run or the

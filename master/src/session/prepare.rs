@@ -13,6 +13,7 @@ use ethercrab::{Command as Datagram, MainDevice};
 use super::fault_evidence::BringUpEvidence;
 use super::{EmergencyLog, Options, Progress, RunError, open, panic_text};
 use crate::bringup::{Bus, Step, bring_up};
+use crate::cancel::run_until_set;
 use crate::clock::{self, Clock, Nanos};
 use crate::config::{Machine, Signal};
 use crate::datagram::{CyclicMailboxTransport, DatagramClient};
@@ -31,7 +32,7 @@ use crate::rt::exchange::{Exchange, ExchangeDevice};
 use crate::rt::image::{self, AxisBits, BitField, ImagePlan, NotMapped, SignalBits};
 use crate::rt::phase::Phase;
 use crate::rt::reaction_group::ReactionGroup;
-use crate::supervise::{Supervisor, interruptible};
+use crate::supervise::Supervisor;
 
 /// A segment in SafeOp with everything that the cycle needs.
 #[derive(Debug)]
@@ -356,7 +357,7 @@ fn bring_up_catching_panics(
     // ethercrab panics on some wire content, for example on a SubDevice without an open port.
     let run = std::panic::AssertUnwindSafe(|| {
         let bring_up = Box::pin(bring_up(main_device, machine, image, &mut report, log));
-        drive_pdu_loop(port, link, clock, interruptible(stop, bring_up))
+        drive_pdu_loop(port, link, clock, run_until_set(stop, bring_up))
     });
     match std::panic::catch_unwind(run) {
         Ok(Ok(Some(Ok(bus)))) => Ok(bus),

@@ -1,9 +1,6 @@
 //! Explains what stopped the machine, by reading the devices while they still answer.
 
-use std::future::{Future, poll_fn};
-use std::pin::pin;
 use std::sync::Arc;
-use std::task::Poll;
 use std::time::Duration;
 
 use ecaxis_axis::{AxisStatus, State, Trip};
@@ -190,7 +187,7 @@ impl Supervisor {
     /// Reads an object of an axis's device. Returns `None` after a timeout.
     async fn upload(&mut self, axis: usize, index: u16) -> Option<Vec<u8>> {
         let mailbox = self.mailboxes.urgent(*self.axes.get(axis)?)?;
-        with_timeout(ASK_TIMEOUT, mailbox.upload(index, 0))
+        clock::timeout(ASK_TIMEOUT, mailbox.upload(index, 0))
             .await?
             .ok()
     }
@@ -261,7 +258,7 @@ impl Supervisor {
             self.mailboxes.urgent(device),
             self.machine.devices.get(device),
         ) && let Some(Ok(messages)) =
-            with_timeout(ASK_TIMEOUT, diagnosis_history::read(&mailbox, config)).await
+            clock::timeout(ASK_TIMEOUT, diagnosis_history::read(&mailbox, config)).await
         {
             history = messages;
         }
@@ -302,15 +299,4 @@ impl Supervisor {
         }
         Ok(())
     }
-}
-
-/// Returns `None` if the future takes longer than `time`.
-async fn with_timeout<F: Future>(time: Duration, future: F) -> Option<F::Output> {
-    let mut future = pin!(future);
-    let mut over = pin!(clock::delay(time));
-    poll_fn(|context| match future.as_mut().poll(context) {
-        Poll::Ready(output) => Poll::Ready(Some(output)),
-        Poll::Pending => over.as_mut().poll(context).map(|()| None),
-    })
-    .await
 }

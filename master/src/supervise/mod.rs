@@ -3,17 +3,17 @@
 //! only through `rt::handover`.
 
 use std::collections::VecDeque;
-use std::future::{Future, poll_fn};
+use std::future::poll_fn;
 use std::pin::pin;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::Sender;
-use std::task::Poll;
 use std::time::Duration;
 
 use ecaxis_axis::{Command, CommandError};
 
 use crate::bringup::{AlState, Bus, DeviceRef, StateError, al, clocks};
+use crate::cancel::run_until_set;
 use crate::clock::{self, Nanos};
 use crate::config::steps::enables;
 use crate::config::{Machine, Step};
@@ -108,18 +108,6 @@ pub struct ProgramOutcome {
     pub left: Option<(Arc<RunError>, Witnessed)>,
 }
 
-/// Runs a future until it ends or the user stops the run; returns `None` then.
-pub async fn interruptible<F: Future>(stop: &AtomicBool, future: F) -> Option<F::Output> {
-    let mut future = pin!(future);
-    poll_fn(|context| {
-        if stop.load(Ordering::Relaxed) {
-            return Poll::Ready(None);
-        }
-        future.as_mut().poll(context).map(Some)
-    })
-    .await
-}
-
 impl Supervisor {
     /// Runs everything outside the cycle. The cycle ends when this future ends.
     pub async fn run(mut self) -> (ProgramOutcome, Result<(), RunError>) {
@@ -136,7 +124,7 @@ impl Supervisor {
     async fn run_inner(mut self) -> (ProgramOutcome, Result<(), RunError>) {
         let mut ended = ProgramOutcome::default();
         let stop = Arc::clone(&self.stop);
-        let worked = interruptible(&stop, self.run_to_end(&mut ended)).await;
+        let worked = run_until_set(&stop, self.run_to_end(&mut ended)).await;
         ended.interrupted = worked.is_none();
         ended.group_stops = self.group_stops();
         let mut result = worked.unwrap_or(Ok(()));
