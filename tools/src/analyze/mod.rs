@@ -34,7 +34,7 @@ pub use context::{Context, library};
 pub use document::document;
 pub use report::{
     AxisReport, ClockReport, ClocksReport, CycleReport, DeviceReport, FileReport, Line, Report,
-    SyncManagerReport, TransferReport, WkcRun, called, highest,
+    SyncManagerReport, TransferReport, WkcRun, called,
 };
 
 use match_frames::Pairing;

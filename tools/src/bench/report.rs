@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use super::bus::Counts;
 use super::kernel::CpuTimeDelta;
+pub use crate::doctor::Fact;
 use ecaxis_master::rt::stats::{Counters, LatencyHistogram};
 use ecaxis_master::sys::process::ThreadUsage;
 
@@ -27,12 +28,6 @@ pub struct Report {
     pub ratios: Vec<Ratio>,
     /// Remarks on figures that need caution.
     pub remarks: Vec<String>,
-}
-
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Fact {
-    pub name: &'static str,
-    pub value: String,
 }
 
 /// The result of one variant.
@@ -132,16 +127,6 @@ pub enum Measure {
 }
 
 impl Measure {
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::WakeUpLateness => "wake-up lateness",
-            Self::ReleaseToInput => "release to input",
-            Self::SoftwareShare => "release to input less the hold",
-            Self::CpuPerCycle => "CPU per cycle",
-        }
-    }
-
     /// Returns the heading of the measure.
     pub(super) fn title(self) -> &'static str {
         match self {

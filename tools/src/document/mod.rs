@@ -12,7 +12,6 @@ mod html;
 mod text;
 
 pub use chart::{Axis, Chart, Series, Shape};
-pub use text::wrap;
 
 /// A report.
 #[derive(Debug, Clone, Default)]

@@ -73,8 +73,7 @@ fn fill(text: &str, width: usize) -> Vec<String> {
 }
 
 /// Breaks a text into lines of at most `width` characters, within words if they are longer.
-#[must_use]
-pub fn wrap(text: &str, width: usize) -> Vec<String> {
+fn wrap(text: &str, width: usize) -> Vec<String> {
     if text.chars().count() <= width {
         return vec![text.to_owned()];
     }
@@ -87,7 +86,7 @@ pub fn wrap(text: &str, width: usize) -> Vec<String> {
 }
 
 impl Table {
-    /// Formats the table, indented by `indent`, with a line feed after each line.
+    /// Formats the table, indented by `indent`; `None`: lines of any length.
     #[must_use]
     pub fn text(&self, indent: usize, columns: Option<usize>) -> String {
         let mut out = String::new();
