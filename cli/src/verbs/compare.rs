@@ -235,10 +235,8 @@ fn rewrite(
     let marked = applied.text.lines().filter(|line| line.contains(mark));
     match marked.count() {
         0 => {}
-        n => note(&format!(
-            "{} marked \"{mark}\": check each",
-            pluralize(n, "line")
-        )),
+        1 => note(&format!("1 line is marked \"{mark}\" and needs a check")),
+        n => note(&format!("{n} lines are marked \"{mark}\" and need a check")),
     }
     Ok(())
 }
