@@ -1,6 +1,7 @@
 //! The main function on the simulated bus in virtual time: from a machine file to moving axes.
 
-use ecaxis_master::bringup::{AlState, Step};
+use ecaxis_master::acyclic::AlState;
+use ecaxis_master::bringup::Step;
 use ecaxis_master::session::{Options, Progress};
 use ecaxis_test_support::{axes, fixture, load, machine, run, run_well, virtual_time};
 

@@ -6,13 +6,14 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use ecaxis_master::acyclic::eeprom::EepromAccess;
-use ecaxis_master::acyclic::{DatagramClient, device, mailbox, run_on_link};
-use ecaxis_master::bringup::{AlState, al};
+use ecaxis_master::acyclic::{AlState, al};
+use ecaxis_master::acyclic::{DatagramClient, device, mailbox};
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::Locator;
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME, Nanos};
 use ecaxis_master::mailbox::{FoeError, MailboxTransport, SdoError};
+use ecaxis_master::session::run_on_link;
 use ecaxis_master::session::simulated_bus;
 use ecaxis_sim::{
     DeviceOptions, FaultScript, FirmwareHeader, FirmwareOptions, Segment, SegmentOptions, SimDevice,

@@ -8,16 +8,16 @@ use std::thread;
 use ecaxis_esi::Dictionary;
 use ecaxis_master::acyclic::eeprom::{Eeprom, EepromAccess};
 use ecaxis_master::acyclic::image::{with_alias, write};
-use ecaxis_master::acyclic::{
-    DatagramClient, Registers, ServiceError, device, mailbox, run_on_link,
-};
-use ecaxis_master::bringup::{AlState, al, bring_up};
+use ecaxis_master::acyclic::{AlState, al};
+use ecaxis_master::acyclic::{DatagramClient, Registers, ServiceError, device, mailbox};
+use ecaxis_master::bringup::bring_up;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{self, Locator, Machine};
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::mailbox::worker::EmergencySink;
 use ecaxis_master::mailbox::{CoeClient, Emergencies, FoeClient, MailboxTransport, ObjectList};
 use ecaxis_master::rt::image::{plan, process_data};
+use ecaxis_master::session::run_on_link;
 use ecaxis_master::session::simulated_bus;
 use ecaxis_sim::FirmwareHeader;
 use ecaxis_test_support::{fixture, machine, root};

@@ -4,10 +4,11 @@ use std::process::Stdio;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
-use ecaxis_master::acyclic::{DatagramClient, run_on_link};
+use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::link::{self, SocketKind};
 use ecaxis_master::mailbox::MailboxTransport;
+use ecaxis_master::session::run_on_link;
 use ecaxis_tools::bench::veth::VethPair;
 
 use ecaxis_test_support::bench::Bench;

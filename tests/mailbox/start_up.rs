@@ -1,7 +1,8 @@
 //! Start-up SDOs: skipped, written, verified.
 
 use ecaxis_esi::StartupSdo;
-use ecaxis_master::bringup::{DeviceRef, SdoOutcome, write_startup_sdo};
+use ecaxis_master::acyclic::DeviceRef;
+use ecaxis_master::bringup::{SdoOutcome, write_startup_sdo};
 use ecaxis_master::config::StartupOptions;
 use ecaxis_test_support::mailbox::fault_injection::Mischief;
 use ecaxis_test_support::mailbox::server::Server;

@@ -95,7 +95,7 @@ impl Bus {
         signals::stop_on_interrupt(&stop);
         let heard = Arc::new(AtomicU64::new(0));
         let others = Arc::clone(&heard);
-        let done = acyclic::with_bus(
+        let done = session::with_bus(
             move || self.open(&others),
             clock,
             stop,

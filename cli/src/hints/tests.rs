@@ -1,4 +1,4 @@
-use ecaxis_master::bringup::{AlState, DeviceRef};
+use ecaxis_master::acyclic::{AlState, DeviceRef};
 use ecaxis_master::link::OpenError;
 
 use super::*;

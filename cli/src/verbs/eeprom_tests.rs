@@ -3,12 +3,12 @@
 use std::sync::atomic::AtomicBool;
 use std::thread;
 
-use ecaxis_master::acyclic::run_on_link;
-use ecaxis_master::bringup::AlState;
+use ecaxis_master::acyclic::AlState;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{self, Locator, Nic};
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::mailbox::MailboxTransport;
+use ecaxis_master::session::run_on_link;
 use ecaxis_sim::{DeviceOptions, Segment, SegmentOptions, SimDevice};
 
 use super::*;

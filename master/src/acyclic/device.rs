@@ -6,7 +6,7 @@ use super::eeprom::{EepromAccess, EepromError, with_eeprom};
 use super::enumerate::{EnumeratedDevice, address, enumerate, select};
 use super::mailbox::{self, MailboxSession};
 use super::{DatagramClient, ServiceError};
-use crate::bringup::{AlState, DeviceRef, al};
+use crate::acyclic::{AlState, DeviceRef, al};
 use crate::config::Locator;
 use crate::mailbox::MailboxTransport;
 

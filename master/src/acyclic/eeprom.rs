@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::{Registers, ServiceError};
-use crate::bringup::{AlState, DeviceRef};
+use crate::acyclic::{AlState, DeviceRef};
 use crate::cancel::CancelToken;
 use crate::mailbox::MailboxTransport;
 use ecaxis_ecat::registers;

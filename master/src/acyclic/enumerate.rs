@@ -1,7 +1,7 @@
 //! Enumerates the SubDevices of a segment and assigns station addresses.
 
 use super::ServiceError;
-use crate::bringup::{AlState, DeviceRef};
+use crate::acyclic::{AlState, DeviceRef};
 use crate::config::Locator;
 use crate::datagram::DatagramClient;
 use crate::mailbox::DatagramError;

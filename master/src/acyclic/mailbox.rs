@@ -7,8 +7,8 @@ use ecaxis_esi::model::SmUse;
 use ecaxis_esi::sii::{MailboxAreas, Sii};
 
 use super::{Registers, ServiceError};
-use crate::bringup::al::{self, AlState};
-use crate::bringup::{DeviceRef, StateError};
+use crate::acyclic::al::{self, AlState};
+use crate::acyclic::{DeviceRef, StateError};
 use crate::mailbox::{CoeClient, MailboxLayout, MailboxTransport};
 
 /// The control bytes of mailboxes: one buffer each. The MainDevice writes one, with an interrupt to

@@ -4,7 +4,7 @@
 //! The segment is used as found. Nothing here resets it, and each operation touches a device only
 //! as far as needed: another MainDevice may be driving it.
 //!
-//! - [`with_bus`], [`run_on_link`]: exchange frames while an operation runs;
+//! - [`al`]: AL states;
 //! - [`enumerate`]: the devices of a segment and their addresses;
 //! - [`device`]: finds one device by its locator;
 //! - [`eeprom`]: the EEPROM interface of one device;
@@ -12,22 +12,16 @@
 //! - [`mailbox`]: the mailboxes of one device, and the state they need;
 //! - [`topology`]: how the devices are connected.
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
-use std::thread;
+use std::fmt;
 
 use ecaxis_esi::sii::SiiError;
 
-use crate::bringup::{DeviceRef, StateError};
-use crate::clock::Clock;
-use crate::link::Link;
-use crate::link::pdu_loop::{drive_pdu_loop, main_device};
 use crate::mailbox::{DatagramError, InfoError, MailboxTransport, SdoError};
-use crate::report::{RunError, panic_text};
 
 pub use crate::datagram::DatagramClient;
+pub use al::{AlState, StateError};
 
+pub mod al;
 pub mod device;
 pub mod eeprom;
 pub mod enumerate;
@@ -37,9 +31,23 @@ pub mod mailbox;
 mod tests;
 pub mod topology;
 
-/// The stack size in bytes of the thread that exchanges the frames. Its futures hold whole frames
-/// by value.
-const STACK: usize = 16 * 1024 * 1024;
+/// The SubDevice that an error refers to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DeviceRef {
+    pub name: String,
+    pub position: u16,
+    pub station: u16,
+}
+
+impl fmt::Display for DeviceRef {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "`{}` (position {}, station 0x{:04x})",
+            self.name, self.position, self.station
+        )
+    }
+}
 
 /// An error of an operation on a device.
 #[derive(Debug, thiserror::Error)]
@@ -100,70 +108,6 @@ pub enum ServiceError {
     },
     #[error(transparent)]
     State(#[from] StateError),
-}
-
-/// Runs `work` on a dedicated link and thread until it completes or is cancelled
-/// ([`crate::cancel::CancelToken`]). Blocks.
-///
-/// # Errors
-/// [`RunError::Interrupted`] if `stop` ended the work outside a shielded section; errors that open
-/// or use the link.
-pub fn with_bus<T, W>(
-    open: impl FnOnce() -> Result<Box<dyn Link>, RunError> + Send + 'static,
-    clock: Clock,
-    stop: Arc<AtomicBool>,
-    work: W,
-) -> Result<T, RunError>
-where
-    T: Send + 'static,
-    W: AsyncFnOnce(DatagramClient) -> T + Send + 'static,
-{
-    let owner = thread::Builder::new()
-        .name("ecaxis-bus".to_owned())
-        .stack_size(STACK)
-        .spawn(move || {
-            clock.enter();
-            let mut link = open()?;
-            let done = run_on_link(link.as_mut(), clock, &stop, work);
-            let recorded = link
-                .finish()
-                .map_err(|error| RunError::Record(error.to_string()));
-            done.and_then(|done| recorded.map(|_| done))
-        })
-        .map_err(|error| RunError::Thread(error.to_string()))?;
-    owner
-        .join()
-        .unwrap_or_else(|panic| Err(RunError::Panicked(panic_text(&*panic))))
-}
-
-/// Runs `work` on a link, on the calling thread and its clock ([`Clock::enter`]).
-///
-/// # Errors
-/// As [`with_bus`].
-pub fn run_on_link<T>(
-    link: &mut dyn Link,
-    clock: Clock,
-    stop: &AtomicBool,
-    work: impl AsyncFnOnce(DatagramClient) -> T,
-) -> Result<T, RunError> {
-    let (main_device, mut port) = main_device(0);
-    let run = AssertUnwindSafe(|| {
-        let wire = DatagramClient::new(main_device);
-        let work = Box::pin(work(wire));
-        let ends = wire.stop();
-        drive_pdu_loop(
-            &mut port,
-            link,
-            clock,
-            ends.cancel_on(stop, ends.run_until_cancelled(work)),
-        )
-    });
-    match catch_unwind(run) {
-        Ok(Ok(Some(done))) => Ok(done),
-        Ok(Ok(None)) => Err(RunError::Interrupted),
-        Ok(Err(error)) => Err(RunError::Link(error)),
-        Err(panic) => Err(RunError::Panicked(panic_text(&*panic))),
-    }
 }
 
 /// The registers of a device. Every error names the device.

@@ -11,20 +11,21 @@ use super::device::{locate, read_sii, with_mailbox};
 use super::eeprom::{Eeprom, EepromAccess, EepromError, with_eeprom};
 use super::enumerate::{EnumeratedDevice, address, enumerate, select};
 use super::image::{WriteError, write};
-use super::{DatagramClient, ServiceError, mailbox, run_on_link};
-use crate::bringup::{AlState, DeviceRef};
+use super::{DatagramClient, ServiceError, mailbox};
+use crate::acyclic::{AlState, DeviceRef};
 use crate::clock::Clock;
 use crate::config::{self, Locator};
 use crate::link::sim::SimLink;
 use crate::mailbox::{DatagramError, MailboxTransport};
 use crate::report::RunError;
+use crate::session::run_on_link;
 use crate::session::simulated_bus;
 
 /// Runs `work` on a segment of two drives.
 fn with_drives<T: Send + 'static>(
     work: impl AsyncFnOnce(DatagramClient) -> T + Send + 'static,
 ) -> (T, SimLink) {
-    let there = std::thread::Builder::new().stack_size(super::STACK);
+    let there = std::thread::Builder::new().stack_size(16 * 1024 * 1024);
     let done = there.spawn(move || {
         Clock::Virtual.enter();
         let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
@@ -295,7 +296,7 @@ fn stopped<T: Send + 'static>(
     + Send
     + 'static,
 ) -> (Result<T, RunError>, (String, u8), Vec<u8>) {
-    let there = std::thread::Builder::new().stack_size(super::STACK);
+    let there = std::thread::Builder::new().stack_size(16 * 1024 * 1024);
     let done = there.spawn(move || {
         Clock::Virtual.enter();
         let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");

@@ -6,7 +6,8 @@
 //! Dc).
 
 use super::device::{read, write};
-use super::{BringUpError, BusDevice, DeviceRef, Step};
+use super::{BringUpError, BusDevice, Step};
+use crate::acyclic::DeviceRef;
 use crate::clock::Nanos;
 use crate::config::Machine;
 use crate::datagram::DatagramClient;

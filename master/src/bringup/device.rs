@@ -4,7 +4,8 @@ use ecaxis_ecat::registers;
 use ecaxis_esi::layout::SmLayout;
 use ecaxis_esi::{StartupSdo, address};
 
-use super::{BringUpError, BusDevice, DeviceRef, Step};
+use super::{BringUpError, BusDevice, Step};
+use crate::acyclic::DeviceRef;
 use crate::config::{DeviceConfig, StartupOptions};
 use crate::mailbox::{
     CoeClient, DatagramError, MailboxTransport, NamedObject, SdoError, object_name,

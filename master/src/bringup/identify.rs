@@ -4,8 +4,9 @@ use ecaxis_esi::model::Identity;
 use ethercrab::error::{Error, TimeoutError};
 use ethercrab::{MainDevice, SubDeviceIdentity};
 
-use super::{BringUpError, DeviceRef, Group, Step, al, scan_error};
+use super::{BringUpError, Group, Step, scan_error};
 use crate::acyclic::enumerate::{EnumeratedDevice, FIRST_STATION, count, read_device};
+use crate::acyclic::{DeviceRef, al};
 use crate::config::{DeviceConfig, Locator, Machine};
 use crate::datagram::DatagramClient;
 

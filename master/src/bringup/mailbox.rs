@@ -4,8 +4,9 @@
 use ecaxis_ecat::registers;
 use ecaxis_esi::model::SmUse;
 
+use super::BringUpError;
 use super::device::read;
-use super::{BringUpError, DeviceRef};
+use crate::acyclic::DeviceRef;
 use crate::config::DeviceConfig;
 use crate::mailbox::{MailboxLayout, MailboxTransport};
 

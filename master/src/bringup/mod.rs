@@ -18,6 +18,7 @@ use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
 use ecaxis_esi::address;
 
+use crate::acyclic::{AlState, DeviceRef, StateError, al};
 use crate::acyclic::{ServiceError, enumerate};
 use crate::clock;
 use crate::config::{AdoptedUnits, LimitConflict, MAX_SUBDEVICES, Machine, UnitProblem};
@@ -28,7 +29,6 @@ use crate::rt::image::{self, ImagePlan};
 use crate::rt::phase::ClockPlan;
 use crate::text::pluralize;
 
-pub mod al;
 pub(crate) mod clocks;
 mod device;
 pub mod drive_units;
@@ -40,7 +40,6 @@ mod output_defaults;
 pub(crate) use identify::name_at;
 mod watchdog;
 
-pub use al::{AlState, StateError};
 use device::StartupPhase;
 pub use device::{SdoOutcome, write_startup_sdo};
 
@@ -48,24 +47,6 @@ pub use device::{SdoOutcome, write_startup_sdo};
 const MAX_PDI: usize = 1;
 
 type Group = SubDeviceGroup<MAX_SUBDEVICES, MAX_PDI>;
-
-/// The SubDevice that an error refers to.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct DeviceRef {
-    pub name: String,
-    pub position: u16,
-    pub station: u16,
-}
-
-impl fmt::Display for DeviceRef {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
-            "`{}` (position {}, station 0x{:04x})",
-            self.name, self.position, self.station
-        )
-    }
-}
 
 /// A SubDevice that was found and set up.
 #[derive(Debug)]

@@ -2,7 +2,8 @@
 
 use super::diagnose::{SYNC_CODES, WATCHDOG};
 use super::evidence::{Evidence, Lateness};
-use crate::bringup::{AlState, BringUpError, StateError};
+use crate::acyclic::{AlState, StateError};
+use crate::bringup::BringUpError;
 use crate::mailbox::SdoError;
 use crate::report::RunError;
 

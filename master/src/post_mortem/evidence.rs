@@ -1,6 +1,6 @@
 //! Everything that is known after a failed run, as plain data.
 
-use crate::bringup::DeviceRef;
+use crate::acyclic::DeviceRef;
 use crate::clock::Nanos;
 use crate::link::LinkStats;
 use crate::rt::bus_monitor::StopCause;

@@ -7,7 +7,8 @@ use std::sync::Arc;
 use ecaxis_axis::cia402::describe;
 use ecaxis_axis::{CommandError, Mode, State, Trip};
 
-use crate::bringup::{AlState, BringUpError, DeviceRef, StateError};
+use crate::acyclic::{AlState, DeviceRef, StateError};
+use crate::bringup::BringUpError;
 use crate::config::LimitConflict;
 use crate::link::{LinkError, OpenError};
 use crate::rt::image::{NotMapped, TooLarge};

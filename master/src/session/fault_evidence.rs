@@ -4,8 +4,9 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use super::events::EventLine;
 use super::{Options, RunError};
+use crate::acyclic::DeviceRef;
 use crate::acyclic::topology::{self, ParentPort};
-use crate::bringup::{Bus, DeviceRef, name_at};
+use crate::bringup::{Bus, name_at};
 use crate::clock::{Clock, Nanos};
 use crate::config::Machine;
 use crate::link::LinkStats;

@@ -23,6 +23,7 @@ use crate::rt::cycle::EngineReport;
 use crate::rt::stats::Stats;
 use crate::supervise::jog::{self, Operator};
 
+mod bus;
 mod cycle_thread;
 mod fault_evidence;
 mod open;
@@ -36,6 +37,7 @@ pub use crate::report::{
     Progress, RunError, Status, StepRef, Summary, ThreadSummary,
 };
 use crate::report::{events, panic_text};
+pub use bus::{run_on_link, with_bus};
 use cycle_thread::CycleRun;
 use fault_evidence::{BringUpEvidence, RunEvidence};
 pub use open::{recorded, simulated_bus, topology};

@@ -6,7 +6,7 @@ use std::time::Duration;
 use ecaxis_axis::{AxisStatus, State, Trip};
 
 use super::{Supervisor, diagnosis_history};
-use crate::bringup::al;
+use crate::acyclic::al;
 use crate::clock::{self, Nanos};
 use crate::config::LimitConflict;
 use crate::post_mortem::snapshot::{self, Depth};

@@ -12,7 +12,8 @@ use std::time::Duration;
 
 use ecaxis_axis::{Command, CommandError};
 
-use crate::bringup::{AlState, Bus, DeviceRef, StateError, al, clocks};
+use crate::acyclic::{AlState, DeviceRef, StateError, al};
+use crate::bringup::{Bus, clocks};
 use crate::cancel::run_until_set;
 use crate::clock::{self, Nanos};
 use crate::config::steps::enables;

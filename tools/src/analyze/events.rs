@@ -8,7 +8,7 @@ use ecaxis_axis::cia402::describe;
 use super::mailbox::{FileTransfer, Transfer, TransferDirection, TransferOutcome};
 use super::values::value;
 use ecaxis_ecat::al_status_code::al_status_text;
-use ecaxis_master::bringup::AlState;
+use ecaxis_master::acyclic::AlState;
 use ecaxis_master::mailbox::{Emergency, abort_text, mailbox_error_text, object_name};
 
 /// The maximum number of stored events; further ones are counted.

@@ -2,7 +2,7 @@
 
 use ecaxis_ecat::datagram::Command;
 use ecaxis_ecat::registers;
-use ecaxis_master::bringup::AlState;
+use ecaxis_master::acyclic::AlState;
 
 use super::axes::Axes;
 use super::clocks::Clocks;

@@ -4,10 +4,10 @@ use std::fmt;
 use std::time::Duration;
 
 use super::{RunningProgram, UpdateMethod};
+use ecaxis_master::acyclic::al::AlState;
 use ecaxis_master::acyclic::enumerate::{EnumeratedDevice, read_device};
 use ecaxis_master::acyclic::{DatagramClient, ServiceError};
-use ecaxis_master::bringup::al::AlState;
-use ecaxis_master::bringup::{DeviceRef, StateError};
+use ecaxis_master::acyclic::{DeviceRef, StateError};
 use ecaxis_master::mailbox::{FoeError, SdoError};
 
 /// A step of an update.

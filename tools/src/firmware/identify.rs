@@ -8,8 +8,8 @@ use ecaxis_esi::sii::{Protocols, Sii};
 use super::FirmwareError;
 use ecaxis_master::acyclic::device::{locate, read_sii_unless_in_use, with_mailbox};
 use ecaxis_master::acyclic::eeprom::EepromAccess;
+use ecaxis_master::acyclic::{AlState, DeviceRef};
 use ecaxis_master::acyclic::{DatagramClient, ServiceError};
-use ecaxis_master::bringup::{AlState, DeviceRef};
 use ecaxis_master::config::Locator;
 use ecaxis_master::mailbox::{CoeClient, SdoError, Timeouts};
 

@@ -16,10 +16,10 @@ use std::time::Duration;
 
 use ecaxis_esi::sii::Protocols;
 
+use ecaxis_master::acyclic::AlState;
 use ecaxis_master::acyclic::DatagramClient;
+use ecaxis_master::acyclic::al;
 use ecaxis_master::acyclic::device::locate;
-use ecaxis_master::bringup::AlState;
-use ecaxis_master::bringup::al;
 use ecaxis_master::config::Locator;
 use ecaxis_master::mailbox::{MailboxTransport, foe};
 use error::StepFailure;

@@ -11,10 +11,10 @@ use super::error::{Cause, Step, StepFailure};
 use super::{
     DeviceIdentity, INIT_TIMEOUT, LOOK_AGAIN, ReadBack, UpdateProgress, UpdateRequest, after, since,
 };
+use ecaxis_master::acyclic::DeviceRef;
+use ecaxis_master::acyclic::al::{self, AlState};
 use ecaxis_master::acyclic::device::locate;
 use ecaxis_master::acyclic::{DatagramClient, Registers, ServiceError, mailbox};
-use ecaxis_master::bringup::DeviceRef;
-use ecaxis_master::bringup::al::{self, AlState};
 use ecaxis_master::config::Locator;
 use ecaxis_master::mailbox::{CoeClient, MailboxTransport, SdoError, Timeouts};
 

@@ -3,8 +3,8 @@
 
 use std::time::Duration;
 
+use ecaxis_master::acyclic::DeviceRef;
 use ecaxis_master::acyclic::ServiceError;
-use ecaxis_master::bringup::DeviceRef;
 use ecaxis_master::mailbox::{CoeClient, MailboxTransport, Timeouts};
 
 /// The time-out of the command. A device answers when it is done; flash memories take tens of

@@ -4,8 +4,8 @@ use ecaxis_esi::model::{Access, PdoMapping};
 use ecaxis_esi::{Dictionary, Object, ObjectCode, ObjectItem, Writable};
 
 use super::DataType;
+use ecaxis_master::acyclic::DeviceRef;
 use ecaxis_master::acyclic::ServiceError;
-use ecaxis_master::bringup::DeviceRef;
 use ecaxis_master::mailbox::{
     CoeClient, EntryDescription, InfoError, InfoRequest, MailboxTransport, ObjectDescription,
     ObjectList,

@@ -5,8 +5,8 @@ use ecaxis_esi::Dictionary;
 use super::compare::Difference;
 use super::restore_order::{Write, is_list, is_setting, order, settings_only};
 use super::{Parameter, writable_in_pre_op};
+use ecaxis_master::acyclic::DeviceRef;
 use ecaxis_master::acyclic::ServiceError;
-use ecaxis_master::bringup::DeviceRef;
 use ecaxis_master::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, abort_text};
 
 /// The maximum number of passes. Settings limit each other, so refused writes are retried after the

@@ -3,8 +3,8 @@
 use ecaxis_esi::Dictionary;
 
 use super::{Parameter, items, name_of, type_of, writable_in_pre_op};
+use ecaxis_master::acyclic::DeviceRef;
 use ecaxis_master::acyclic::ServiceError;
-use ecaxis_master::bringup::DeviceRef;
 use ecaxis_master::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError};
 
 /// The values of a device.

@@ -17,12 +17,12 @@ use ecaxis_ecat::registers as esc;
 use ecaxis_esi::Identity;
 use ecaxis_esi::sii::{General, Protocols, Sii};
 
+use ecaxis_master::acyclic::al::{self, AlState};
 use ecaxis_master::acyclic::device::{read_sii, with_mailbox};
 use ecaxis_master::acyclic::eeprom::EepromAccess;
 use ecaxis_master::acyclic::enumerate::{self, EnumeratedDevice};
 use ecaxis_master::acyclic::topology::{ParentPort, open_ports, parents};
 use ecaxis_master::acyclic::{DatagramClient, ServiceError};
-use ecaxis_master::bringup::al::{self, AlState};
 use ecaxis_master::mailbox::MailboxTransport;
 
 pub mod coe_info;

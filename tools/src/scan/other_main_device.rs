@@ -4,9 +4,9 @@ use std::fmt;
 use std::time::Duration;
 
 use ecaxis_ecat::registers;
+use ecaxis_master::acyclic::AlState;
 use ecaxis_master::acyclic::enumerate::{self, EnumeratedDevice};
 use ecaxis_master::acyclic::{DatagramClient, ServiceError};
-use ecaxis_master::bringup::AlState;
 use ecaxis_master::mailbox::MailboxTransport;
 
 const STEP: &str = "looking for another MainDevice";

@@ -12,15 +12,16 @@ use std::time::Duration;
 use ecaxis_sim::FaultScript;
 
 use super::{MainDeviceEvidence, Options, Scan, scan};
+use ecaxis_master::acyclic::AlState;
+use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::acyclic::enumerate::{address, enumerate};
-use ecaxis_master::acyclic::{DatagramClient, run_on_link};
-use ecaxis_master::bringup::AlState;
 use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config::{self, Machine};
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
 use ecaxis_master::mailbox::MailboxTransport;
 use ecaxis_master::rt::cycle::Engine;
+use ecaxis_master::session::run_on_link;
 use ecaxis_master::session::{self, Prepared, RunBuilder, simulated_bus};
 
 const STACK: usize = 16 * 1024 * 1024;

@@ -6,7 +6,7 @@
 
 use serde::Serialize;
 
-use ecaxis_master::bringup::AlState;
+use ecaxis_master::acyclic::AlState;
 
 mod build;
 mod problems;

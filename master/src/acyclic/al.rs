@@ -126,7 +126,7 @@ pub async fn read_status(
 /// True if AL status mirrors AL control, without a processor behind the controller (device
 /// emulation, ETG.1000.4). The error bit is then the MainDevice's own acknowledgement and not a
 /// refusal.
-pub(super) async fn emulated(wire: &impl MailboxTransport, station: u16) -> bool {
+pub(crate) async fn emulated(wire: &impl MailboxTransport, station: u16) -> bool {
     let mut configuration = [0];
     let read = wire
         .read(station, registers::ESC_CONFIGURATION, &mut configuration)
