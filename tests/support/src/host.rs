@@ -233,8 +233,8 @@ mod tests {
             ("f", DISTURBED, Verdict::Again),
             ("fpp", DISTURBED, Verdict::Again),
             ("fppp", DISTURBED, Verdict::Passed),
-            ("fpfpp", DISTURBED, Verdict::Again),
-            ("fpfppp", DISTURBED, Verdict::Passed),
+            ("fpfp", DISTURBED, Verdict::Again),
+            ("fpfpp", DISTURBED, Verdict::Passed),
             ("fpfpf", DISTURBED, Verdict::Failed),
             ("fff", DISTURBED, Verdict::Failed),
         ] {
