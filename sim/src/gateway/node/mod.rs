@@ -148,11 +148,6 @@ impl Node {
         self.d.get(index, sub)
     }
 
-    /// Sets an object's number, as a signal at an analogue input does.
-    pub fn set_object(&mut self, index: u16, sub: u8, value: i64) {
-        self.d.set(index, sub, value);
-    }
-
     /// True if the CAN controller takes part in the traffic.
     pub(super) fn is_on_bus(&self, bit_rate: u32) -> bool {
         self.alive && self.online && self.bit_rate == bit_rate
