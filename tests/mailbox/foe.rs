@@ -423,8 +423,12 @@ proptest! {
         let server = server(&[Mischief::Corrupt(answer, position, value)]);
         let mut client = client(48);
         let data = bytes(150);
-        if write(&mut client, &server, &data).is_ok() {
-            prop_assert_eq!(stored(&server), Some(data));
+        match write(&mut client, &server, &data) {
+            Ok(()) => prop_assert_eq!(stored(&server), Some(data)),
+            // The byte made an error message of an acknowledgement. A device that sends one has
+            // ended its transfer, but this server has not.
+            Err(FoeError::Refused { .. }) => return Ok(()),
+            Err(_) => {}
         }
         next_transfer_works(&mut client, &server);
     }
