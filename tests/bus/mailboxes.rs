@@ -275,8 +275,8 @@ fn dropped_futures_leave_no_transfer_behind() {
         let mailbox = mailboxes.device("a0").expect("it is there");
         for round in 0..40_u64 {
             let long = mailbox.upload(0x1008, 0);
-            let patience = std::time::Duration::from_micros(50 * (round % 8));
-            let _ = tokio::time::timeout(patience, long).await;
+            let timeout = std::time::Duration::from_micros(50 * (round % 8));
+            let _ = tokio::time::timeout(timeout, long).await;
             if round % 4 == 3 {
                 let name = mailbox.upload(0x1008, 0).await.expect("read");
                 assert!(!name.is_empty());

@@ -13,7 +13,7 @@ use super::view::{self, Axis};
 use super::wire::{self, DriveLayout};
 
 /// The limit of real time for a run; much longer than any run takes.
-const PATIENCE: Duration = Duration::from_secs(300);
+const TIMEOUT: Duration = Duration::from_secs(300);
 
 #[derive(Debug, Clone, Default)]
 pub struct Outcome {
@@ -98,7 +98,7 @@ pub fn run(plan: &Plan, folder: &Path) -> Outcome {
     let exit = loop {
         match child.try_wait().expect("the program is ours") {
             Some(status) => break status.code(),
-            None if start.elapsed() > PATIENCE => {
+            None if start.elapsed() > TIMEOUT => {
                 _ = child.kill();
                 _ = child.wait();
                 break None;

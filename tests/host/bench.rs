@@ -22,7 +22,7 @@ use ecaxis_tools::bench::measure::{self, Measured, Thread};
 use ecaxis_tools::bench::veth::{VethPair, leftovers};
 
 /// A timeout much longer than a start or an end.
-const PATIENCE: Duration = Duration::from_secs(20);
+const TIMEOUT: Duration = Duration::from_secs(20);
 
 fn exists(nic: &str) -> bool {
     Path::new("/sys/class/net").join(nic).exists()
@@ -263,7 +263,7 @@ impl Drop for Killed {
 fn soon(what: impl Fn() -> bool) -> bool {
     let start = Instant::now();
     while !what() {
-        if start.elapsed() > PATIENCE {
+        if start.elapsed() > TIMEOUT {
             return false;
         }
         sleep(Duration::from_millis(20));

@@ -12,7 +12,7 @@ use ecaxis_tools::bench::bus::{Bus, FaultInjection, Options, ReplyDelay};
 use ecaxis_tools::bench::segment::Segment;
 use ecaxis_tools::bench::veth::VethPair;
 
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 /// The EtherType for sending.
 const ETHERCAT: u16 = 0x88a4;
 
@@ -56,7 +56,7 @@ fn reflect(pair: &VethPair) -> Bus {
 fn receive(link: &mut dyn Link) -> Option<Vec<u8>> {
     let start = Instant::now();
     let mut buf = [0; MAX_FRAME];
-    while start.elapsed() < PATIENCE {
+    while start.elapsed() < TIMEOUT {
         if let Some(len) = link.recv(&mut buf).expect("receives") {
             return Some(buf[..len].to_vec());
         }
@@ -206,7 +206,7 @@ fn overflow(pair: &VethPair, back_end: SocketKind) {
     let mut seen = 0_u64;
     // The kernel delivers pending frames later.
     let start = Instant::now();
-    while seen + link.stats().dropped < 400 && start.elapsed() < PATIENCE {
+    while seen + link.stats().dropped < 400 && start.elapsed() < TIMEOUT {
         seen += u64::from(link.recv(&mut buf).expect("receives").is_some());
     }
     let dropped = link.stats().dropped;
@@ -244,7 +244,7 @@ fn an_interface_that_is_down_is_an_error_until_it_is_up_again() {
                 std::thread::sleep(Duration::from_millis(1));
                 match link.recv(&mut buf) {
                     Ok(Some(_)) => break buf[17],
-                    _ => assert!(start.elapsed() < PATIENCE, "{back_end}"),
+                    _ => assert!(start.elapsed() < TIMEOUT, "{back_end}"),
                 }
             };
             assert_eq!(answer, 2, "{back_end}");

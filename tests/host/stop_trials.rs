@@ -28,7 +28,7 @@ use trace::{Stop, Table, Trace};
 /// The speed of both axes in turns/s.
 const SPEED: f64 = 20.0;
 /// A timeout longer than every permitted stop.
-const PATIENCE: Duration = Duration::from_secs(6);
+const TIMEOUT: Duration = Duration::from_secs(6);
 
 /// Two drives, one in CSP and one in CSV, and an I/O block behind them.
 const MACHINE: &str = r#"

@@ -11,7 +11,7 @@ use ecaxis_test_support::recordings::comes_to_rest;
 use ecaxis_test_support::{skip, tolerant_demo};
 
 /// A timeout much longer than any operation.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 #[test]
 fn jog_without_a_terminal_names_the_alternative() {
@@ -90,7 +90,7 @@ impl Tmux {
             if what(&screen) {
                 return screen;
             }
-            assert!(began.elapsed() < PATIENCE, "never {text}:\n{screen}");
+            assert!(began.elapsed() < TIMEOUT, "never {text}:\n{screen}");
             sleep(Duration::from_millis(50));
         }
     }
@@ -241,7 +241,7 @@ fn a_closed_terminal_stops_the_machine() {
             tmux.ask(&["kill-server"]);
             let began = Instant::now();
             while process.exists() || (!before.is_empty() && tmux.file("code").is_empty()) {
-                assert!(began.elapsed() < PATIENCE, "it goes on without a terminal");
+                assert!(began.elapsed() < TIMEOUT, "it goes on without a terminal");
                 sleep(Duration::from_millis(50));
             }
             if !before.is_empty() {

@@ -25,7 +25,7 @@ const START: Duration = Duration::from_millis(200);
 const WARM_UP: u64 = 200;
 /// The timeout after which a reply counts as lost. It is long, because ethercrab's task ends when a
 /// reply arrives after its timeout.
-const PATIENCE: Duration = Duration::from_millis(500);
+const TIMEOUT: Duration = Duration::from_millis(500);
 
 static STORAGE: PduStorage<16, { PduStorage::element_size(1486) }> = PduStorage::new();
 
@@ -57,7 +57,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     });
     std::thread::sleep(START);
     let timeouts = Timeouts {
-        pdu: PATIENCE,
+        pdu: TIMEOUT,
         ..Timeouts::default()
     };
     let config = MainDeviceConfig {

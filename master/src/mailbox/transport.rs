@@ -23,7 +23,7 @@ const REPEAT: u8 = 0x02;
 
 /// After this many frames in a row that were lost or came back unprocessed, a device or bus counts
 /// as gone.
-const PATIENCE: u32 = 5;
+const MAX_FAILURES: u32 = 5;
 /// After this many messages in a row with an incremented counter, a device is known to count. A
 /// single one may be chance.
 const COUNTED: u32 = 3;
@@ -133,7 +133,7 @@ impl Port {
         self.counter = self.counter % 7 + 1;
         request.emit(self.counter, self.layout.out_len, &mut self.outgoing);
         let mut deadline = Deadline::after(w, self.timeouts.request);
-        let mut patience = RetryBudget::default();
+        let mut budget = RetryBudget::default();
         let mut arrived = mem::take(&mut self.free);
         loop {
             // A write whose frame was lost may have arrived; the counter marks the repeated write
@@ -142,17 +142,17 @@ impl Port {
             let written = w
                 .write(self.layout.station, self.layout.out_address, &self.outgoing)
                 .await;
-            match patience.judge(written)? {
+            match budget.judge(written)? {
                 WriteOutcome::Yes => return Ok(()),
                 WriteOutcome::No => {
                     // Full, or gone? Unless the device is gone, a register read answers.
-                    let full = self.status(w, self.layout.out_sm, &mut patience).await?;
+                    let full = self.status(w, self.layout.out_sm, &mut budget).await?;
                     if arrived && full {
                         // The mailbox most likely contains this request. Its answer may be next and
                         // must not be set aside.
                         return Ok(());
                     }
-                    if !arrived && self.fetch(w, &mut patience).await? == ReadOutcome::Message {
+                    if !arrived && self.fetch(w, &mut budget).await? == ReadOutcome::Message {
                         self.set_aside(w);
                     }
                 }
@@ -171,14 +171,14 @@ impl Port {
         w: &W,
         deadline: &mut Deadline,
     ) -> Result<(), TransportError> {
-        let mut patience = RetryBudget::default();
+        let mut budget = RetryBudget::default();
         let mut repeats = 0;
         loop {
-            match self.look(w, &mut patience).await? {
+            match self.look(w, &mut budget).await? {
                 ReadOutcome::Message => return Ok(()),
                 ReadOutcome::Lost if repeats < REPEATS => {
                     repeats += 1;
-                    self.repeat(w, &mut patience).await?;
+                    self.repeat(w, &mut budget).await?;
                 }
                 ReadOutcome::Lost => return Err(TransportError::Timeout(Phase::Repeat)),
                 ReadOutcome::Nothing | ReadOutcome::Waiting => {}
@@ -194,14 +194,14 @@ impl Port {
     async fn look<W: MailboxTransport>(
         &mut self,
         w: &W,
-        patience: &mut RetryBudget,
+        budget: &mut RetryBudget,
     ) -> Result<ReadOutcome, TransportError> {
         if self.waits(w) {
-            return self.read(w, patience).await;
+            return self.read(w, budget).await;
         }
         match w.seen_lately() {
             Some(_) => Ok(ReadOutcome::Nothing),
-            None => self.fetch(w, patience).await,
+            None => self.fetch(w, budget).await,
         }
     }
 
@@ -215,19 +215,19 @@ impl Port {
     async fn fetch<W: MailboxTransport>(
         &mut self,
         w: &W,
-        patience: &mut RetryBudget,
+        budget: &mut RetryBudget,
     ) -> Result<ReadOutcome, TransportError> {
-        if !self.status(w, self.layout.in_sm, patience).await? {
+        if !self.status(w, self.layout.in_sm, budget).await? {
             return Ok(ReadOutcome::Nothing);
         }
-        self.read(w, patience).await
+        self.read(w, budget).await
     }
 
     /// Reads the full mailbox.
     async fn read<W: MailboxTransport>(
         &mut self,
         w: &W,
-        patience: &mut RetryBudget,
+        budget: &mut RetryBudget,
     ) -> Result<ReadOutcome, TransportError> {
         mem::swap(&mut self.incoming, &mut self.previous);
         let read = w
@@ -238,7 +238,7 @@ impl Port {
             )
             .await;
         self.read_at = w.now();
-        let touched = patience.judge(read);
+        let touched = budget.judge(read);
         if !matches!(touched, Ok(WriteOutcome::Yes)) {
             mem::swap(&mut self.incoming, &mut self.previous);
         }
@@ -251,7 +251,7 @@ impl Port {
             // The frame was lost on its way out, so the message still waits. Otherwise it was lost
             // on its way back, and the message is gone.
             WriteOutcome::No | WriteOutcome::Lost
-                if self.status(w, self.layout.in_sm, patience).await? =>
+                if self.status(w, self.layout.in_sm, budget).await? =>
             {
                 Ok(ReadOutcome::Waiting)
             }
@@ -280,10 +280,10 @@ impl Port {
     async fn repeat<W: MailboxTransport>(
         &self,
         w: &W,
-        patience: &mut RetryBudget,
+        budget: &mut RetryBudget,
     ) -> Result<(), TransportError> {
         let asked = self
-            .register(w, self.layout.in_sm, SM_ACTIVATE, patience)
+            .register(w, self.layout.in_sm, SM_ACTIVATE, budget)
             .await?
             ^ REPEAT;
         let mut deadline = Deadline::after(w, self.timeouts.request);
@@ -291,14 +291,14 @@ impl Port {
         loop {
             if written {
                 let acknowledged = self
-                    .register(w, self.layout.in_sm, SM_PDI_CONTROL, patience)
+                    .register(w, self.layout.in_sm, SM_PDI_CONTROL, budget)
                     .await?;
                 if (acknowledged ^ asked) & REPEAT == 0 {
                     return Ok(());
                 }
             } else {
                 let register = sm_register(self.layout.in_sm, SM_ACTIVATE);
-                written = patience.judge(w.write(self.layout.station, register, &[asked]).await)?
+                written = budget.judge(w.write(self.layout.station, register, &[asked]).await)?
                     == WriteOutcome::Yes;
             }
             if deadline.passed(w) {
@@ -315,16 +315,16 @@ impl Port {
         w: &W,
         most: usize,
     ) -> Result<usize, TransportError> {
-        let mut patience = RetryBudget::default();
+        let mut budget = RetryBudget::default();
         let mut count = 0;
         for _ in 0..most {
-            match self.fetch(w, &mut patience).await? {
+            match self.fetch(w, &mut budget).await? {
                 ReadOutcome::Message => {
                     self.set_aside(w);
                     count += 1;
                 }
                 ReadOutcome::Waiting => w.delay(POLL_MIN).await,
-                ReadOutcome::Lost => match self.repeat(w, &mut patience).await {
+                ReadOutcome::Lost => match self.repeat(w, &mut budget).await {
                     // A message that cannot be repeated no longer occupies the mailbox.
                     Ok(()) | Err(TransportError::Timeout(_)) => {}
                     Err(trouble) => return Err(trouble),
@@ -332,7 +332,7 @@ impl Port {
                 ReadOutcome::Nothing => break,
             }
         }
-        self.free = !self.status(w, self.layout.out_sm, &mut patience).await?;
+        self.free = !self.status(w, self.layout.out_sm, &mut budget).await?;
         Ok(count)
     }
 
@@ -352,9 +352,9 @@ impl Port {
         &self,
         w: &W,
         sm: u8,
-        patience: &mut RetryBudget,
+        budget: &mut RetryBudget,
     ) -> Result<bool, TransportError> {
-        Ok(self.register(w, sm, SM_STATUS, patience).await? & MAILBOX_FULL != 0)
+        Ok(self.register(w, sm, SM_STATUS, budget).await? & MAILBOX_FULL != 0)
     }
 
     /// Reads one byte of a SyncManager, repeated while frames are lost.
@@ -363,23 +363,23 @@ impl Port {
         w: &W,
         sm: u8,
         offset: u16,
-        patience: &mut RetryBudget,
+        budget: &mut RetryBudget,
     ) -> Result<u8, TransportError> {
         loop {
             let mut byte = [0];
-            match patience.judge(
+            match budget.judge(
                 w.read(self.layout.station, sm_register(sm, offset), &mut byte)
                     .await,
             )? {
                 WriteOutcome::Yes => {
-                    patience.untouched = 0;
+                    budget.untouched = 0;
                     let [byte] = byte;
                     return Ok(byte);
                 }
-                WriteOutcome::No => patience.untouched += 1,
+                WriteOutcome::No => budget.untouched += 1,
                 WriteOutcome::Lost => {}
             }
-            if patience.untouched >= PATIENCE {
+            if budget.untouched >= MAX_FAILURES {
                 return Err(TransportError::Gone);
             }
             w.delay(POLL_MIN).await;
@@ -431,7 +431,7 @@ impl RetryBudget {
                     WriteOutcome::Yes
                 })
             }
-            Err(DatagramError::Timeout { .. }) if self.lost + 1 < PATIENCE => {
+            Err(DatagramError::Timeout { .. }) if self.lost + 1 < MAX_FAILURES => {
                 self.lost += 1;
                 Ok(WriteOutcome::Lost)
             }

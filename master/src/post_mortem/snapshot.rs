@@ -14,7 +14,7 @@ use crate::mailbox::{DatagramError, DeviceMailbox, MailboxTransport};
 use crate::rt::exchange::ErrorCounters;
 
 /// The timeout in ns for all devices together.
-pub const PATIENCE: Nanos = 500_000_000;
+pub const TIMEOUT: Nanos = 500_000_000;
 /// The timeout for one object of one device.
 const MAILBOX_TIMEOUT: Duration = Duration::from_millis(200);
 /// The number of consecutive lost frames after which reading ends.
@@ -247,7 +247,7 @@ struct SnapshotReader<'a> {
 
 impl<'a> SnapshotReader<'a> {
     fn new(wire: &'a DatagramClient) -> Self {
-        let end = clock::now().saturating_add(PATIENCE);
+        let end = clock::now().saturating_add(TIMEOUT);
         Self { wire, end, lost: 0 }
     }
 

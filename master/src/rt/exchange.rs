@@ -52,7 +52,7 @@ const SEPARATE_CYCLES: u16 = 100;
 #[derive(Debug)]
 pub struct Exchange {
     /// The frame set that is staged or was sent in this cycle, and those sent before.
-    flights: Vec<FrameSet>,
+    frame_sets: Vec<FrameSet>,
     staged: usize,
     /// The positions of the datagrams: with shared datagrams, and with one for each device.
     forms: Vec<DatagramSlots>,
@@ -108,18 +108,18 @@ impl Exchange {
             datagrams.push(&plan.separate);
         }
         let mut forms = Vec::new();
-        let mut flights = Vec::new();
-        for flight in 0..mode.flights() {
+        let mut frame_sets = Vec::new();
+        for frame_set in 0..mode.frame_sets() {
             let mut frames = Vec::new();
             for datagrams in &datagrams {
                 let mut form = new_frames(frames_of(datagrams));
                 let places = DatagramSlots::fill(&mut form, plan, datagrams, &order, clock);
                 frames.push(form);
-                if flight == 0 {
+                if frame_set == 0 {
                     forms.push(places);
                 }
             }
-            flights.push(FrameSet::new(frames));
+            frame_sets.push(FrameSet::new(frames));
         }
         // The first group exists even without members.
         let groups = plan.groups.iter().max().map_or(1, |last| last + 1);
@@ -136,7 +136,7 @@ impl Exchange {
                 .position(|member| member.station == clock.reference)
         });
         let mut exchange = Self {
-            flights,
+            frame_sets,
             staged: 0,
             forms,
             form_of: [0; 256],
@@ -165,7 +165,7 @@ impl Exchange {
     /// Returns when answers are evaluated.
     #[must_use]
     pub fn mode(&self) -> ExchangeMode {
-        if self.flights.len() == 1 {
+        if self.frame_sets.len() == 1 {
             ExchangeMode::SameCycle
         } else {
             ExchangeMode::Pipelined
@@ -258,11 +258,11 @@ impl Exchange {
     /// Returns the device and the clock difference that the answers of this cycle contain.
     #[must_use]
     pub fn clock_read(&self) -> Option<(usize, i32)> {
-        let flight = self.flights.get(self.due())?;
-        let PollTarget::At { device, probe } = flight.turn?.look else {
+        let frame_set = self.frame_sets.get(self.due())?;
+        let PollTarget::At { device, probe } = frame_set.turn?.look else {
             return None;
         };
-        flight.answer(0)?;
+        frame_set.answer(0)?;
         let found = self.diagnoses.get(device)?;
         let read = probe == DiagnosticRegister::ClockDifference && found.answers;
         read.then_some((device, found.clock_difference))
@@ -270,7 +270,7 @@ impl Exchange {
 
     /// Returns the index of the oldest frame set, which is evaluated in this cycle.
     fn due(&self) -> usize {
-        (self.staged + 1) % self.flights.len()
+        (self.staged + 1) % self.frame_sets.len()
     }
 
     /// Fills the frames of the next cycle. RT: O(image).
@@ -282,17 +282,17 @@ impl Exchange {
         self.separate_cycles = self.separate_cycles.saturating_sub(1);
         let form = usize::from(separate);
         self.form_of[(self.cycle & 0xff) as usize] = u8::from(separate);
-        if let Some(flight) = self.flights.get_mut(self.staged) {
-            flight.form = form;
+        if let Some(frame_set) = self.frame_sets.get_mut(self.staged) {
+            frame_set.form = form;
         }
         self.refresh_outputs();
         let time = self.expected_time;
-        let (Some(flight), Some(places)) =
-            (self.flights.get_mut(self.staged), self.forms.get(form))
+        let (Some(frame_set), Some(places)) =
+            (self.frame_sets.get_mut(self.staged), self.forms.get(form))
         else {
             return;
         };
-        let first = &mut flight.frames_mut()[0].bytes;
+        let first = &mut frame_set.frames_mut()[0].bytes;
         let turn = self.schedule.next();
         if let Some(turn) = turn {
             // The diagnostic datagram is the last of its frame, so its length may change within the
@@ -309,23 +309,23 @@ impl Exchange {
         }
         first[places.al_status.data()].fill(0);
         clear_wkc(first, places.al_status);
-        flight.turn = turn;
-        flight.stage(self.cycle);
+        frame_set.turn = turn;
+        frame_set.stage(self.cycle);
         self.expected_time = time.wrapping_add(self.cycle_ns);
     }
 
     /// Copies outputs that have changed since [`Exchange::stage`] into the frames. Call before
     /// [`Exchange::send`]. RT: O(image).
     pub fn refresh_outputs(&mut self) {
-        let Some(flight) = self.flights.get_mut(self.staged) else {
+        let Some(frame_set) = self.frame_sets.get_mut(self.staged) else {
             return;
         };
-        let Some(places) = self.forms.get(flight.form) else {
+        let Some(places) = self.forms.get(frame_set.form) else {
             return;
         };
         for datagram in &places.process_data {
             let place = datagram.place;
-            let frame = &mut flight.frames_mut()[place.frame].bytes;
+            let frame = &mut frame_set.frames_mut()[place.frame].bytes;
             if datagram.access != Access::Inputs {
                 let from = datagram.image..datagram.image + place.len;
                 frame[place.data()].copy_from_slice(&self.outputs[from]);
@@ -337,8 +337,8 @@ impl Exchange {
     /// Sends all frames of the cycle back to back, `late` after their planned release. RT: blocks
     /// on the wire only.
     pub fn send(&mut self, link: &mut dyn Link, late: Nanos) -> Result<(), LinkError> {
-        match self.flights.get_mut(self.staged) {
-            Some(flight) => flight.send(link, late),
+        match self.frame_sets.get_mut(self.staged) {
+            Some(frame_set) => frame_set.send(link, late),
             None => Ok(()),
         }
     }
@@ -348,8 +348,8 @@ impl Exchange {
         if frame.get(12..14) != Some(&ETHERCAT[..]) || frame.get(11) != Some(&MAC_TAIL) {
             return Received::Foreign;
         }
-        let mut flights = self.flights.iter_mut();
-        if flights.any(|flight| flight.receive(frame)) {
+        let mut frame_sets = self.frame_sets.iter_mut();
+        if frame_sets.any(|frame_set| frame_set.receive(frame)) {
             Received::Current
         } else {
             self.receive_late(frame);
@@ -364,14 +364,14 @@ impl Exchange {
             return;
         };
         let form = usize::from(self.form_of[usize::from(low)]);
-        let (Some(places), Some(flight)) = (self.forms.get(form), self.flights.first()) else {
+        let (Some(places), Some(frame_set)) = (self.forms.get(form), self.frame_sets.first()) else {
             return;
         };
         let age = self.cycle.wrapping_sub(u32::from(low)) & 0xff;
-        let sent = flight.form_frames(form);
+        let sent = frame_set.form_frames(form);
         let number = frame_number(tag, sent.len());
         let same_tag = tag == frame_tag(number, sent.len(), self.cycle.wrapping_sub(age));
-        let recent = age > 0 && age <= self.flights.len() as u32 + 1;
+        let recent = age > 0 && age <= self.frame_sets.len() as u32 + 1;
         let Some(sent) = sent.get(number).filter(|_| recent && same_tag) else {
             return;
         };
@@ -403,20 +403,20 @@ impl Exchange {
     /// True if every frame that is evaluated in this cycle has come back.
     #[must_use]
     pub fn complete(&self) -> bool {
-        self.flights.get(self.due()).is_some_and(FrameSet::complete)
+        self.frame_sets.get(self.due()).is_some_and(FrameSet::complete)
     }
 
     /// Evaluates the due answers per device, per group and in total, and copies their inputs. RT:
     /// O(image).
     pub fn evaluate(&mut self) -> CycleResult {
         let due = self.due();
-        let Some(flight) = self.flights.get(due) else {
+        let Some(frame_set) = self.frame_sets.get(due) else {
             return CycleResult::default();
         };
-        let Some(places) = self.forms.get(flight.form) else {
+        let Some(places) = self.forms.get(frame_set.form) else {
             return CycleResult::default();
         };
-        let first = flight.answer(0);
+        let first = frame_set.answer(0);
         let alone = if first.is_some() {
             Evidence::Fresh
         } else {
@@ -434,7 +434,7 @@ impl Exchange {
                 continue;
             };
             let place = datagram.place;
-            let answer = flight.answer(place.frame);
+            let answer = frame_set.answer(place.frame);
             let wkc = answer.map_or(0, |answer| place.wkc(answer));
             let right = answer.is_some() && wkc == datagram.expected_wkc;
             let (begin, end) = datagram.devices;
@@ -467,7 +467,7 @@ impl Exchange {
             self.separate_cycles = SEPARATE_CYCLES;
         }
         let mut answer = CycleResult {
-            complete: flight.complete(),
+            complete: frame_set.complete(),
             inputs_fresh: self.shares.iter().all(|share| share.fresh),
             wkc: self.shares.iter().fold((0, 0), |sum, share| {
                 let (seen, expected) = share.wkc;
@@ -475,7 +475,7 @@ impl Exchange {
             }),
             system_time: None,
             al_status: None,
-            sent_late: flight.sent_late.unwrap_or(0),
+            sent_late: frame_set.sent_late.unwrap_or(0),
         };
         let Some(first) = first else {
             return answer;
@@ -483,7 +483,7 @@ impl Exchange {
         answer.al_status = first
             .get(places.al_status.data())
             .and_then(|data| Some((*data.first()?, places.al_status.wkc(first))));
-        if let Some(turn) = flight.turn {
+        if let Some(turn) = frame_set.turn {
             let place = DatagramSlot {
                 frame: 0,
                 offset: places.probe_at,
@@ -507,16 +507,16 @@ impl Exchange {
                     let devices = self.schedule.mailbox_devices.iter().skip(first);
                     for (&device, &status) in devices.zip(data) {
                         self.bus_status
-                            .store_mailbox_status(device, flight.sent_at, status);
+                            .store_mailbox_status(device, frame_set.sent_at, status);
                     }
                 }
             }
         }
         answer.system_time = self.system_time(first, places.clock);
         if let Some(time) = answer.system_time {
-            self.bus_status.set_clock(flight.sent_at, time);
-            // The time of the frame set that is staged next; those in flight lie between.
-            let ahead = self.cycle_ns.saturating_mul(self.flights.len() as u64);
+            self.bus_status.set_clock(frame_set.sent_at, time);
+            // The time of the frame set that is staged next; those in frame_set lie between.
+            let ahead = self.cycle_ns.saturating_mul(self.frame_sets.len() as u64);
             self.expected_time = time.wrapping_add(ahead);
         }
         answer
@@ -543,10 +543,10 @@ impl Exchange {
 
     /// Returns the bytes of each staged frame without FCS.
     pub fn frame_lengths(&self) -> impl Iterator<Item = usize> + '_ {
-        let staged = self.flights.get(self.staged);
+        let staged = self.frame_sets.get(self.staged);
         staged
             .into_iter()
-            .flat_map(|flight| flight.frames().iter().map(|frame| frame.bytes.len()))
+            .flat_map(|frame_set| frame_set.frames().iter().map(|frame| frame.bytes.len()))
     }
 }
 

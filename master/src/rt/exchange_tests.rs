@@ -24,7 +24,7 @@ impl Link for Nowhere {
 /// present.
 fn reflect(exchange: &mut Exchange, number: usize, input: u8) -> Vec<u8> {
     exchange.send(&mut Nowhere, 0).expect("nowhere takes all");
-    let mut frame = exchange.flights[exchange.staged].frames()[number]
+    let mut frame = exchange.frame_sets[exchange.staged].frames()[number]
         .bytes
         .clone();
     frame[6] |= 0x02;
@@ -32,7 +32,7 @@ fn reflect(exchange: &mut Exchange, number: usize, input: u8) -> Vec<u8> {
     while at + DATAGRAM_HEADER <= frame.len() {
         let len = usize::from(u16::from_le_bytes([frame[at + 6], frame[at + 7] & 7]));
         let data = at + DATAGRAM_HEADER;
-        let form = exchange.flights[exchange.staged].form;
+        let form = exchange.frame_sets[exchange.staged].form;
         let expected = exchange.forms[form]
             .process_data
             .iter()
@@ -192,7 +192,7 @@ fn device_without_lrw_exchanges_data_in_two_datagrams() {
     let mut exchange = exchange(&[axis(0), without], ExchangeMode::SameCycle);
     exchange.outputs_mut().fill(0x77);
     exchange.stage();
-    let sent = exchange.flights[0].frames()[0].bytes.clone();
+    let sent = exchange.frame_sets[0].frames()[0].bytes.clone();
     let commands: Vec<(u8, bool)> = exchange.forms[0]
         .process_data
         .iter()
@@ -236,7 +236,7 @@ fn diagnostic_slot_reads_all_registers_of_all_devices() {
     let mut exchange = axes(2);
     let mut seen = Vec::new();
     for _ in 0..2 * DiagnosticRegister::ALL.len() {
-        let turn = exchange.flights[0].turn.expect("there are members");
+        let turn = exchange.frame_sets[0].turn.expect("there are members");
         let PollTarget::At { device, probe } = turn.look else {
             panic!("no device has a mailbox");
         };
@@ -392,7 +392,7 @@ fn missing_device_does_not_change_the_evidence_of_others() {
         exchange.expect_op(true);
         let missing_second = |exchange: &mut Exchange, input: u8| {
             let mut frame = reflect(exchange, 0, input);
-            let form = exchange.flights[exchange.staged].form;
+            let form = exchange.frame_sets[exchange.staged].form;
             let at = exchange.forms[form].process_data[form].place.data().end;
             frame[at] = if form == 0 { 6 } else { 0 };
             assert_eq!(exchange.receive(&frame), Received::Current);
@@ -425,7 +425,7 @@ fn missing_device_does_not_change_the_evidence_of_others() {
             }
             exchange.stage();
         }
-        assert_eq!(exchange.flights[exchange.staged].form, 0);
+        assert_eq!(exchange.frame_sets[exchange.staged].form, 0);
     }
 }
 

@@ -279,11 +279,11 @@ impl SetpointGenerator {
                 (next, false, state)
             }
         };
-        let patience = match source {
+        let timeout = match source {
             Source::Gear { actual: true, .. } => SLIP_ACTUAL_S,
             _ => SLIP_S,
         };
-        if self.slipping_s > patience {
+        if self.slipping_s > timeout {
             (self.source, self.state) = (None, GeneratorState::Lost(SLIPS));
             return true;
         }

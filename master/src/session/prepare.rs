@@ -259,7 +259,7 @@ fn plan(machine: &Machine) -> Result<CyclePlan, RunError> {
         })?;
         let mut config = setup.config;
         // A feedback value belongs to the set-point of an earlier cycle.
-        config.answers_late = machine.bus.exchange.flights() - 1;
+        config.answers_late = machine.bus.exchange.frame_sets() - 1;
         config.dead_time_s += f64::from(config.answers_late) * machine.bus.cycle_ns as f64 * 1e-9;
         let axis = Axis::new(config).map_err(|source| RunError::Axis {
             name: name(index),

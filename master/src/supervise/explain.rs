@@ -222,7 +222,7 @@ impl Supervisor {
         let mut looks = vec![DeviceSnapshot::default(); self.bus.devices.len()];
         snapshot::read_registers(&self.wire, &self.stations(), &mut looks, depth).await;
         let snapshot = self.outer.snapshots.read().clone();
-        let end = clock::now().saturating_add(snapshot::PATIENCE);
+        let end = clock::now().saturating_add(snapshot::TIMEOUT);
         for (&device, status) in self.axes.iter().zip(&snapshot.axes) {
             let following = matches!(status.trip, Some(Trip::FollowingError { .. }));
             let ask = snapshot::ObjectSelection {

@@ -178,7 +178,7 @@ impl Supervisor {
         // Reading every clock takes long on a large bus with a long cycle.
         let looks = self.bus.devices.len() * DiagnosticRegister::ALL.len() * 2;
         let looks = u64::try_from(looks).unwrap_or(u64::MAX);
-        let patience = LOCK_TIMEOUT.saturating_add(looks.saturating_mul(self.machine.bus.cycle_ns));
+        let timeout = LOCK_TIMEOUT.saturating_add(looks.saturating_mul(self.machine.bus.cycle_ns));
         loop {
             let snapshot = self.poll_and_query().await?;
             let looked_at_all =
@@ -191,7 +191,7 @@ impl Supervisor {
                 }
                 return Ok(());
             }
-            if clock::now().saturating_sub(start) > patience {
+            if clock::now().saturating_sub(start) > timeout {
                 return Err(match (snapshot.phase, unsettled) {
                     _ if !snapshot.inputs_fresh => RunError::NoProcessData {
                         al_status: snapshot.al_status,

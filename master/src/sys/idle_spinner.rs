@@ -13,7 +13,7 @@ use thread_priority::{
 use super::rt_thread::{RtSetupError, pin};
 
 /// The time to wait for the thread's first time slice; a busy CPU may delay it.
-const PATIENCE: Duration = Duration::from_millis(200);
+const TIMEOUT: Duration = Duration::from_millis(200);
 
 /// The thread calls nothing, so a small stack suffices.
 const STACK: usize = 64 * 1024;
@@ -51,7 +51,7 @@ impl IdleSpinner {
             thread: Some(thread),
         };
         let begin = Instant::now();
-        while !turning.load(Ordering::Relaxed) && begin.elapsed() < PATIENCE {
+        while !turning.load(Ordering::Relaxed) && begin.elapsed() < TIMEOUT {
             if awake.thread.as_ref().is_some_and(JoinHandle::is_finished) {
                 awake.end()?;
                 break;

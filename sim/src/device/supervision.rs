@@ -12,7 +12,7 @@ use crate::esc::al::{AlState, code};
 
 const MISSED: u32 = 3;
 /// The number of SYNC0 periods without a pulse after which SYNC0 is lost.
-const PATIENCE: u64 = 3;
+const MAX_PERIODS: u64 = 3;
 
 #[derive(Debug, Clone)]
 pub(super) struct Supervision {
@@ -91,8 +91,8 @@ impl SimDevice {
             return;
         }
         let period = self.esc.dc.as_ref().map_or(0, |dc| dc.sync.cycle0);
-        let patience = PATIENCE * u64::from(period) + CONTROL_PERIOD_NS;
-        if self.local.saturating_sub(self.supervision.last_sync0) > patience {
+        let timeout = MAX_PERIODS * u64::from(period) + CONTROL_PERIOD_NS;
+        if self.local.saturating_sub(self.supervision.last_sync0) > timeout {
             self.fall_to(
                 AlState::SafeOp,
                 code::FATAL_SYNC_ERROR,

@@ -318,8 +318,8 @@ impl GatewayOptions {
             match node.supervision {
                 Supervision::None => {}
                 Supervision::Heartbeat { period_ms } => {
-                    let patience = u32::from(period_ms) + u32::from(period_ms / 2).max(1);
-                    let consumer = u32::from(node.id) << 16 | patience.min(0xffff);
+                    let timeout_ms = u32::from(period_ms) + u32::from(period_ms / 2).max(1);
+                    let consumer = u32::from(node.id) << 16 | timeout_ms.min(0xffff);
                     gateway.push(u32_(0x1016, n, consumer));
                     dcf.push(u16_(0x1017, 0, period_ms));
                 }

@@ -107,7 +107,7 @@ impl Server {
             replies.release(now);
             segment.advance(now);
             between(segment, now);
-            if !socket::wait(&self.sockets, replies.patience(now)) {
+            if !socket::wait(&self.sockets, replies.time_to_next(now)) {
                 idle += 1;
                 if idle.is_multiple_of(CHECK) {
                     self.sockets.iter().try_for_each(RawSocket::check)?;
@@ -179,7 +179,7 @@ impl Replies<'_> {
     }
 
     /// Returns the time to wait for a frame in ns.
-    fn patience(&self, now: Nanos) -> Nanos {
+    fn time_to_next(&self, now: Nanos) -> Nanos {
         let due = self.held.iter().map(|held| held.at).min();
         due.map_or(IDLE_NS, |due| due.saturating_sub(now).min(IDLE_NS))
     }

@@ -203,7 +203,7 @@ impl RawSocket {
 }
 
 /// Waits for a frame at one of the sockets. Returns false on time-out.
-pub(super) fn wait(sockets: &[RawSocket], patience: Nanos) -> bool {
+pub(super) fn wait(sockets: &[RawSocket], timeout: Nanos) -> bool {
     let mut polled = [libc::pollfd {
         fd: -1,
         events: libc::POLLIN,
@@ -214,7 +214,7 @@ pub(super) fn wait(sockets: &[RawSocket], patience: Nanos) -> bool {
     }
     let timeout = libc::timespec {
         tv_sec: 0,
-        tv_nsec: patience.min(999_999_999).cast_signed(),
+        tv_nsec: timeout.min(999_999_999).cast_signed(),
     };
     // SAFETY: descriptors and timeout are valid for the call.
     unsafe { libc::ppoll(polled.as_mut_ptr(), 2, &raw const timeout, ptr::null()) > 0 }

@@ -16,7 +16,7 @@ use super::SPEED;
 use ecaxis_test_support::Heard;
 
 /// A timeout by which a failed run has ended.
-const PATIENCE: Duration = Duration::from_secs(20);
+const TIMEOUT: Duration = Duration::from_secs(20);
 
 /// The location of the panic.
 #[derive(Debug, Clone, Copy)]
@@ -67,7 +67,7 @@ impl Library {
         let run = self.run.take().expect("once");
         let began = Instant::now();
         while !run.is_finished() {
-            assert!(began.elapsed() < PATIENCE, "the run does not end");
+            assert!(began.elapsed() < TIMEOUT, "the run does not end");
             sleep(Duration::from_millis(10));
         }
         run.join().expect("panics within a run are its errors")

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use rustix::time::{ClockId, clock_gettime};
 
-use super::PATIENCE;
+use super::TIMEOUT;
 
 /// The standstill threshold in turns/s, as in the simulator.
 const STANDS: f64 = 0.1;
@@ -141,7 +141,7 @@ impl Trace {
     }
 
     #[track_caller]
-    fn wait(&mut self, patience: Duration, what: &str, holds: impl Fn(&Self) -> bool) {
+    fn wait(&mut self, timeout: Duration, what: &str, holds: impl Fn(&Self) -> bool) {
         let began = Instant::now();
         loop {
             self.read();
@@ -149,7 +149,7 @@ impl Trace {
                 return;
             }
             let last = &self.samples[self.samples.len().saturating_sub(2)..];
-            assert!(began.elapsed() < patience, "no {what}: {last:?}");
+            assert!(began.elapsed() < timeout, "no {what}: {last:?}");
             sleep(Duration::from_millis(5));
         }
     }
@@ -170,7 +170,7 @@ impl Trace {
     /// must receive set-points until they stand.
     #[track_caller]
     pub fn await_standstill(&mut self, began: u64, ramped: usize) -> Stop {
-        self.wait(PATIENCE, "standstill", |trace| {
+        self.wait(TIMEOUT, "standstill", |trace| {
             let now = trace.samples.last().map_or(0, |sample| sample.at);
             let settled = now.saturating_sub(began) > SETTLED_NS;
             let from = now.saturating_sub(SETTLED_NS);

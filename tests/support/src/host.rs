@@ -23,7 +23,7 @@ use crate::{NO_ROOT, skip};
 const CONFIRMATIONS: usize = 3;
 const MAX_FAILURES: usize = 3;
 /// No retry starts after this time.
-const PATIENCE: Duration = Duration::from_secs(180);
+const TIMEOUT: Duration = Duration::from_secs(180);
 /// Above every thread of the program and of the tests, so that none of them delays the watch.
 const PRIORITY: u8 = 95;
 const EVERY: Duration = Duration::from_millis(1);
@@ -102,7 +102,7 @@ pub fn retry_if_host_stalled(test: impl Fn()) {
         last_panic = result.err().or(last_panic);
         tries.push(Try { passed, taken });
         println!("try {}: passed: {passed}, {taken:?}", tries.len());
-        match judge(&tries, began.elapsed() < PATIENCE) {
+        match judge(&tries, began.elapsed() < TIMEOUT) {
             Verdict::Passed => return,
             Verdict::Failed => resume_unwind(last_panic.expect("a try has failed")),
             Verdict::Again => {}

@@ -13,7 +13,7 @@ use serde_json::Value;
 use crate::root;
 
 /// A timeout much longer than any operation.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Returns the path of `ecaxis`, which cargo builds two folders above the tests.
 pub fn ecaxis() -> PathBuf {
@@ -117,7 +117,7 @@ impl ProgramOutput {
     pub fn says(&mut self, text: &str) {
         let began = Instant::now();
         loop {
-            let left = PATIENCE.saturating_sub(began.elapsed());
+            let left = TIMEOUT.saturating_sub(began.elapsed());
             match self.lines.recv_timeout(left) {
                 Ok(line) => {
                     self.heard += &line;

@@ -47,7 +47,7 @@ const FREQUENCY: f64 = 1.0;
 const PERIODS: u32 = 1_000_000;
 
 /// The time-out for phase lock and enabling of all axes.
-const PATIENCE: Duration = Duration::from_secs(20);
+const TIMEOUT: Duration = Duration::from_secs(20);
 const TICK: Duration = Duration::from_millis(5);
 /// The settling time after the start of motion.
 const SETTLE: Duration = Duration::from_millis(300);
@@ -57,7 +57,7 @@ const SETTLE: Duration = Duration::from_millis(300);
 pub enum RigError {
     #[error("{0} axes do not fit: one frame holds the process data of a device whole")]
     TooMany(usize),
-    #[error("{what} after {} s ({cycles} cycles, {lost} without an answer)", PATIENCE.as_secs())]
+    #[error("{what} after {} s ({cycles} cycles, {lost} without an answer)", TIMEOUT.as_secs())]
     NotReady {
         what: &'static str,
         cycles: u64,
@@ -244,7 +244,7 @@ pub fn set_in_motion(
 /// Sends a command and waits for space in the queue, which the cycle empties.
 fn order(outer: &mut HostEndpoint, order: RtCommand) {
     let start = Instant::now();
-    while outer.orders.push(order).is_err() && start.elapsed() < PATIENCE {
+    while outer.orders.push(order).is_err() && start.elapsed() < TIMEOUT {
         thread::sleep(TICK);
     }
 }
@@ -260,7 +260,7 @@ fn wait(
         if stop.load(Ordering::Relaxed) {
             return Ok(false);
         }
-        if start.elapsed() > PATIENCE {
+        if start.elapsed() > TIMEOUT {
             let counters = outer.snapshots.read().counters;
             return Err(RigError::NotReady {
                 what,

@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 /// The name prefix before the process ID.
 const PREFIX: &str = "ecx";
 /// The time-out for a link.
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A pair of interfaces, removed on drop.
 #[derive(Debug)]
@@ -116,7 +116,7 @@ fn wait_for_link(nic: &str) -> io::Result<()> {
     let carrier = format!("/sys/class/net/{nic}/carrier");
     let start = Instant::now();
     while std::fs::read_to_string(Path::new(&carrier))?.trim() != "1" {
-        if start.elapsed() > PATIENCE {
+        if start.elapsed() > TIMEOUT {
             return Err(io::Error::other(format!("{nic} gets no link")));
         }
         thread::sleep(Duration::from_millis(5));

@@ -205,17 +205,17 @@ fn on(
         nic: machine.bus.nic.clone(),
     };
     thread::scope(|scope| {
-        let seat = TerminalSide {
+        let terminal = TerminalSide {
             terminal,
             asks,
             shared,
             stop,
             title: &title,
         };
-        let seat = thread::Builder::new()
+        let terminal = thread::Builder::new()
             .name("terminal".to_owned())
-            .spawn_scoped(scope, move || seat.serve());
-        if let Err(error) = seat {
+            .spawn_scoped(scope, move || terminal.serve());
+        if let Err(error) = terminal {
             return RunError::Thread(error.to_string()).into();
         }
         let outcome = session::run_with_operator(

@@ -83,7 +83,7 @@ pub struct CycleResult {
 impl ExchangeMode {
     /// Returns how many cycles have frames in flight at once.
     #[must_use]
-    pub const fn flights(self) -> u8 {
+    pub const fn frame_sets(self) -> u8 {
         match self {
             Self::SameCycle => 1,
             Self::Pipelined => 2,

@@ -79,7 +79,7 @@ pub(super) struct JogController {
     pub hands: Vec<JogAxis>,
     pub news: Pending,
     /// The maximum time in ns to wait for a drive.
-    patience: Nanos,
+    timeout: Nanos,
 }
 
 /// The inputs of [`JogController`].
@@ -125,11 +125,11 @@ impl JogContext<'_> {
 pub(super) type Commands = Vec<(usize, Command)>;
 
 impl JogController {
-    pub fn new(axes: usize, patience: Nanos) -> Self {
+    pub fn new(axes: usize, timeout: Nanos) -> Self {
         Self {
             hands: vec![JogAxis::default(); axes],
             news: Pending::new(),
-            patience,
+            timeout,
         }
     }
 
@@ -164,7 +164,7 @@ impl JogController {
                 continue;
             };
             let what = hand.doing;
-            let Some(end) = hand.end(status, scene.stopped(axis), scene.now, self.patience) else {
+            let Some(end) = hand.end(status, scene.stopped(axis), scene.now, self.timeout) else {
                 continue;
             };
             hand.doing = Activity::Nothing;
@@ -342,7 +342,7 @@ impl JogAxis {
         status: &AxisStatus,
         stopped: bool,
         now: Nanos,
-        patience: Nanos,
+        timeout: Nanos,
     ) -> Option<Result<(), String>> {
         let waited = now.saturating_sub(self.since);
         if self.doing.moves() && (stopped || !status.enabled) {
@@ -400,7 +400,7 @@ impl JogAxis {
         if done {
             return Some(Ok(()));
         }
-        (waited > patience).then(|| {
+        (waited > timeout).then(|| {
             Err(match status.waiting {
                 Some(waiting) if self.doing == Activity::Enabling => waiting.to_string(),
                 _ => format!("not done in time; the drive is in {}", status.state),

@@ -22,10 +22,10 @@ impl Supervisor {
         &mut self,
         operator: &mut dyn Operator,
     ) -> Result<(), RunError> {
-        let patience = self.machine.bus.enable_timeout_ns + self.longest_stop();
+        let timeout = self.machine.bus.enable_timeout_ns + self.longest_stop();
         let all: Vec<usize> = (0..self.axes.len()).collect();
-        let patience = patience + self.longest_release(&all);
-        let mut worker = JogController::new(self.axes.len(), patience);
+        let timeout = timeout + self.longest_release(&all);
+        let mut worker = JogController::new(self.axes.len(), timeout);
         let (machine, axes) = (Arc::clone(&self.machine), self.axes.clone());
         // Enabled axes whose mode must be read over CoE because it is not in their process data.
         let mut enabled: Vec<usize> = Vec::new();

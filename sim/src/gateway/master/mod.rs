@@ -34,7 +34,7 @@ enum Boot {
 struct Guard {
     period: u64,
     /// Unanswered requests until the node fails.
-    patience: u8,
+    retries: u8,
     unanswered: u8,
     next: u64,
     /// The toggle bit of the next answer. `None` accepts either value.

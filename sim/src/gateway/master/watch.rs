@@ -74,7 +74,7 @@ impl Gateway {
         {
             slave.guard = Some(Guard {
                 period,
-                patience: retries,
+                retries,
                 unanswered: 0,
                 next: now,
                 toggle: None,
@@ -107,7 +107,7 @@ impl Gateway {
                 continue;
             };
             guard.next = now + guard.period;
-            let given_up = guard.unanswered >= guard.patience;
+            let given_up = guard.unanswered >= guard.retries;
             guard.unanswered = guard.unanswered.saturating_add(1);
             let news = given_up && !slave.error;
             self.bus
