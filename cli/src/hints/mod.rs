@@ -216,10 +216,7 @@ fn message(error: &RunError) -> String {
             };
             (device, source, Some(object.to_string()))
         }
-        BringUpError::Mailbox { device, source }
-        | BringUpError::ReadBack { device, source }
-        | BringUpError::ReadUnits { device, source }
-        | BringUpError::ReadLimits { device, source } => (device, source, None),
+        BringUpError::Sdo { device, source, .. } => (device, source, None),
         _ => return text,
     };
     let long = source.to_string();
@@ -285,14 +282,9 @@ fn not_homed(error: HomingError) -> &'static str {
 
 fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
     let hint = match error {
-        BringUpError::NoAnswer => {
-            let failure = match nic {
-                Nic::Interface(name) => failure
-                    .hint(format!("is `{name}` the right interface? {}", interfaces()))
-                    .hint("check that the first SubDevice has power and its IN port is connected"),
-                Nic::Sim => failure.hint("check the fault script: it may silence the bus"),
-            };
-            return failure;
+        BringUpError::Service(error) => {
+            let hints = service(error, nic).hints;
+            return Failure { hints, ..failure };
         }
         BringUpError::Missing { .. } => {
             "check the power of the first one missing and the cable to it, or remove its [[device]] from the file; `ecaxis compare` shows all differences".to_owned()
@@ -313,12 +305,7 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
         BringUpError::NotHeld { .. } => {
             "the device rounds or limits the value, or another object has changed it: write the value that it holds, or omit `verify` for this object".to_owned()
         }
-        BringUpError::Mailbox { source, .. }
-        | BringUpError::ReadBack { source, .. }
-        | BringUpError::ReadUnits { source, .. }
-        | BringUpError::ReadLimits { source, .. } => {
-            sdo(source, "bring-up")
-        }
+        BringUpError::Sdo { source, .. } => sdo(source, "bring-up"),
         BringUpError::Watchdog { .. } => {
             "without its watchdog the drive keeps moving when the outputs fail: ask its vendor how to enable it".to_owned()
         }
@@ -337,10 +324,7 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
         BringUpError::NoClock { .. } => {
             "run the device without distributed clock: `dc = \"off\"`".to_owned()
         }
-        BringUpError::Scan { .. } | BringUpError::Wire { .. } | BringUpError::NotTaken { .. } => {
-            "frames are lost or a device restarts: check cables and supply, and record with `--record`".to_owned()
-        }
-        BringUpError::State(state) => self::state(state),
+        BringUpError::Scan { .. } => service::FRAMES.to_owned(),
     };
     failure.hint(hint)
 }

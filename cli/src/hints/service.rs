@@ -5,14 +5,13 @@ use std::path::Path;
 use ecaxis_master::acyclic::ServiceError;
 use ecaxis_master::acyclic::eeprom::EepromError;
 use ecaxis_master::acyclic::image::WriteError;
-use ecaxis_master::bringup::BringUpError;
 use ecaxis_master::config::Nic;
 use ecaxis_master::mailbox::{InfoError, SdoError};
 use ecaxis_tools::parameters::restore::RestoreError;
 
-use super::{FAILED, Failure, INTERRUPTED, WRONG, bring_up, sdo, state};
+use super::{FAILED, Failure, INTERRUPTED, WRONG, interfaces, sdo, state};
 
-const FRAMES: &str = "frames are lost or a device restarts: check cables and supply";
+pub(super) const FRAMES: &str = "frames are lost or a device restarts: check cables and supply";
 
 /// Maps the error of acyclic work to a failure.
 pub(crate) fn service(error: &ServiceError, nic: &Nic) -> Failure {
@@ -22,7 +21,14 @@ pub(crate) fn service(error: &ServiceError, nic: &Nic) -> Failure {
     };
     let failure = Failure::new(code, message(error));
     let hint = match error {
-        ServiceError::NoAnswer => return bring_up(failure, &BringUpError::NoAnswer, nic),
+        ServiceError::NoAnswer => {
+            return match nic {
+                Nic::Interface(name) => failure
+                    .hint(format!("is `{name}` the right interface? {}", interfaces()))
+                    .hint("check that the first SubDevice has power and its IN port is connected"),
+                Nic::Sim => failure.hint("check the fault script: it may silence the bus"),
+            };
+        }
         ServiceError::Silent { .. }
         | ServiceError::Segment { .. }
         | ServiceError::Wire { .. }

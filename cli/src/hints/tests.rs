@@ -1,4 +1,4 @@
-use ecaxis_master::acyclic::{AlState, DeviceRef};
+use ecaxis_master::acyclic::{AlState, DeviceRef, ServiceError};
 use ecaxis_master::link::OpenError;
 
 use super::*;
@@ -37,7 +37,7 @@ fn every_failure_has_a_hint() {
     };
     let bring_up = |error| RunError::BringUp(Box::new(error));
     let refused = |code| {
-        bring_up(BringUpError::State(StateError::Refused {
+        bring_up(BringUpError::from(StateError::Refused {
             device: device(),
             wanted: AlState::SafeOp,
             actual: AlState::PreOp,
@@ -120,7 +120,7 @@ fn every_failure_has_a_hint() {
             "this computer has",
         ),
         (
-            bring_up(BringUpError::NoAnswer),
+            bring_up(ServiceError::NoAnswer.into()),
             FAILED,
             "is `eth9` the right interface?",
         ),
@@ -238,8 +238,9 @@ fn message_names_an_address_once() {
         assert_eq!(text.matches("0x1001").count(), 1, "{text}");
         assert_eq!(text.matches("0x6060").count(), 1, "{text}");
     }
-    let error = RunError::BringUp(Box::new(BringUpError::ReadBack {
+    let error = RunError::BringUp(Box::new(BringUpError::Sdo {
         device: device(),
+        step: "reading the PDO mapping back",
         source: abort,
     }));
     let text = message(&error);
@@ -312,7 +313,7 @@ fn hints_keep_drives_on_with_another_main_device() {
         code: 0x0609_0030,
     };
     for (source, takes_away) in [(timeout, true), (refused, false)] {
-        let error = ecaxis_master::acyclic::ServiceError::Sdo {
+        let error = ServiceError::Sdo {
             device: device(),
             source,
         };

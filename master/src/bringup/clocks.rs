@@ -7,7 +7,7 @@
 
 use super::device::{read, write};
 use super::{BringUpError, BusDevice, Step};
-use crate::acyclic::DeviceRef;
+use crate::acyclic::{DeviceRef, ServiceError};
 use crate::clock::Nanos;
 use crate::config::Machine;
 use crate::datagram::DatagramClient;
@@ -139,7 +139,7 @@ pub(super) async fn set_again(
         write(wire, at, STEP, registers::DC_SPEED_COUNTER_START, &start).await?;
         write(wire, at, STEP, registers::DC_SYSTEM_TIME_DELAY, &delay).await?;
     }
-    let failed = |source| BringUpError::Wire {
+    let failed = |source| ServiceError::Wire {
         device: reference.at.clone(),
         step: STEP,
         source,
@@ -182,13 +182,12 @@ pub(super) async fn has_system_time(
     let counter = wire
         .read(at.station, registers::DC_SYSTEM_TIME, &mut [0; 8])
         .await;
-    counter
-        .map(|counter| counter > 0)
-        .map_err(|source| BringUpError::Wire {
-            device: at.clone(),
-            step: STEP,
-            source,
-        })
+    let counter = counter.map_err(|source| ServiceError::Wire {
+        device: at.clone(),
+        step: STEP,
+        source,
+    })?;
+    Ok(counter > 0)
 }
 
 async fn system_time(

@@ -5,11 +5,9 @@ use ecaxis_esi::layout::SmLayout;
 use ecaxis_esi::{StartupSdo, address};
 
 use super::{BringUpError, BusDevice, Step};
-use crate::acyclic::DeviceRef;
+use crate::acyclic::{DeviceRef, Registers};
 use crate::config::{DeviceConfig, StartupOptions};
-use crate::mailbox::{
-    CoeClient, DatagramError, MailboxTransport, NamedObject, SdoError, object_name,
-};
+use crate::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, object_name};
 use crate::rt::image::DeviceRegion;
 
 const FMMU_SIZE: u16 = 16;
@@ -48,12 +46,11 @@ pub(super) async fn start_up(
     let Some(coe) = device.coe.as_mut() else {
         return Ok(());
     };
-    coe.drain(wire)
-        .await
-        .map_err(|source| BringUpError::Mailbox {
-            device: device.at.clone(),
-            source,
-        })?;
+    coe.drain(wire).await.map_err(|source| BringUpError::Sdo {
+        device: device.at.clone(),
+        step: "emptying the mailbox",
+        source,
+    })?;
     let mut held = 0;
     for (done, sdo) in list.iter().enumerate() {
         let way = config.startup.way(sdo.index, sdo.sub);
@@ -275,8 +272,8 @@ pub(super) async fn write(
     register: u16,
     data: &[u8],
 ) -> Result<(), BringUpError> {
-    let written = wire.write(device.station, register, data).await;
-    taken(written, device, step, register)
+    let registers = Registers { wire, device, step };
+    Ok(registers.write(register, data).await?)
 }
 
 /// Reads a register; fails if the device does not answer.
@@ -286,28 +283,6 @@ pub(super) async fn read<const N: usize>(
     step: &'static str,
     register: u16,
 ) -> Result<[u8; N], BringUpError> {
-    let mut data = [0; N];
-    let read = wire.read(device.station, register, &mut data).await;
-    taken(read, device, step, register).map(|()| data)
-}
-
-fn taken(
-    result: Result<u16, DatagramError>,
-    device: &DeviceRef,
-    step: &'static str,
-    register: u16,
-) -> Result<(), BringUpError> {
-    match result {
-        Ok(1) => Ok(()),
-        Ok(_) => Err(BringUpError::NotTaken {
-            device: device.clone(),
-            step,
-            register,
-        }),
-        Err(source) => Err(BringUpError::Wire {
-            device: device.clone(),
-            step,
-            source,
-        }),
-    }
+    let registers = Registers { wire, device, step };
+    Ok(registers.read(register).await?)
 }

@@ -23,8 +23,9 @@ pub(super) async fn compare(
     let constant = constant && is_maxon(&config.selection);
     let offered = ask(wire, coe, constant)
         .await
-        .map_err(|source| BringUpError::ReadUnits {
+        .map_err(|source| BringUpError::Sdo {
             device: device.at.clone(),
+            step: "reading the drive's units",
             source,
         })?;
     tracing::debug!(device = %device.at, "{offered:?}");

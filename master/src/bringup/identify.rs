@@ -6,7 +6,7 @@ use ethercrab::{MainDevice, SubDeviceIdentity};
 
 use super::{BringUpError, Group, Step, scan_error};
 use crate::acyclic::enumerate::{EnumeratedDevice, FIRST_STATION, count, read_device};
-use crate::acyclic::{DeviceRef, al};
+use crate::acyclic::{DeviceRef, ServiceError, al};
 use crate::config::{DeviceConfig, Locator, Machine};
 use crate::datagram::DatagramClient;
 
@@ -25,7 +25,7 @@ pub(super) async fn explain_scan(
     error: Error,
 ) -> BringUpError {
     let Ok(count) = count(wire).await else {
-        return BringUpError::NoAnswer;
+        return ServiceError::NoAnswer.into();
     };
     let (mut behind, mut unaddressed) = (None, None);
     for position in 0..count {
@@ -42,19 +42,20 @@ pub(super) async fn explain_scan(
         if found.station != device.station {
             unaddressed.get_or_insert(device);
         } else if found.error && (code != 0 || !al::emulated(wire, device.station).await) {
-            return BringUpError::State(al::StateError::Refused {
+            let refused = al::StateError::Refused {
                 device,
                 wanted: al::AlState::PreOp,
                 actual: state,
                 code,
-            });
+            };
+            return refused.into();
         } else if state != al::AlState::PreOp && behind.is_none() {
             behind = Some((device, state));
         }
     }
     if let Some(device) = unaddressed {
         let wanted = al::AlState::PreOp;
-        return BringUpError::State(al::StateError::Gone { device, wanted });
+        return al::StateError::Gone { device, wanted }.into();
     }
     let missing = positions(machine).filter(|(position, _)| *position >= count);
     let missing: Vec<_> = missing.map(named).collect();
@@ -67,12 +68,13 @@ pub(super) async fn explain_scan(
     }
     match (error, behind) {
         (Error::Timeout(TimeoutError::StateTransition), Some((device, actual))) => {
-            BringUpError::State(al::StateError::Timeout {
+            let timeout = al::StateError::Timeout {
                 device,
                 wanted: al::AlState::PreOp,
                 actual,
                 timeout: crate::link::pdu_loop::STATE_TIMEOUT,
-            })
+            };
+            timeout.into()
         }
         (error, _) => scan_error("scanning the segment and going to PreOp", &error),
     }

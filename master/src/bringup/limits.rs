@@ -17,8 +17,9 @@ pub(super) async fn compare(
     let (Some(axis), Some(coe)) = (&config.axis, device.coe.as_mut()) else {
         return Ok(());
     };
-    let failed = |source| BringUpError::ReadLimits {
+    let failed = |source| BringUpError::Sdo {
         device: device.at.clone(),
+        step: "reading the drive's limits",
         source,
     };
     let selection = &config.selection;

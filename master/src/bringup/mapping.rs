@@ -77,8 +77,9 @@ async fn read_list(
         return Ok(None);
     };
     let list = coe.upload_list(wire, index).await;
-    list.map_err(|source| BringUpError::ReadBack {
+    list.map_err(|source| BringUpError::Sdo {
         device: device.at.clone(),
+        step: "reading the PDO mapping back",
         source,
     })
 }

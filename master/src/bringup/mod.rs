@@ -18,13 +18,12 @@ use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
 use ecaxis_esi::address;
 
-use crate::acyclic::{AlState, DeviceRef, StateError, al};
-use crate::acyclic::{ServiceError, enumerate};
+use crate::acyclic::{AlState, DeviceRef, ServiceError, StateError, al, enumerate};
 use crate::clock;
 use crate::config::{AdoptedUnits, LimitConflict, MAX_SUBDEVICES, Machine, UnitProblem};
 use crate::datagram::DatagramClient;
 use crate::mailbox::worker::EmergencySink;
-use crate::mailbox::{CoeClient, DatagramError, SdoError};
+use crate::mailbox::{CoeClient, SdoError};
 use crate::rt::image::{self, ImagePlan};
 use crate::rt::phase::ClockPlan;
 use crate::text::pluralize;
@@ -170,8 +169,6 @@ fn few(names: &[String]) -> String {
 /// Why the bring-up failed.
 #[derive(Debug, thiserror::Error)]
 pub enum BringUpError {
-    #[error("no SubDevice answers")]
-    NoAnswer,
     #[error("{step}: {message}")]
     Scan { step: &'static str, message: String },
     #[error(
@@ -246,25 +243,11 @@ pub enum BringUpError {
         device: DeviceRef,
         problems: Vec<UnitProblem>,
     },
-    #[error("{device}: asking the drive for its units: {source}")]
-    ReadUnits { device: DeviceRef, source: SdoError },
-    #[error("{device}: asking the drive for its limits: {source}")]
-    ReadLimits { device: DeviceRef, source: SdoError },
-    #[error("{device}: emptying the mailbox: {source}")]
-    Mailbox { device: DeviceRef, source: SdoError },
-    #[error("{device}: reading the PDO mapping back: {source}")]
-    ReadBack { device: DeviceRef, source: SdoError },
     #[error("{device}: {step}: {source}")]
-    Wire {
+    Sdo {
         device: DeviceRef,
         step: &'static str,
-        source: DatagramError,
-    },
-    #[error("{device}: {step}: register 0x{register:04x} did not take the write")]
-    NotTaken {
-        device: DeviceRef,
-        step: &'static str,
-        register: u16,
+        source: SdoError,
     },
     #[error("{device}: {what}: register 0x{register:04x} holds {found}, wanted is {wanted}")]
     Watchdog {
@@ -286,8 +269,15 @@ pub enum BringUpError {
         expected: String,
         actual: String,
     },
+    /// Lost frames, registers without an answer, refused states.
     #[error(transparent)]
-    State(#[from] StateError),
+    Service(#[from] ServiceError),
+}
+
+impl From<StateError> for BringUpError {
+    fn from(error: StateError) -> Self {
+        Self::Service(error.into())
+    }
 }
 
 fn list(problems: &[UnitProblem]) -> String {
@@ -311,7 +301,7 @@ pub async fn bring_up(
             step: "scanning",
             message: source.to_string(),
         },
-        _ => BringUpError::NoAnswer,
+        error => error.into(),
     })?;
 
     let group = match main_device

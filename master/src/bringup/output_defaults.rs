@@ -42,8 +42,9 @@ pub(super) async fn read(
         };
         let (index, sub) = (field.index, field.sub);
         let data = coe.upload_optional(wire, index, sub, false).await;
-        let data = data.map_err(|source| BringUpError::ReadBack {
+        let data = data.map_err(|source| BringUpError::Sdo {
             device: device.at.clone(),
+            step: "reading the PDO mapping back",
             source,
         })?;
         // If an object cannot be read over CoE, the ESI's value is used.

@@ -3,6 +3,7 @@
 //! nothing stops the drive if this host fails.
 
 use super::{BringUpError, BusDevice, Step};
+use crate::acyclic::ServiceError;
 use crate::config::{Bus, DeviceConfig};
 use crate::mailbox::{DatagramError, MailboxTransport};
 use ecaxis_ecat::registers;
@@ -104,9 +105,10 @@ async fn read<const N: usize>(
 }
 
 fn lost(device: &BusDevice, source: DatagramError) -> BringUpError {
-    BringUpError::Wire {
+    let lost = ServiceError::Wire {
         device: device.at.clone(),
         step: STEP,
         source,
-    }
+    };
+    lost.into()
 }

@@ -2,7 +2,7 @@
 
 use super::diagnose::{SYNC_CODES, WATCHDOG};
 use super::evidence::{Evidence, Lateness};
-use crate::acyclic::{AlState, StateError};
+use crate::acyclic::{AlState, ServiceError, StateError};
 use crate::bringup::BringUpError;
 use crate::mailbox::SdoError;
 use crate::report::RunError;
@@ -42,22 +42,21 @@ impl Class {
             RunError::LeftOp { state, code, .. } => Self::of_state(*state, *code, evidence),
             RunError::State(error) => Self::of_change(error, evidence),
             RunError::BringUp(error) => match error.as_ref() {
-                BringUpError::NoAnswer
+                BringUpError::Service(ServiceError::State(error)) => {
+                    Self::of_change(error, evidence)
+                }
+                BringUpError::Service(_)
                 | BringUpError::Scan { .. }
-                | BringUpError::Missing { .. }
-                | BringUpError::Wire { .. }
-                | BringUpError::NotTaken { .. } => Self::Bus,
-                BringUpError::State(error) => Self::of_change(error, evidence),
+                | BringUpError::Missing { .. } => Self::Bus,
                 BringUpError::NoStart { .. } => Self::Timing,
-                BringUpError::StartUp { source, .. }
-                | BringUpError::Mailbox { source, .. }
-                | BringUpError::ReadBack { source, .. }
-                | BringUpError::ReadUnits { source, .. } => match source {
-                    SdoError::Gone { .. } | SdoError::Wire { .. } => Self::Bus,
-                    // A device that another MainDevice sets to Init loses its mailbox.
-                    SdoError::Timeout { .. } if evidence.other_frames() > 0 => Self::Bus,
-                    _ => Self::Device,
-                },
+                BringUpError::StartUp { source, .. } | BringUpError::Sdo { source, .. } => {
+                    match source {
+                        SdoError::Gone { .. } | SdoError::Wire { .. } => Self::Bus,
+                        // A device that another MainDevice sets to Init loses its mailbox.
+                        SdoError::Timeout { .. } if evidence.other_frames() > 0 => Self::Bus,
+                        _ => Self::Device,
+                    }
+                }
                 _ => Self::Device,
             },
             RunError::FollowLost { reason, .. }

@@ -11,7 +11,7 @@ use super::cause::{Cause, Diagnosis};
 use super::class::Class;
 use super::evidence::{DeviceEvidence, Evidence, Lateness, place};
 use super::snapshot::SyncSnapshot;
-use crate::acyclic::{AlState, DeviceRef, StateError};
+use crate::acyclic::{AlState, DeviceRef, ServiceError, StateError};
 use crate::bringup::BringUpError;
 use crate::mailbox::SdoError;
 use crate::report::RunError;
@@ -458,26 +458,13 @@ fn bring_up(error: &BringUpError, evidence: &Evidence) -> Option<Cause> {
             device: place(device),
             doing: format!("start-up SDO {} {name}", address(*index, *sub)),
         }),
-        BringUpError::Mailbox {
+        BringUpError::Sdo {
             device,
+            step,
             source: SdoError::Timeout { .. },
         } => Some(Cause::Mailbox {
             device: place(device),
-            doing: "emptying it".to_owned(),
-        }),
-        BringUpError::ReadBack {
-            device,
-            source: SdoError::Timeout { .. },
-        } => Some(Cause::Mailbox {
-            device: place(device),
-            doing: "reading the PDO mapping back".to_owned(),
-        }),
-        BringUpError::ReadUnits {
-            device,
-            source: SdoError::Timeout { .. },
-        } => Some(Cause::Mailbox {
-            device: place(device),
-            doing: "asking for its units".to_owned(),
+            doing: (*step).to_owned(),
         }),
         BringUpError::Identity {
             device,
@@ -492,9 +479,9 @@ fn bring_up(error: &BringUpError, evidence: &Evidence) -> Option<Cause> {
                 .file_name()
                 .map_or_else(|| esi.clone(), |name| name.to_string_lossy().into_owned()),
         }),
-        BringUpError::State(StateError::Refused { device, code, .. }) => {
-            sync(device, *code, true, evidence)
-        }
+        BringUpError::Service(ServiceError::State(StateError::Refused {
+            device, code, ..
+        })) => sync(device, *code, true, evidence),
         _ => None,
     }
 }

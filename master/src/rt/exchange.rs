@@ -364,7 +364,8 @@ impl Exchange {
             return;
         };
         let form = usize::from(self.form_of[usize::from(low)]);
-        let (Some(places), Some(frame_set)) = (self.forms.get(form), self.frame_sets.first()) else {
+        let (Some(places), Some(frame_set)) = (self.forms.get(form), self.frame_sets.first())
+        else {
             return;
         };
         let age = self.cycle.wrapping_sub(u32::from(low)) & 0xff;
@@ -403,7 +404,9 @@ impl Exchange {
     /// True if every frame that is evaluated in this cycle has come back.
     #[must_use]
     pub fn complete(&self) -> bool {
-        self.frame_sets.get(self.due()).is_some_and(FrameSet::complete)
+        self.frame_sets
+            .get(self.due())
+            .is_some_and(FrameSet::complete)
     }
 
     /// Evaluates the due answers per device, per group and in total, and copies their inputs. RT:
