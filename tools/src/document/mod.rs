@@ -4,7 +4,7 @@
 //!
 //! - `text`: aligned columns, wrapped to a width; without charts;
 //! - `html`: one self-contained XHTML file; `chart`: its charts as SVG;
-//! - [`format`]: figures, times and options as text.
+//! - [`mod@format`]: figures, times and options as text.
 
 mod chart;
 pub mod format;

@@ -1,7 +1,6 @@
 //! Parameters of a device: found by name or number, saved to files, compared and restored. MAY
 //! BLOCK AND ALLOCATE.
 //!
-//! - [`data_type`], [`value`]: data types, and values as text;
 //! - [`lookup`]: finds an object by number or name;
 //! - [`dictionary`]: the dictionary from the device (SDO Information), in the form of ESI
 //!   dictionaries;
