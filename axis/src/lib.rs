@@ -10,7 +10,7 @@
 //! | [`units`] | newtypes for drive-side and user-side quantities |
 //! | [`scale`] | counts ↔ user units, drive units (0x60A9, 0x60AA), polarity, modulo, torque |
 //! | [`cia402`] | Statusword, Controlword, power state machine, modes, error codes |
-//! | [`supervision`] | further supervision, reaction to a trip, brake, fault reset |
+//! | [`supervision`] | limits that trip the axis, reaction to a trip, brake, fault reset |
 //! | [`homing`] | homing by the drive: methods and parameters |
 //! | [`setpoint`] | hold, moves, ramps, streams, tables, gears; advanced once per cycle |
 //! | [`group`] | several axes: straight lines, synchronous arrival |

@@ -1,9 +1,9 @@
 //! Manual operation of a machine: the dead-man rule, speeds, stops and resets, in virtual time.
 //! Also `ecaxis jog` with lines and in a terminal.
 
-mod hands;
-mod instead;
 mod lines;
+mod operator;
+mod replaced_requests;
 mod terminal;
 
 use ecaxis_axis::{Mode, State, Trip};
@@ -12,7 +12,7 @@ use ecaxis_master::supervise::jog::{
     View,
 };
 use ecaxis_test_support::{axes, faults, machine, virtual_time};
-use hands::{Seen, by_hand, here, request};
+use operator::{Seen, by_hand, here, request};
 
 /// Limits of the machines of `axes`, in turns/s and turns/s².
 const VELOCITY: f64 = 50.0;
@@ -34,7 +34,7 @@ fn once_enabled(
             };
         }
         let since = now - *ready.get_or_insert(now);
-        then(view, since).unwrap_or_else(hands::gone)
+        then(view, since).unwrap_or_else(operator::gone)
     }
 }
 
@@ -300,7 +300,7 @@ fn a_fault_stops_all_axes_and_is_reset() {
                 return request(Request::Reset { axis: 1 });
             }
             if now > 6.0 {
-                return hands::gone();
+                return operator::gone();
             }
             let mut turn = here();
             if idle && !ready && (!reset || status[1].fault.is_none()) {
@@ -492,7 +492,7 @@ fn random_requests_stay_within_the_limits() {
         let mut away = false;
         let (outcome, seen) = by_hand(machine(&axes(2)), virtual_time(), move |view, now| {
             if now > 8.0 {
-                return hands::gone();
+                return operator::gone();
             }
             for (axis, hand) in view.hands.iter().enumerate() {
                 let jogs = matches!(hand.doing, Activity::Jogging { .. });

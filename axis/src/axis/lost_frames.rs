@@ -1,7 +1,7 @@
 //! The set-point while frames are lost or late.
 //!
-//! A lost frame takes its targets with it. The next frame that arrives makes up for all lost
-//! targets in one step. So an axis plans only [`RIDE_THROUGH_CYCLES`] cycles without an answer;
+//! A lost frame loses its targets. The next frame that arrives carries the sum of all lost steps,
+//! which the drive executes at once. To bound this jump, an axis plans only [`RIDE_THROUGH_CYCLES`] cycles without an answer;
 //! then its set-point waits, like a drive at its last target. When an answer arrives, the set-point
 //! continues from what the drive has done meanwhile. In CSP the drive stands at its last target; in
 //! every other mode it has moved on.

@@ -180,10 +180,10 @@ pub enum Spin {
 /// How frames are received from a network interface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum SocketKind {
-    /// From mapped memory: `ring::RingLink`.
+    /// From a ring in memory that the kernel shares.
     #[default]
     Ring,
-    /// By system calls: `packet::PacketLink`.
+    /// By one system call per frame.
     Packet,
 }
 

@@ -1,6 +1,6 @@
 //! Everything outside the cycle while the machine runs: the way to Op and back, enabling, the steps
 //! of the program, and the error after a stop. MAY BLOCK AND ALLOCATE; communicates with the cycle
-//! only through `rt::handover`.
+//! only through `rt::channel`.
 
 use std::collections::VecDeque;
 use std::future::poll_fn;

@@ -61,7 +61,7 @@
 //! ```
 
 mod frames;
-mod inject;
+mod keys;
 mod script;
 #[cfg(test)]
 mod tests;

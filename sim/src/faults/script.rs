@@ -3,7 +3,7 @@
 use serde::Deserialize;
 use toml::Spanned;
 
-use super::inject;
+use super::keys;
 use crate::Nanos;
 use crate::drive::State;
 use crate::esc::al::AlState;
@@ -248,7 +248,7 @@ impl FaultScript {
             let line = text.bytes().take(at).filter(|b| *b == b'\n').count() + 1;
             let kind = fault.kind.get_ref().clone();
             let number = u32::try_from(line).unwrap_or(u32::MAX);
-            inject::check(&fault, number).map_err(|problem| ScriptError::Fault {
+            keys::check(&fault, number).map_err(|problem| ScriptError::Fault {
                 line,
                 kind,
                 problem,

@@ -1,6 +1,6 @@
 //! Tests of valid scripts and of the errors of invalid ones.
 
-use super::inject::al_state;
+use super::keys::al_state;
 use super::script::*;
 use crate::drive::State;
 use crate::esc::al::AlState;

@@ -438,5 +438,4 @@ impl TerminalSide<'_> {
 }
 
 #[cfg(test)]
-#[path = "hands_tests.rs"]
 mod tests;

@@ -4,7 +4,7 @@
 use ecaxis_axis::Mode;
 use ecaxis_master::supervise::jog::{Activity, JogEvent, OperatorInput, Presence, Request, View};
 
-use super::hands::{Seen, by_hand, gone, here, request};
+use super::operator::{Seen, by_hand, gone, here, request};
 use super::{LET_GO_S, VERSATILE, once_enabled, within_limits};
 use ecaxis_test_support::{axes, machine, virtual_time};
 
