@@ -8,5 +8,7 @@ pub mod al_status_code;
 pub mod data_type;
 pub mod datagram;
 pub mod mailbox;
+pub mod object;
+mod object_names;
 pub mod registers;
 pub mod value;

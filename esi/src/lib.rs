@@ -14,7 +14,6 @@
 #![deny(missing_docs)]
 #![forbid(unsafe_code)]
 
-mod address;
 mod error;
 pub mod layout;
 pub mod lint;
@@ -25,7 +24,7 @@ pub mod sii;
 pub mod startup;
 mod xml;
 
-pub use address::{Address, address};
+pub use ecaxis_ecat::object::{Address, address};
 pub use error::{EsiError, EsiProblem};
 pub use layout::{Field, Layout, SmLayout};
 pub use lint::{Finding, Severity, lint};

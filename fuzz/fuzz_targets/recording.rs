@@ -2,10 +2,10 @@
 #![no_main]
 
 use ecaxis_master::recording::Reader;
-use ecaxis_tools::analyze::{Context, analyze, html};
+use ecaxis_tools::analyze::{Context, analyze, document};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|file: &[u8]| {
     let report = analyze(vec![Reader::new(file)], None, Context::default());
-    assert!(html("x", &report).ends_with("</html>\n"));
+    assert!(document("x", &report, &[], true).html().ends_with("</html>\n"));
 });

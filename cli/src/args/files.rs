@@ -6,6 +6,7 @@ use std::io::{self, ErrorKind, Write};
 use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt, chown};
 use std::path::{Path, PathBuf};
 
+use ecaxis_master::config::Machine;
 use tempfile::NamedTempFile;
 
 use crate::hints;
@@ -55,19 +56,45 @@ fn folder(path: &Path) -> &Path {
     }
 }
 
-/// Fails if `target`, given with `option`, cannot be written, is one of the `inputs` (each with its
-/// description), or has a content and `force` is false.
-pub(crate) fn check_output<'p>(
+/// The files that a command reads, each with its description. No output replaces one of them.
+#[derive(Debug, Default)]
+pub(crate) struct Inputs(Vec<(PathBuf, &'static str)>);
+
+impl Inputs {
+    /// Returns the machine file, and the ESI files and set-point tables that it names.
+    pub fn from_machine(machine: &Machine) -> Self {
+        let esi = machine.devices.iter().map(|device| &device.esi_path);
+        let tables = machine.tables.iter().map(|table| &table.path);
+        Self::default()
+            .with("the machine file", [&machine.path])
+            .with("an ESI file of this machine", esi)
+            .with("a set-point table of this machine", tables)
+    }
+
+    pub fn with<P: Into<PathBuf>>(
+        mut self,
+        what: &'static str,
+        files: impl IntoIterator<Item = P>,
+    ) -> Self {
+        self.0
+            .extend(files.into_iter().map(|file| (file.into(), what)));
+        self
+    }
+}
+
+/// Fails if `target`, given with `option`, cannot be written, is one of the inputs, or has a content
+/// and `force` is false.
+pub(crate) fn check_output(
     option: &str,
     target: &Path,
     force: bool,
-    inputs: impl IntoIterator<Item = (&'p Path, &'p str)>,
+    inputs: &Inputs,
 ) -> Result<(), Failure> {
     let shown = target.display();
     let refuse = |what: String, hint: &str| {
         Err(Failure::new(hints::WRONG, format!("{option}: {what}")).hint(hint))
     };
-    for (input, what) in inputs {
+    for (input, what) in &inputs.0 {
         if same_file(input, target) {
             return refuse(format!("{shown} is {what}"), "name another file");
         }
@@ -106,7 +133,10 @@ fn same_file(a: &Path, b: &Path) -> bool {
 /// Replaces the text of a file atomically, or creates the file. Symlinks, owner and permissions are
 /// kept.
 pub(crate) fn replace(path: &Path, text: &str) -> Result<(), Failure> {
-    let target = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+    let target = fs::canonicalize(path)
+        // A symlink to a file that does not exist yet.
+        .or_else(|_| fs::read_link(path).map(|to| folder(path).join(to)))
+        .unwrap_or_else(|_| path.to_owned());
     let replaced =
         sibling(&target, text.as_bytes()).and_then(|new| new.persist(&target).map_err(|e| e.error));
     replaced.map_err(|e| unwritable(path, &e))?;
@@ -200,16 +230,16 @@ mod tests {
         };
         let (full, empty) = (file("full", "dear diary"), file("empty", ""));
         let new = folder.path().join("new");
-        let inputs = [(folder.path().join("full"), "what is read")];
-        let inputs = || inputs.iter().map(|(path, what)| (path.as_path(), *what));
+        let none = Inputs::default();
+        let inputs = Inputs::default().with("what is read", [folder.path().join("full")]);
         for force in [false, true] {
-            assert_eq!(check_output("--x", &full, force, []).is_ok(), force);
+            assert_eq!(check_output("--x", &full, force, &none).is_ok(), force);
             for free in [&empty, &new, Path::new("/dev/null")] {
-                assert_eq!(check_output("--x", free, force, []), Ok(()), "{free:?}");
+                assert_eq!(check_output("--x", free, force, &none), Ok(()), "{free:?}");
             }
-            let failure = check_output("--x", &full, force, inputs()).unwrap_err();
+            let failure = check_output("--x", &full, force, &inputs).unwrap_err();
             assert!(failure.message.ends_with("is what is read"), "{failure:?}");
-            let failure = check_output("--x", folder.path(), force, []).unwrap_err();
+            let failure = check_output("--x", folder.path(), force, &none).unwrap_err();
             assert!(failure.message.ends_with("is a folder"), "{failure:?}");
         }
         assert!(!new.exists());

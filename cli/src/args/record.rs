@@ -2,47 +2,16 @@
 
 use std::path::Path;
 
-use ecaxis_master::config::Machine;
 use ecaxis_master::link::capture;
 
-use crate::args::files::check_output;
+use crate::args::files::{Inputs, check_output};
 use crate::hints::Failure;
 
-/// Fails if a run must not write its frames to `target`.
-pub(crate) fn check(
-    target: &Path,
-    force: bool,
-    machine: &Machine,
-    faults: Option<&Path>,
-) -> Result<(), Failure> {
-    check_distinct(target, force, Some(machine), faults, None)
-}
-
-/// Fails if frames must not be written to `target`. `input` is a file that is read, with its
-/// description.
-pub(crate) fn check_distinct(
-    target: &Path,
-    force: bool,
-    machine: Option<&Machine>,
-    faults: Option<&Path>,
-    input: Option<(&Path, &str)>,
-) -> Result<(), Failure> {
-    let files = machine.into_iter().flat_map(|machine| {
-        let esi = machine.devices.iter().map(|d| d.esi_path.as_path());
-        let esi = esi.map(|path| (path, "an ESI file of this machine"));
-        std::iter::once((machine.path.as_path(), "the machine file")).chain(esi)
-    });
-    let inputs = files
-        .chain(faults.map(|path| (path, "the fault script")))
-        .chain(input);
-    check_output("--record", target, force, inputs)
-}
-
 /// Fails if the parts of a limited recording would overwrite another file.
-pub(crate) fn check_parts(target: &Path, force: bool) -> Result<(), Failure> {
+pub(crate) fn check_parts(target: &Path, force: bool, inputs: &Inputs) -> Result<(), Failure> {
     let parts = capture::parts_of(target).unwrap_or_default();
     let mut parts = parts.iter();
-    parts.try_for_each(|part| check_output("--record-limit", part, force, []))
+    parts.try_for_each(|part| check_output("--record-limit", part, force, inputs))
 }
 
 /// The minimum size: the first of four parts should hold the bring-up of a long bus.
@@ -88,17 +57,18 @@ mod tests {
         std::fs::write(&faults, "").unwrap();
         let link = folder.path().join("link");
         std::os::unix::fs::symlink(&machine.path, &link).unwrap();
+        let inputs = Inputs::from_machine(&machine).with("the fault script", [&faults]);
         for (bad, what) in [
             (configs.join("demo.toml"), "the machine file"),
             (link, "the machine file"),
             (configs.join("esi/EPOS4.xml"), "an ESI file"),
             (faults.clone(), "the fault script"),
         ] {
-            let failure = check(&bad, true, &machine, Some(&faults)).unwrap_err();
+            let failure = check_output("--record", &bad, true, &inputs).unwrap_err();
             assert!(failure.message.contains(what), "{failure:?}");
         }
         let new = folder.path().join("new.pcapng");
-        assert_eq!(check(&new, false, &machine, Some(&faults)), Ok(()));
+        assert_eq!(check_output("--record", &new, false, &inputs), Ok(()));
     }
 
     #[test]
@@ -130,10 +100,10 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.pcapng");
         std::fs::write(folder.path().join("run.notes.pcapng"), "no part").unwrap();
-        assert_eq!(check_parts(&path, false), Ok(()));
+        assert_eq!(check_parts(&path, false, &Inputs::default()), Ok(()));
         std::fs::write(folder.path().join("run.0002.pcapng"), "part").unwrap();
-        let failure = check_parts(&path, false).unwrap_err();
+        let failure = check_parts(&path, false, &Inputs::default()).unwrap_err();
         assert!(failure.message.contains("run.0002.pcapng"), "{failure:?}");
-        assert_eq!(check_parts(&path, true), Ok(()));
+        assert_eq!(check_parts(&path, true, &Inputs::default()), Ok(()));
     }
 }

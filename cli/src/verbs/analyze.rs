@@ -6,7 +6,7 @@ use ecaxis_master::text::pluralize;
 use ecaxis_master::{config, recording};
 use ecaxis_tools::analyze::{self as analysis, Context, DeviceReport, Report, called};
 
-use crate::args::files::{check_output, unwritable};
+use crate::args::files::{Inputs, check_output, unwritable};
 use crate::hints::{self, Failure};
 use crate::render::{note, print_json, print_page};
 
@@ -55,12 +55,11 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if let Some(path) = &args.html {
-        let recordings = args.files.iter().map(|file| (file, "a recording to read"));
-        let machine = args.machine.iter().map(|file| (file, "the machine file"));
-        let esi = args.esi.iter().map(|file| (file, "the ESI file"));
-        let inputs = recordings.chain(machine).chain(esi);
-        let inputs = inputs.map(|(file, what)| (file.as_path(), what));
-        check_output("--html", path, args.force, inputs)?;
+        let inputs = Inputs::default()
+            .with("a recording to read", &args.files)
+            .with("the machine file", &args.machine)
+            .with("the ESI file", &args.esi);
+        check_output("--html", path, args.force, &inputs)?;
     }
     let (known, expected) = known(args)?;
     let mut parts = Vec::new();
@@ -89,7 +88,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     let advice = advice(&report);
     if let Some(path) = &args.html {
-        let page = analysis::document(&name, &report, &advice, false).html();
+        let page = analysis::document(&name, &report, &advice, true).html();
         std::fs::write(path, page).map_err(|e| unwritable(path, &e))?;
         note(&format!("written: {}", path.display()));
     }

@@ -16,7 +16,7 @@ use ecaxis_tools::bench::plan::{Baseline, Plan, Target, exchange_name};
 use ecaxis_tools::bench::run::{self, BenchError, BenchObserver};
 use ecaxis_tools::bench::{document, fixture, host, veth};
 
-use crate::args::files::{check_output, unwritable};
+use crate::args::files::{Inputs, check_output, unwritable};
 use crate::args::signals;
 use crate::hints::{self, Failure};
 use crate::render::progress::ProgressPrinter;
@@ -193,10 +193,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::new(hints::WRONG, message));
     }
     for (option, path) in [("--html", &args.html), ("--save", &args.save)] {
-        let machine = args.machine.iter();
-        let inputs = machine.map(|file| (file.as_path(), "the machine file"));
+        let inputs = Inputs::default().with("the machine file", &args.machine);
         if let Some(path) = path {
-            check_output(option, path, args.force, inputs)?;
+            check_output(option, path, args.force, &inputs)?;
         }
     }
     if args.html.is_some() && args.html == args.save {

@@ -11,7 +11,7 @@ use ecaxis_master::session::{self, Options, Outcome, Summary};
 use ecaxis_sim::FaultScript;
 use serde_json::{Value, json};
 
-use crate::args::files::check_output;
+use crate::args::files::{Inputs, check_output};
 use crate::args::record;
 use crate::args::signals;
 use crate::hints::{self, Failure};
@@ -255,10 +255,13 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
     }
     let script = args.faults.as_deref();
     let faults = script.map(|path| faults(path, machine)).transpose()?;
+    let inputs = Inputs::from_machine(machine)
+        .with("the fault script", script)
+        .with("the recording to replay", &args.replay);
     if let Some(path) = &args.record {
-        record::check(path, args.force, machine, script)?;
+        check_output("--record", path, args.force, &inputs)?;
         if args.record_limit.is_some() {
-            record::check_parts(path, args.force)?;
+            record::check_parts(path, args.force, &inputs)?;
         }
     }
     if let Some(path) = &args.fault_report {
@@ -273,7 +276,7 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
             ));
         }
         for path in [path, &data] {
-            check_output("--fault-report", path, args.force, [])?;
+            check_output("--fault-report", path, args.force, &inputs)?;
         }
     }
     let seed = args.seed.or(faults.as_ref().and_then(|f| f.seed));

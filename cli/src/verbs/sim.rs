@@ -16,7 +16,7 @@ use serde_json::{Value, json};
 
 use ecaxis_master::text::pluralize;
 
-use crate::args::files::{check_output, unwritable, write_new};
+use crate::args::files::{Inputs, check_output, unwritable, write_new};
 use crate::args::signals;
 use crate::args::trace::Trace;
 use crate::hints::{self, Failure};
@@ -129,8 +129,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         write_images(&segment, folder)?;
     }
     let trace = args.trace.as_deref();
+    let inputs = Inputs::from_machine(&machine).with("the fault script", &args.faults);
     let mut trace = trace
-        .map(|path| create_trace(path, args.force))
+        .map(|path| create_trace(path, args.force, &inputs))
         .transpose()?;
     if on_signal.is_some() {
         let pid = std::process::id();
@@ -169,8 +170,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     })
 }
 
-fn create_trace(path: &Path, force: bool) -> Result<Trace, Failure> {
-    check_output("--trace", path, force, [])?;
+fn create_trace(path: &Path, force: bool, inputs: &Inputs) -> Result<Trace, Failure> {
+    check_output("--trace", path, force, inputs)?;
     let file = std::fs::File::create(path).and_then(Trace::new);
     file.map_err(|error| unwritable(path, &error))
 }

@@ -29,13 +29,19 @@ pub(super) async fn explain_scan(
     };
     let (mut behind, mut unaddressed) = (None, None);
     for position in 0..count {
-        let Ok(found) = read_device(wire, position).await else {
-            continue;
-        };
         let device = DeviceRef {
             name: name_at(machine, position),
             position,
             station: FIRST_STATION.saturating_add(position),
+        };
+        let found = match read_device(wire, position).await {
+            Ok(found) => found,
+            // It was counted, but no longer answers.
+            Err(ServiceError::Silent { .. }) => {
+                unaddressed.get_or_insert(device);
+                continue;
+            }
+            Err(_) => continue,
         };
         let EnumeratedDevice { state, code, .. } = found;
         // The device has lost the station address that ethercrab assigned.

@@ -44,7 +44,7 @@ pub(super) async fn read(
         let data = coe.upload_optional(wire, index, sub, false).await;
         let data = data.map_err(|source| BringUpError::Sdo {
             device: device.at.clone(),
-            step: "reading the PDO mapping back",
+            step: "reading the values of its outputs",
             source,
         })?;
         // If an object cannot be read over CoE, the ESI's value is used.

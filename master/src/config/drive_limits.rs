@@ -11,7 +11,7 @@ use super::problem::Problems;
 use super::raw::RawSdo;
 use super::units::rounded;
 use super::{AxisSetup, UnitSource};
-use crate::mailbox::NamedObject;
+use ecaxis_ecat::object::NamedObject;
 
 const POSITION_RANGE: u16 = 0x607b;
 const SOFTWARE_LIMIT: u16 = 0x607d;

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use ecaxis_ecat::mailbox::{abort_text, mailbox_error_text};
 
-use super::object_names::NamedObject;
 use super::{DatagramError, MAX_OBJECT};
+use ecaxis_ecat::object::NamedObject;
 
 /// An SDO error. `station` is the SubDevice's configured address. The transfer has ended in every
 /// case, and the next one starts clean.

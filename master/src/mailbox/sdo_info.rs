@@ -8,9 +8,9 @@ use ecaxis_ecat::mailbox::coe::{Answer, Fragment, Message, Request};
 use ecaxis_ecat::mailbox::{abort_text, mailbox_error_text};
 
 use super::error::{LostDatagram, Phase};
-use super::object_names::NamedObject;
 use super::transport::{Deadline, TransportError};
 use super::{CoeClient, DatagramError, MailboxLayout, MailboxTransport};
+use ecaxis_ecat::object::NamedObject;
 
 const LIST: u8 = 1;
 const OBJECT: u8 = 3;

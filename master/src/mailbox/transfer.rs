@@ -4,8 +4,8 @@ use super::MailboxLayout;
 use ecaxis_ecat::mailbox::coe::Answer;
 
 use super::error::{Phase, SdoError, Subject};
-use super::object_names::NamedObject;
 use super::transport::{Deadline, Port, TransportError};
+use ecaxis_ecat::object::NamedObject;
 
 #[derive(Debug)]
 pub(super) struct Transfer {

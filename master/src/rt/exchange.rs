@@ -109,13 +109,13 @@ impl Exchange {
         }
         let mut forms = Vec::new();
         let mut frame_sets = Vec::new();
-        for frame_set in 0..mode.frame_sets() {
+        for number in 0..mode.frame_sets() {
             let mut frames = Vec::new();
             for datagrams in &datagrams {
                 let mut form = new_frames(frames_of(datagrams));
                 let places = DatagramSlots::fill(&mut form, plan, datagrams, &order, clock);
                 frames.push(form);
-                if frame_set == 0 {
+                if number == 0 {
                     forms.push(places);
                 }
             }
@@ -518,7 +518,7 @@ impl Exchange {
         answer.system_time = self.system_time(first, places.clock);
         if let Some(time) = answer.system_time {
             self.bus_status.set_clock(frame_set.sent_at, time);
-            // The time of the frame set that is staged next; those in frame_set lie between.
+            // The time of the frame set that is staged next; those in flight lie between.
             let ahead = self.cycle_ns.saturating_mul(self.frame_sets.len() as u64);
             self.expected_time = time.wrapping_add(ahead);
         }

@@ -12,7 +12,7 @@ use ecaxis_master::config::Nic;
 use ecaxis_master::session::Options;
 
 use crate::args::device::{DeviceArgs, Target};
-use crate::args::record;
+use crate::args::files::{Inputs, check_output};
 use crate::hints::{Failure, WRONG};
 use crate::verbs::run;
 
@@ -72,7 +72,7 @@ struct TargetArgs {
 impl TargetArgs {
     /// Sets clock, faults and recording of the target's bus. `input`: a file that is read, with its
     /// description.
-    fn set_up(&self, target: Target, input: Option<(&Path, &str)>) -> Result<Target, Failure> {
+    fn set_up(&self, target: Target, input: Option<&Path>) -> Result<Target, Failure> {
         let machine = target.machine.as_deref();
         let is_sim = target.bus.nic() == Nic::Sim;
         if !is_sim && (self.virtual_time || self.faults.is_some()) {
@@ -85,7 +85,10 @@ impl TargetArgs {
             _ => None,
         };
         if let Some(path) = &self.record {
-            record::check_distinct(path, self.force, machine, self.faults.as_deref(), input)?;
+            let inputs = machine.map(Inputs::from_machine).unwrap_or_default();
+            let inputs = inputs.with("the fault script", &self.faults);
+            let inputs = inputs.with("the firmware file", input);
+            check_output("--record", path, self.force, &inputs)?;
         }
         let mut options = Options {
             clock: match self.virtual_time {

@@ -120,10 +120,9 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
         return Err(wrong("which file? One firmware file after the device"));
     };
     let path = PathBuf::from(path);
-    let input = (path.as_path(), "the firmware file");
     let Target {
         bus, at, config, ..
-    } = args.at.set_up(target, Some(input))?;
+    } = args.at.set_up(target, Some(&path))?;
     let identity = config.as_ref().map(|config| config.device.identity);
     let expected = Expected {
         vendor: args.expect_vendor.or(identity.map(|i| i.vendor)),

@@ -27,7 +27,7 @@ use ecaxis_master::supervise::jog::{
     HOLD_TO_RUN_TIMEOUT, Operator, OperatorInput, Presence, Request, View,
 };
 
-use crate::args::record;
+use crate::args::files::{Inputs, check_output};
 use crate::args::signals;
 use crate::hints;
 use crate::hints::Failure;
@@ -157,7 +157,8 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
     let script = args.faults.as_deref();
     let faults = script.map(|path| run::faults(path, machine)).transpose()?;
     if let Some(path) = &args.record {
-        record::check(path, args.force, machine, script)?;
+        let inputs = Inputs::from_machine(machine).with("the fault script", script);
+        check_output("--record", path, args.force, &inputs)?;
     }
     let defaults = Options::default();
     Ok(Options {

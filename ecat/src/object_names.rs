@@ -1,37 +1,8 @@
 //! Names of objects in messages, for devices without an ESI.
 
-use std::fmt;
-
-use ecaxis_esi::{Address, address};
-
-/// index:subindex; displayed with its name if it is known here.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct NamedObject {
-    pub index: u16,
-    pub sub: u8,
-}
-
-impl NamedObject {
-    /// Returns the address without the name.
-    #[must_use]
-    pub fn number(self) -> Address {
-        address(self.index, self.sub)
-    }
-}
-
-impl fmt::Display for NamedObject {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}", self.number())?;
-        match object_name(self.index, self.sub) {
-            Some(name) => write!(f, " ({name})"),
-            None => Ok(()),
-        }
-    }
-}
-
 /// Returns the name of an object of CiA 301, CiA 402, ETG.1000.6 or ETG.5001 that bring-up and
 /// drives use.
-pub fn object_name(index: u16, sub: u8) -> Option<&'static str> {
+pub(crate) fn name(index: u16, sub: u8) -> Option<&'static str> {
     Some(match (index, sub) {
         (0x1000, 0) => "Device type",
         (0x1001, 0) => "Error register",

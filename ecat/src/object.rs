@@ -1,6 +1,16 @@
-//! Index and subindex of an object, with their text form.
+//! Objects of the object dictionary: addresses and names.
+//!
+//! ```
+//! use ecaxis_ecat::object::{NamedObject, address};
+//!
+//! assert_eq!(address(0x60c2, 1).to_string(), "0x60c2:01");
+//! let object = NamedObject { index: 0x6041, sub: 0 };
+//! assert_eq!(object.to_string(), "0x6041:00 (Statusword)");
+//! ```
 
-use std::fmt;
+use core::fmt;
+
+use crate::object_names::name;
 
 /// Index and subindex of an object, shown as `0x60c2:01`. Both are hexadecimal: `0x1600:10` is the
 /// sixteenth entry.
@@ -35,6 +45,39 @@ impl Address {
             (1..=2).contains(&digits.len()) && digits.chars().all(|c| c.is_ascii_hexdigit());
         whole.then(|| u8::from_str_radix(digits, 16).ok()).flatten()
     }
+}
+
+/// index:subindex; displayed with its name if it is known here.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct NamedObject {
+    /// The index.
+    pub index: u16,
+    /// The subindex.
+    pub sub: u8,
+}
+
+impl NamedObject {
+    /// Returns the address without the name.
+    #[must_use]
+    pub fn number(self) -> Address {
+        address(self.index, self.sub)
+    }
+}
+
+impl fmt::Display for NamedObject {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.number())?;
+        match object_name(self.index, self.sub) {
+            Some(name) => write!(f, " ({name})"),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Returns the name of a known object: of the communication area, of CiA 402 and of modular devices.
+#[must_use]
+pub fn object_name(index: u16, sub: u8) -> Option<&'static str> {
+    name(index, sub)
 }
 
 #[cfg(test)]
