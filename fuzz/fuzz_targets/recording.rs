@@ -7,5 +7,9 @@ use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|file: &[u8]| {
     let report = analyze(vec![Reader::new(file)], None, Context::default());
-    assert!(document("x", &report, &[], true).html().ends_with("</html>\n"));
+    assert!(
+        document("x", &report, &[], true)
+            .html()
+            .ends_with("</html>\n")
+    );
 });

@@ -283,7 +283,9 @@ fn not_homed(error: HomingError) -> &'static str {
 fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
     let hint = match error {
         BringUpError::Service(error) => {
-            let hints = service(error, nic).hints;
+            let mut hints = service(error, nic).hints;
+            let lost = hints.iter().any(|hint| hint == service::FRAMES);
+            hints.extend(lost.then(|| "record the bring-up with `--record`".to_owned()));
             return Failure { hints, ..failure };
         }
         BringUpError::Missing { .. } => {
