@@ -17,7 +17,7 @@
 //! - [`cancel`]: cooperative cancellation;
 //! - [`clock`]: monotonic or virtual time;
 //! - [`text`]: formatting of counts with nouns;
-//! - [`file`]: reads whole files of bounded length;
+//! - [`mod@file`]: reads whole files of bounded length;
 //! - [`sys`]: system calls; all unsafe code.
 
 #![deny(unsafe_code)]
