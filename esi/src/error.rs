@@ -49,7 +49,10 @@ impl EsiProblem {
     pub(crate) fn is_of_one_element(&self) -> bool {
         matches!(
             self,
-            Self::Missing { .. } | Self::Number { .. } | Self::HexBytes { .. }
+            Self::Missing { .. }
+                | Self::UnknownPdoReference(_)
+                | Self::Number { .. }
+                | Self::HexBytes { .. }
         )
     }
 }
@@ -81,6 +84,9 @@ pub enum EsiProblem {
         /// The element or attribute.
         what: &'static str,
     },
+    /// No PDO of the file has this `RefName`.
+    #[error("no PDO of this file has the RefName {0:?}")]
+    UnknownPdoReference(String),
     /// A number is malformed or out of range.
     #[error("{what} {text:?} is not a number that fits ({min} to {max})")]
     Number {

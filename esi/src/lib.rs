@@ -35,4 +35,4 @@ pub use select::{
     UserSdo, find_device, offered_modes, select,
 };
 pub use startup::StartupSdo;
-pub use xml::parse;
+pub use xml::{parse, parse_where};

@@ -8,6 +8,7 @@ mod element_cache;
 mod fuzz;
 mod layouts;
 mod own_files;
+mod partial;
 mod selection;
 mod sii;
 mod sii_vs_recorded;

@@ -4,7 +4,7 @@
 use std::path::PathBuf;
 
 use ecaxis_esi::sii::Sii;
-use ecaxis_esi::{Dictionary, Identity, SelectOptions, select};
+use ecaxis_esi::{DeviceHeader, Dictionary, Identity, SelectOptions, select};
 use ecaxis_master::acyclic::eeprom::EepromAccess;
 use ecaxis_master::acyclic::enumerate::EnumeratedDevice;
 use ecaxis_master::acyclic::{AlState, DeviceRef};
@@ -349,7 +349,11 @@ impl Open<'_> {
                     path.display()
                 ))
             })?;
-        let file = esi_library::load(&library.folder().join(&entry.file)).map_err(wrong)?;
+        let path = library.folder().join(&entry.file);
+        let is_described = |header: &DeviceHeader| {
+            (header.identity.product, header.identity.revision) == (entry.product, entry.revision)
+        };
+        let file = esi_library::load(&path, &is_described).map_err(wrong)?;
         let wanted = Identity {
             revision: entry.revision,
             ..identity

@@ -28,6 +28,19 @@ impl fmt::Display for Identity {
     }
 }
 
+/// The identity and the names of a device, without its content.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DeviceHeader {
+    /// The number of the `Device` element in its list, from 1, as in element paths.
+    pub number: u32,
+    /// Vendor, product code and revision.
+    pub identity: Identity,
+    /// Text of `Type`.
+    pub type_name: String,
+    /// As [`Device::name`].
+    pub name: String,
+}
+
 /// One `Device` of an ESI file (ETG.2000).
 #[derive(Debug, Clone, Default)]
 pub struct Device {

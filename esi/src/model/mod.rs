@@ -42,7 +42,7 @@ pub use small_bytes::Bytes;
 pub use sync::*;
 
 /// The position in the file at which an element starts.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Position {
     /// The line, from 1.
     pub line: u32,
@@ -65,6 +65,8 @@ pub struct EsiFile {
     pub groups: Vec<Group>,
     /// The devices in file order.
     pub devices: Vec<Device>,
+    /// The devices that the caller of [`parse_where`](crate::parse_where) did not want.
+    pub skipped: Vec<DeviceHeader>,
     /// The modules in file order.
     pub modules: Vec<Module>,
     /// `InfoReference`: other files, usually with root `EtherCATModule`, that contain further

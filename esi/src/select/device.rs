@@ -3,7 +3,7 @@
 use std::fmt;
 
 use super::SelectError;
-use crate::model::{Device, EsiFile, Warning};
+use crate::model::{Device, EsiFile, Identity, Warning};
 
 /// The known properties of a device; `None` matches every device.
 #[derive(Debug, Clone, Copy, Default)]
@@ -35,42 +35,40 @@ impl fmt::Display for DeviceQuery<'_> {
     }
 }
 
+impl DeviceQuery<'_> {
+    /// Returns `true` if a device of this identity, `Type` and `Name` matches.
+    #[must_use]
+    pub fn matches(&self, identity: Identity, type_name: &str, name: &str) -> bool {
+        let is_named = |wanted: &str| {
+            let wanted = wanted.trim();
+            type_name.eq_ignore_ascii_case(wanted) || name.eq_ignore_ascii_case(wanted)
+        };
+        self.name.is_none_or(is_named)
+            && self.product.is_none_or(|wanted| wanted == identity.product)
+            && (self.revision).is_none_or(|wanted| wanted == identity.revision)
+    }
+}
+
 /// Returns the device that matches `query`. If several revisions of one product match, returns the
 /// newest.
 pub fn find_device<'a>(
     file: &'a EsiFile,
     query: &DeviceQuery<'_>,
 ) -> Result<&'a Device, SelectError> {
-    if file.devices.is_empty() {
+    if file.devices.is_empty() && file.skipped.is_empty() {
         return Err(SelectError::NoDevices);
     }
-    let named = |device: &&Device| {
-        query.name.is_none_or(|name| {
-            let name = name.trim();
-            device.type_name.eq_ignore_ascii_case(name) || device.name.eq_ignore_ascii_case(name)
-        })
-    };
-    let matching: Vec<&Device> = file
-        .devices
-        .iter()
-        .filter(named)
-        .filter(|device| {
-            query
-                .product
-                .is_none_or(|product| device.identity.product == product)
-        })
-        .filter(|device| {
-            query
-                .revision
-                .is_none_or(|revision| device.identity.revision == revision)
-        })
-        .collect();
+    let is_wanted =
+        |device: &&Device| query.matches(device.identity, &device.type_name, &device.name);
+    let matching: Vec<&Device> = file.devices.iter().filter(is_wanted).collect();
     let Some(newest) = matching
         .iter()
         .copied()
         .max_by_key(|device| device.identity.revision)
     else {
-        let available = list(file.devices.iter());
+        let skipped = file.skipped.iter();
+        let skipped = skipped.map(|device| line(device.identity, &device.type_name, &device.name));
+        let available = list(file.devices.iter().map(line_of).chain(skipped));
         return Err(SelectError::NoSuchDevice {
             query: query.to_string(),
             available,
@@ -81,7 +79,7 @@ pub fn find_device<'a>(
         .iter()
         .any(|device| device.identity.product != newest.identity.product)
     {
-        let available = list(matching.into_iter());
+        let available = list(matching.into_iter().map(line_of));
         return Err(SelectError::Ambiguous {
             query: query.to_string(),
             available,
@@ -110,17 +108,20 @@ fn unreadable(file: &EsiFile) -> String {
     .collect()
 }
 
-fn list<'a>(devices: impl Iterator<Item = &'a Device>) -> String {
+fn line_of(device: &Device) -> String {
+    line(device.identity, &device.type_name, &device.name)
+}
+
+fn line(id: Identity, type_name: &str, name: &str) -> String {
+    format!(
+        "{type_name} ({name}, product 0x{:08x} revision 0x{:08x})",
+        id.product, id.revision
+    )
+}
+
+fn list(devices: impl Iterator<Item = String>) -> String {
     const SHOWN: usize = 12;
-    let texts: Vec<String> = devices
-        .map(|device| {
-            let id = device.identity;
-            format!(
-                "{} ({}, product 0x{:08x} revision 0x{:08x})",
-                device.type_name, device.name, id.product, id.revision
-            )
-        })
-        .collect();
+    let texts: Vec<String> = devices.collect();
     let more = texts.len().saturating_sub(SHOWN);
     let mut text = texts.into_iter().take(SHOWN).collect::<Vec<_>>().join("; ");
     if more > 0 {

@@ -4,7 +4,7 @@ use super::cursor::{Cursor, Element};
 use super::text::Names;
 use super::{dc, device_info, eeprom, mailbox, mapping, pdo, profile, slots, sync};
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Device, Direction, HiddenType, InitialRegisters, RevisionCheck};
+use crate::model::{Device, DeviceHeader, Direction, HiddenType, InitialRegisters, RevisionCheck};
 
 pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Device, EsiError> {
     let mut device = Device {
@@ -37,6 +37,7 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Devi
             "Su" => device.sync_units.push(sync::sync_unit(c, el)?),
             "RxPdo" => pdo::append(c, el, Direction::Rx, &mut device.rx_pdos)?,
             "TxPdo" => pdo::append(c, el, Direction::Tx, &mut device.tx_pdos)?,
+            "Pdo" => pdo::append_reference(c, el, &mut device.rx_pdos, &mut device.tx_pdos)?,
             "Mailbox" => device.mailbox = Some(mailbox::read(c, el)?),
             "Dc" => device.dc_modes = dc::read(c, el)?,
             "Slots" => device.slots = Some(slots::read(c, el)?),
@@ -49,12 +50,7 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Devi
         Ok(())
     })?;
     if !has_type {
-        return Err(c.error_at(
-            element,
-            EsiProblem::Missing {
-                what: "Device/Type",
-            },
-        ));
+        return Err(no_type(c, element));
     }
     (device.name, device.names) = names.take_all();
     mapping::complete(&mut device);
@@ -62,6 +58,42 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Devi
         device.name = device.type_name.clone();
     }
     Ok(device)
+}
+
+/// Reads the identity and the names, and skips the rest.
+pub(super) fn header<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+) -> Result<DeviceHeader, EsiError> {
+    let (mut typed, mut names) = (None, Names::default());
+    c.children(element, |c, el| {
+        match el.name {
+            "Type" => {
+                let mut device = Device::default();
+                type_element(c, el, &mut device)?;
+                typed = Some((device.identity, device.type_name));
+            }
+            "Name" => names.add(c, el)?,
+            _ => {}
+        }
+        Ok(())
+    })?;
+    let (identity, type_name) = typed.ok_or_else(|| no_type(c, element))?;
+    let name = names.take().into_owned();
+    Ok(DeviceHeader {
+        number: element.number(),
+        identity,
+        name: match name.is_empty() {
+            true => type_name.clone(),
+            false => name,
+        },
+        type_name,
+    })
+}
+
+fn no_type(c: &Cursor<'_>, element: &Element<'_>) -> EsiError {
+    let what = "Device/Type";
+    c.error_at(element, EsiProblem::Missing { what })
 }
 
 /// Reads `Type`: the identity and its attributes.

@@ -4,29 +4,41 @@ use super::cursor::{Cursor, Element};
 use super::text::Names;
 use super::{device, module};
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{EsiFile, Group, Vendor};
+use crate::model::{DeviceHeader, EsiFile, Group, Vendor};
 
-pub(super) fn read(c: &mut Cursor<'_>, file: &mut EsiFile) -> Result<(), EsiError> {
+/// Decides which devices are built; `None`: all.
+pub(super) type Wanted<'w> = Option<&'w dyn Fn(&DeviceHeader) -> bool>;
+
+pub(super) fn read(
+    c: &mut Cursor<'_>,
+    file: &mut EsiFile,
+    wanted: Wanted<'_>,
+) -> Result<(), EsiError> {
     let root = c.root()?;
     match root.name {
-        "EtherCATInfo" => info(c, &root, file),
-        "EtherCATModule" => modules_alone(c, &root, file),
+        "EtherCATInfo" => info(c, &root, file, wanted),
+        "EtherCATModule" => modules_alone(c, &root, file, wanted),
         "EtherCATInfoList" => c.children(&root, |c, el| match el.name {
-            "EtherCATInfo" => info(c, el, file),
+            "EtherCATInfo" => info(c, el, file, wanted),
             _ => Ok(()),
         }),
         other => Err(c.error_at(&root, EsiProblem::NotEsi(other.chars().take(40).collect()))),
     }
 }
 
-fn info<'a>(c: &mut Cursor<'a>, root: &Element<'a>, file: &mut EsiFile) -> Result<(), EsiError> {
-    let first = file.devices.len();
+fn info<'a>(
+    c: &mut Cursor<'a>,
+    root: &Element<'a>,
+    file: &mut EsiFile,
+    wanted: Wanted<'_>,
+) -> Result<(), EsiError> {
+    let first = (file.devices.len(), file.skipped.len());
     let mut vendor = None;
     c.children(root, |c, el| {
         match el.name {
             "InfoReference" => file.references.push(c.text(el)?),
             "Vendor" => vendor = Some(read_vendor(c, el)?),
-            "Descriptions" => descriptions(c, el, file)?,
+            "Descriptions" => descriptions(c, el, file, wanted)?,
             _ => {}
         }
         Ok(())
@@ -34,8 +46,11 @@ fn info<'a>(c: &mut Cursor<'a>, root: &Element<'a>, file: &mut EsiFile) -> Resul
     let Some(vendor) = vendor else {
         return Err(c.error_at(root, EsiProblem::Missing { what: "Vendor" }));
     };
-    for device in file.devices.iter_mut().skip(first) {
-        device.identity.vendor = vendor.id;
+    let built = file.devices.iter_mut().skip(first.0);
+    let skipped = file.skipped.iter_mut().skip(first.1);
+    let identities = built.map(|device| &mut device.identity);
+    for identity in identities.chain(skipped.map(|header| &mut header.identity)) {
+        identity.vendor = vendor.id;
     }
     file.vendor = vendor;
     Ok(())
@@ -63,6 +78,7 @@ fn descriptions<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
     file: &mut EsiFile,
+    wanted: Wanted<'_>,
 ) -> Result<(), EsiError> {
     c.children(element, |c, el| match el.name {
         "Groups" => c.children(el, |c, el| {
@@ -74,6 +90,17 @@ fn descriptions<'a>(
         "Devices" => c.children(el, |c, el| {
             if el.name != "Device" {
                 return Ok(());
+            }
+            if let Some(wanted) = wanted {
+                let start = c.mark();
+                // An unreadable header is a problem that the reader of the device reports.
+                match device::header(c, el) {
+                    Ok(header) if !wanted(&header) => {
+                        file.skipped.push(header);
+                        return Ok(());
+                    }
+                    _ => c.rewind(el, start),
+                }
             }
             let read = device::read(c, el).map(|device| file.devices.push(device));
             c.leave_out_damaged(el, read)
@@ -125,13 +152,14 @@ fn modules_alone<'a>(
     c: &mut Cursor<'a>,
     root: &Element<'a>,
     file: &mut EsiFile,
+    wanted: Wanted<'_>,
 ) -> Result<(), EsiError> {
     c.children(root, |c, el| {
         match el.name {
             "Vendor" => file.vendor = read_vendor(c, el)?,
             "Module" => one_module(c, el, file)?,
             "Modules" => modules(c, el, file)?,
-            "Descriptions" => descriptions(c, el, file)?,
+            "Descriptions" => descriptions(c, el, file, wanted)?,
             _ => {}
         }
         Ok(())

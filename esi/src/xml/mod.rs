@@ -39,17 +39,48 @@ mod sync;
 mod text;
 
 use crate::error::EsiError;
-use crate::model::{EsiFile, Warning};
+use crate::model::{DeviceHeader, EsiFile, Warning};
+use pdo::PdoDefinitions;
 
 /// Reads an ESI file (`EtherCATInfo`), a module file (`EtherCATModule`), or the output of `ethercat
 /// xml` (`EtherCATInfoList`).
 pub fn parse(bytes: &[u8]) -> Result<EsiFile, EsiError> {
+    read(bytes, None)
+}
+
+/// Same as [`parse`], but builds only the devices that `wanted` accepts. The others are in
+/// [`EsiFile::skipped`], and their content is not checked. The vendor of the header is not set
+/// when `wanted` sees it.
+///
+/// ```
+/// # let bytes = include_bytes!("../../../configs/esi/SV1.xml");
+/// let file = ecaxis_esi::parse_where(bytes, &|device| device.type_name == "other")?;
+/// assert!(file.devices.is_empty() && !file.skipped.is_empty());
+/// # Ok::<(), ecaxis_esi::EsiError>(())
+/// ```
+pub fn parse_where(
+    bytes: &[u8],
+    wanted: &dyn Fn(&DeviceHeader) -> bool,
+) -> Result<EsiFile, EsiError> {
+    read(bytes, Some(wanted))
+}
+
+fn read(bytes: &[u8], wanted: info::Wanted<'_>) -> Result<EsiFile, EsiError> {
     let decoded = decode::decode(bytes);
+    let mut definitions = PdoDefinitions::default();
+    // A `Ref` may stand before the `RefName` that it names.
+    if memchr::memmem::find(decoded.text.as_bytes(), b"RefName").is_some() {
+        let mut cursor = cursor::Cursor::new(&decoded.text);
+        info::read(&mut cursor, &mut EsiFile::default(), None)?;
+        definitions = cursor.pdo_definitions;
+    }
     let mut cursor = cursor::Cursor::new(&decoded.text);
+    cursor.pdo_definitions = definitions;
     let mut file = EsiFile::default();
-    info::read(&mut cursor, &mut file)?;
+    info::read(&mut cursor, &mut file, wanted)?;
     if let Some(error) = cursor.first_left_out.take()
         && file.devices.is_empty()
+        && file.skipped.is_empty()
         && file.modules.is_empty()
     {
         return Err(error);

@@ -25,6 +25,7 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Modu
             "Name" => names.add(c, el)?,
             "RxPdo" => pdo::append(c, el, Direction::Rx, &mut module.rx_pdos)?,
             "TxPdo" => pdo::append(c, el, Direction::Tx, &mut module.tx_pdos)?,
+            "Pdo" => pdo::append_reference(c, el, &mut module.rx_pdos, &mut module.tx_pdos)?,
             "Mailbox" => module.init_cmds = mailbox::read(c, el)?.coe.unwrap_or_default().init_cmds,
             "DcOpModeName" => module.dc_mode = Some(c.text(el)?),
             "Profile" => {

@@ -1,10 +1,16 @@
 //! `RxPdo` and `TxPdo`.
+//!
+//! A PDO with an attribute `RefName` can be repeated by an element `Pdo`, `RxPdo` or `TxPdo` with
+//! an attribute `Ref` of the same text. Attributes and children of that element replace those of
+//! the definition.
+
+use std::collections::HashMap;
 
 use super::cursor::{Cursor, Element};
 use super::text::Names;
 use crate::address;
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Direction, Entry, Excluded, Oversampling, Pdo, SlotDependence, Text};
+use crate::model::{Direction, Entry, Excluded, Oversampling, Pdo, Position, SlotDependence, Text};
 
 /// The maximum number of entries; a frame carries 11888 bits.
 const MAX_ENTRIES: usize = 12_000;
@@ -31,30 +37,60 @@ pub(super) fn append<'a>(
     c.leave_out(element, read)
 }
 
+/// The PDOs of a file by their `RefName`.
+pub(super) type PdoDefinitions = HashMap<String, Pdo>;
+
+/// Reads a `Pdo`, whose direction is that of the definition that it refers to.
+pub(super) fn append_reference<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+    rx: &mut Vec<Pdo>,
+    tx: &mut Vec<Pdo>,
+) -> Result<(), EsiError> {
+    match definition(c, element) {
+        Ok(Some(Pdo { direction, .. })) => match direction {
+            Direction::Rx => append(c, element, Direction::Rx, rx),
+            Direction::Tx => append(c, element, Direction::Tx, tx),
+        },
+        Ok(None) => Ok(()),
+        Err(error) => c.leave_out(element, Err(error)),
+    }
+}
+
+/// Returns a copy of the PDO that `Ref` names.
+fn definition<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Option<Pdo>, EsiError> {
+    let Some(name) = c.attribute(element, "Ref")? else {
+        return Ok(None);
+    };
+    let Some(known) = c.pdo_definitions.get(&name) else {
+        let name = name.chars().take(80).collect();
+        return Err(c.error_at(element, EsiProblem::UnknownPdoReference(name)));
+    };
+    let copy = known.clone();
+    let bytes = copy.entries.len() * size_of::<Entry>();
+    c.spend(bytes, (c.position(element), element))?;
+    Ok(Some(copy))
+}
+
 fn read<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
     direction: Direction,
 ) -> Result<Pdo, EsiError> {
-    let mut pdo = Pdo {
-        position: c.position(element),
-        direction,
-        index: 0,
-        name: String::new(),
-        sm: c.attribute_number(element, "Sm")?,
-        su: c.attribute_number(element, "Su")?,
-        excluded_sm: Vec::new(),
-        fixed: c.attribute_flag(element, "Fixed")?,
-        mandatory: c.attribute_flag(element, "Mandatory")?,
-        virtual_: c.attribute_flag(element, "Virtual")?,
-        overwritten_by_module: c.attribute_flag(element, "OverwrittenByModule")?,
-        depends_on: SlotDependence::default(),
-        oversampling: oversampling(c, element)?,
-        exclude: Vec::new(),
-        entries: Vec::new(),
-    };
+    let defined = definition(c, element)?;
+    let mut index = defined.as_ref().map(|pdo| pdo.index);
+    let mut inherits_entries = defined.is_some();
+    let mut pdo = defined.unwrap_or_else(|| empty(direction));
+    pdo.position = c.position(element);
+    pdo.direction = direction;
+    pdo.sm = c.attribute_number(element, "Sm")?.or(pdo.sm);
+    pdo.su = c.attribute_number(element, "Su")?.or(pdo.su);
+    pdo.fixed |= c.attribute_flag(element, "Fixed")?;
+    pdo.mandatory |= c.attribute_flag(element, "Mandatory")?;
+    pdo.virtual_ |= c.attribute_flag(element, "Virtual")?;
+    pdo.overwritten_by_module |= c.attribute_flag(element, "OverwrittenByModule")?;
+    pdo.oversampling = oversampling(c, element)?.or(pdo.oversampling);
     let mut names = Names::default();
-    let mut index = None;
     c.children(element, |c, el| {
         match el.name {
             "Index" => {
@@ -68,6 +104,9 @@ fn read<'a>(
             }),
             "ExcludedSm" => pdo.excluded_sm.push(c.number(el, "excluded SyncManager")?),
             "Entry" => {
+                if std::mem::take(&mut inherits_entries) {
+                    pdo.entries.clear();
+                }
                 room(c, el, &pdo.entries)?;
                 pdo.entries.push(entry(c, el)?);
             }
@@ -77,8 +116,34 @@ fn read<'a>(
     })?;
     pdo.index =
         index.ok_or_else(|| c.error_at(element, EsiProblem::Missing { what: "PDO Index" }))?;
-    pdo.name = names.take().into_owned();
+    let name = names.take();
+    if !name.is_empty() {
+        pdo.name = name.into_owned();
+    }
+    if let Some(name) = c.attribute(element, "RefName")? {
+        c.pdo_definitions.insert(name, pdo.clone());
+    }
     Ok(pdo)
+}
+
+fn empty(direction: Direction) -> Pdo {
+    Pdo {
+        position: Position::default(),
+        direction,
+        index: 0,
+        name: String::new(),
+        sm: None,
+        su: None,
+        excluded_sm: Vec::new(),
+        fixed: false,
+        mandatory: false,
+        virtual_: false,
+        overwritten_by_module: false,
+        depends_on: SlotDependence::default(),
+        oversampling: None,
+        exclude: Vec::new(),
+        entries: Vec::new(),
+    }
 }
 
 /// Checks that one more entry is allowed.

@@ -3,7 +3,7 @@
 
 use ecaxis_esi::{
     Device, EntryRef, EsiFile, Field, Mode, SelectOptions, Selection, SmLayout, lint,
-    offered_modes, parse, select, sii,
+    offered_modes, parse, parse_where, select, sii,
 };
 
 /// Counters of the inputs that reached each step.
@@ -28,6 +28,8 @@ pub fn walk(bytes: &[u8], reached: &mut Reached) {
         }
     };
     reached.read += 1;
+    let none = parse_where(bytes, &|_| false).expect("a readable file");
+    assert!(none.devices.is_empty() && none.skipped.len() >= file.devices.len());
     for finding in lint(&file) {
         assert!(!finding.path.is_empty() && !finding.message.is_empty());
     }

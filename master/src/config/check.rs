@@ -27,7 +27,8 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
     let places = places(&raw.devices, p);
 
     let folder = path.parent().unwrap_or(Path::new(""));
-    let mut files = EsiFiles::new(folder, bus.as_ref().map(|b| (b.cycle_ns, cycle_span)));
+    let cycle = bus.as_ref().map(|b| (b.cycle_ns, cycle_span));
+    let mut files = EsiFiles::new(folder, &raw.devices, cycle);
     let mut names = Vec::new();
     let mut devices: Vec<Option<DeviceConfig>> = Vec::new();
     let all: Vec<String> = raw

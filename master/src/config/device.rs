@@ -16,6 +16,8 @@ use crate::esi_library::{self, Library, LoadError, RevisionMatch};
 /// Data shared by all devices: the ESI folder, the files read so far, and the cycle.
 pub(crate) struct EsiFiles<'f> {
     folder: &'f Path,
+    /// What the machine file says of its devices; other devices of an ESI file are not built.
+    queries: Vec<OwnedQuery>,
     /// The cycle in ns and its place in the file; `None` if the cycle is invalid.
     cycle: Option<(u64, Span)>,
     /// The files; `None`: could not be read, which has been reported.
@@ -24,9 +26,10 @@ pub(crate) struct EsiFiles<'f> {
 }
 
 impl<'f> EsiFiles<'f> {
-    pub fn new(folder: &'f Path, cycle: Option<(u64, Span)>) -> Self {
+    pub fn new(folder: &'f Path, devices: &[RawDevice], cycle: Option<(u64, Span)>) -> Self {
         Self {
             folder,
+            queries: devices.iter().map(OwnedQuery::new).collect(),
             cycle,
             files: BTreeMap::new(),
             folders: BTreeMap::new(),
@@ -47,7 +50,14 @@ impl<'f> EsiFiles<'f> {
         if let Some(known) = self.files.get(&path) {
             return known.clone().map(|file| (path, file));
         }
-        let read = esi_library::load(&path).map_err(|e| match e {
+        let wanted = |header: &esi::DeviceHeader| {
+            let fits = |query: &OwnedQuery| {
+                let query = query.borrow();
+                query.matches(header.identity, &header.type_name, &header.name)
+            };
+            self.queries.iter().any(fits)
+        };
+        let read = esi_library::load(&path, &wanted).map_err(|e| match e {
             LoadError::Read { path, source } => {
                 let hint = match source.kind() {
                     std::io::ErrorKind::NotFound => neighbours(&path),
@@ -334,19 +344,39 @@ fn mode(raw: &RawDevice, p: &mut Problems<'_>) -> Result<Option<esi::Mode>, ()> 
     }
 }
 
+/// `type`, `product` and `revision` of a device.
+struct OwnedQuery {
+    name: Option<String>,
+    product: Option<u32>,
+    revision: Option<u32>,
+}
+
+impl OwnedQuery {
+    fn new(raw: &RawDevice) -> Self {
+        Self {
+            name: raw.type_name.as_ref().map(|n| n.get_ref().clone()),
+            product: raw.product.value(),
+            revision: raw.revision.value(),
+        }
+    }
+
+    fn borrow(&self) -> esi::DeviceQuery<'_> {
+        esi::DeviceQuery {
+            name: self.name.as_deref(),
+            product: self.product,
+            revision: self.revision,
+        }
+    }
+}
+
 fn find<'e>(
     raw: &RawDevice,
     file: &'e esi::EsiFile,
     p: &mut Problems<'_>,
 ) -> Option<&'e esi::Device> {
-    let query = esi::DeviceQuery {
-        name: raw.type_name.as_ref().map(|n| n.get_ref().as_str()),
-        product: raw.product.value(),
-        revision: raw.revision.value(),
-    };
     let at = raw.type_name.place().or(raw.product.place());
     let at = at.or(raw.revision.place()).or(raw.esi.place());
-    match esi::find_device(file, &query) {
+    match esi::find_device(file, &OwnedQuery::new(raw).borrow()) {
         Ok(device) => Some(device),
         Err(e) => {
             let message = e.to_string();

@@ -45,17 +45,24 @@ fn read(path: &Path) -> Result<Vec<u8>, LoadError> {
     file::read(path, MAX_BYTES).map_err(failed)
 }
 
-fn parse(path: &Path) -> Result<esi::EsiFile, LoadError> {
-    esi::parse(&read(path)?).map_err(|source| LoadError::Esi {
+fn parse(
+    path: &Path,
+    wanted: &dyn Fn(&esi::DeviceHeader) -> bool,
+) -> Result<esi::EsiFile, LoadError> {
+    esi::parse_where(&read(path)?, wanted).map_err(|source| LoadError::Esi {
         path: path.to_owned(),
         source: Box::new(source),
     })
 }
 
-/// Reads an ESI file and adds the modules of the files that its `InfoReference`s name, from the
-/// same folder. A referenced file that cannot be read is a warning of the file.
-pub fn load(path: &Path) -> Result<esi::EsiFile, LoadError> {
-    let mut file = parse(path)?;
+/// Reads an ESI file with the devices that `wanted` accepts, and adds the modules of the files that
+/// its `InfoReference`s name, from the same folder. A referenced file that cannot be read is a
+/// warning of the file.
+pub fn load(
+    path: &Path,
+    wanted: &dyn Fn(&esi::DeviceHeader) -> bool,
+) -> Result<esi::EsiFile, LoadError> {
+    let mut file = parse(path, wanted)?;
     let folder = path.parent().unwrap_or(Path::new(""));
     let mut waiting = std::mem::take(&mut file.references);
     let mut seen: BTreeSet<String> = path
@@ -78,7 +85,8 @@ pub fn load(path: &Path) -> Result<esi::EsiFile, LoadError> {
         let added = if seen.len() > MAX_REFERENCES {
             Err("too many files are referred to".to_owned())
         } else {
-            sibling(folder, &name).and_then(|path| parse(&path).map_err(|e| e.to_string()))
+            sibling(folder, &name)
+                .and_then(|path| parse(&path, &|_| false).map_err(|e| e.to_string()))
         };
         match added {
             Ok(other) => {
@@ -272,7 +280,7 @@ impl Library {
     /// Returns a library with the devices of one file.
     pub fn of_file(path: &Path) -> Result<Self, LoadError> {
         let file = PathBuf::from(path.file_name().unwrap_or_default());
-        let mut entries = devices(&file, &parse(path)?);
+        let mut entries = devices(&file, parse(path, &|_| false)?);
         entries.sort_by_key(|e| (e.vendor, e.product, e.revision));
         Ok(Self {
             folder: path.parent().unwrap_or(Path::new("")).to_owned(),
@@ -325,24 +333,24 @@ impl Library {
 type Record = Result<Vec<Entry>, String>;
 
 fn describe(folder: &Path, file: &Path) -> Record {
-    let parsed = parse(&folder.join(file)).map_err(|error| match error {
+    let parsed = parse(&folder.join(file), &|_| false).map_err(|error| match error {
         LoadError::Esi { source, .. } => source.to_string(),
         LoadError::Read { source, .. } => source.to_string(),
     })?;
-    Ok(devices(file, &parsed))
+    Ok(devices(file, parsed))
 }
 
-fn devices(file: &Path, parsed: &esi::EsiFile) -> Vec<Entry> {
-    let entry = |device: &esi::Device| Entry {
+fn devices(file: &Path, parsed: esi::EsiFile) -> Vec<Entry> {
+    let entry = |device: esi::DeviceHeader| Entry {
         file: file.to_owned(),
         vendor: device.identity.vendor,
         vendor_name: parsed.vendor.name.clone(),
         product: device.identity.product,
         revision: device.identity.revision,
-        type_name: device.type_name.clone(),
-        name: device.name.clone(),
+        type_name: device.type_name,
+        name: device.name,
     };
-    parsed.devices.iter().map(entry).collect()
+    parsed.skipped.into_iter().map(entry).collect()
 }
 
 /// Collects every `.xml` file below the folder.

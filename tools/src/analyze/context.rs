@@ -118,11 +118,11 @@ fn describe(library: &Library, (vendor, product, revision): (u32, u32, u32)) -> 
     let entry = library
         .find(identity, RevisionMatch::Newer)
         .or_else(|| library.find(identity, RevisionMatch::HighWord))?;
-    let file = esi_library::load(&library.folder().join(&entry.file)).ok()?;
-    let device = file
-        .devices
-        .iter()
-        .find(|d| d.identity.product == entry.product && d.identity.revision == entry.revision)?;
+    let is_described = |device: &esi::DeviceHeader| {
+        (device.identity.product, device.identity.revision) == (entry.product, entry.revision)
+    };
+    let file = esi_library::load(&library.folder().join(&entry.file), &is_described).ok()?;
+    let device = file.devices.first()?;
     let choice = esi::SelectOptions::default();
     let layout = esi::select(&file, device, &choice).ok();
     Some(Described {

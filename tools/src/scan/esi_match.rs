@@ -7,7 +7,7 @@ use std::sync::Arc;
 use ecaxis_esi as esi;
 
 use super::{Device, Scan};
-use ecaxis_master::esi_library::{self, Library, LoadError, RevisionMatch};
+use ecaxis_master::esi_library::{self, Entry, Library, LoadError, RevisionMatch};
 
 /// The best description of a device.
 #[derive(Debug, Clone)]
@@ -47,48 +47,56 @@ impl EsiMatch {
 /// be read.
 #[must_use]
 pub fn describe(scan: &Scan, library: &Library) -> (Vec<Option<EsiMatch>>, Vec<LoadError>) {
-    let mut files = BTreeMap::new();
-    let mut unreadable = Vec::new();
-    let all = scan
+    let entries: Vec<_> = scan
         .devices
         .iter()
-        .map(|device| one(device, library, &mut files, &mut unreadable))
+        .map(|device| find_entry(device, library))
         .collect();
+    let is_described = |header: &esi::DeviceHeader| {
+        let mut known = entries.iter().flatten();
+        known.any(|(entry, _)| {
+            let id = header.identity;
+            (id.product, id.revision) == (entry.product, entry.revision)
+        })
+    };
+    let mut files: Files = BTreeMap::new();
+    let mut unreadable = Vec::new();
+    let describe = |found: &Option<(&Entry, RevisionMatch)>| {
+        let (entry, rule) = (*found)?;
+        let path = library.folder().join(&entry.file);
+        let file = files.entry(path.clone()).or_insert_with(|| {
+            let read = esi_library::load(&path, &is_described);
+            read.map_err(|error| unreadable.push(error))
+                .ok()
+                .map(Arc::new)
+        });
+        let file = file.clone()?;
+        let of = |device: &&esi::Device| {
+            let id = device.identity;
+            (id.vendor, id.product, id.revision) == (entry.vendor, entry.product, entry.revision)
+        };
+        let device = Arc::new(file.devices.iter().find(of)?.clone());
+        Some(EsiMatch {
+            path,
+            device,
+            file,
+            rule,
+        })
+    };
+    let all = entries.iter().map(describe).collect();
     (all, unreadable)
 }
 
 type Files = BTreeMap<PathBuf, Option<Arc<esi::EsiFile>>>;
 
-fn one(
-    device: &Device,
-    library: &Library,
-    files: &mut Files,
-    unreadable: &mut Vec<LoadError>,
-) -> Option<EsiMatch> {
+fn find_entry<'l>(device: &Device, library: &'l Library) -> Option<(&'l Entry, RevisionMatch)> {
     let identity = device.identity()?;
     let rules = [
         RevisionMatch::Equal,
         RevisionMatch::Newer,
         RevisionMatch::Ignore,
     ];
-    let (entry, rule) = rules
+    rules
         .into_iter()
-        .find_map(|rule| Some((library.find(identity, rule)?, rule)))?;
-    let path = library.folder().join(&entry.file);
-    let file = files.entry(path.clone()).or_insert_with(|| {
-        let read = esi_library::load(&path).map_err(|error| unreadable.push(error));
-        read.ok().map(Arc::new)
-    });
-    let file = file.clone()?;
-    let of = |device: &&esi::Device| {
-        let id = device.identity;
-        (id.vendor, id.product, id.revision) == (entry.vendor, entry.product, entry.revision)
-    };
-    let described = Arc::new(file.devices.iter().find(of)?.clone());
-    Some(EsiMatch {
-        path,
-        device: described,
-        file,
-        rule,
-    })
+        .find_map(|rule| Some((library.find(identity, rule)?, rule)))
 }

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
-use ecaxis_esi::{self as esi, Device, DeviceQuery, EsiFile, Mode, SelectError};
+use ecaxis_esi::{self as esi, Device, DeviceHeader, DeviceQuery, EsiFile, Mode, SelectError};
 use ecaxis_master::config::nearest;
 use ecaxis_master::esi_library::{self, LoadError};
 use ecaxis_master::text::pluralize;
@@ -73,7 +73,25 @@ struct DeviceArgs {
 
 impl DeviceArgs {
     fn load(&self) -> Result<EsiFile, Failure> {
-        load(&self.file)
+        load(&self.file, &|header| self.may_mean(header))
+    }
+
+    /// Returns `false` if the arguments exclude the device.
+    fn may_mean(&self, header: &DeviceHeader) -> bool {
+        let query = DeviceQuery {
+            name: None,
+            product: self.product,
+            revision: self.revision,
+        };
+        let is_called = |text: &str| {
+            let query = DeviceQuery {
+                name: Some(text),
+                ..DeviceQuery::default()
+            };
+            query.matches(header.identity, &header.type_name, &header.name)
+                || number(text).is_ok_and(|n| n == header.number || n == header.identity.product)
+        };
+        query.matches(header.identity, "", "") && self.device.as_deref().is_none_or(is_called)
     }
 
     fn says_which(&self) -> bool {
@@ -161,9 +179,11 @@ impl DeviceArgs {
                 },
                 Some(name),
             ) => {
-                let mut types: Vec<&str> = file.devices.iter().map(|d| &*d.type_name).collect();
+                let built = file.devices.iter().map(|device| &*device.type_name);
+                let skipped = file.skipped.iter().map(|device| &*device.type_name);
+                let mut types: Vec<&str> = built.chain(skipped).collect();
+                let count = pluralize(types.len(), "device");
                 types.dedup();
-                let count = pluralize(file.devices.len(), "device");
                 let failure = failure(format!("none of its {count} matches {query}{unreadable}"));
                 match nearest(name, types.iter().copied()) {
                     Some(known) => failure.hint(format!("did you mean `{known}`?")),
@@ -189,8 +209,8 @@ impl DeviceArgs {
     }
 }
 
-fn load(path: &Path) -> Result<EsiFile, Failure> {
-    esi_library::load(path).map_err(|error| {
+fn load(path: &Path, wanted: &dyn Fn(&DeviceHeader) -> bool) -> Result<EsiFile, Failure> {
+    esi_library::load(path, wanted).map_err(|error| {
         let failure = Failure::new(hints::WRONG, error.to_string());
         match error {
             LoadError::Esi { source, .. } => failure.hint(match source.problem() {

@@ -10,6 +10,7 @@ mod problems;
 mod values;
 
 use super::lines::Lines;
+use super::pdo::PdoDefinitions;
 use super::scan::{Malformed, XmlEvent, XmlReader, local_name};
 use crate::error::{EsiError, EsiProblem};
 use crate::model::{Position, Warning};
@@ -29,6 +30,8 @@ pub(super) struct Cursor<'a> {
     ends_at_once: bool,
     spent: usize,
     pub warnings: Vec<Warning>,
+    /// The PDOs with a `RefName`.
+    pub pdo_definitions: PdoDefinitions,
     /// The first error that caused an element to be skipped.
     pub first_left_out: Option<EsiError>,
 }
@@ -53,10 +56,22 @@ pub(super) struct Element<'a> {
     depth: usize,
 }
 
+/// The end of a start tag.
+pub(super) struct Mark {
+    offset: usize,
+    ends_at_once: bool,
+    warnings: usize,
+}
+
 impl Element<'_> {
     /// Returns the start offset, for [`Cursor::at`].
     pub fn offset(&self) -> usize {
         self.offset
+    }
+
+    /// Returns the number among the siblings of the same name, from 1, for numbered names.
+    pub fn number(&self) -> u32 {
+        self.number
     }
 }
 
@@ -80,6 +95,7 @@ impl<'a> Cursor<'a> {
             ends_at_once: false,
             spent: 0,
             warnings: Vec::new(),
+            pdo_definitions: PdoDefinitions::default(),
             first_left_out: None,
         }
     }
@@ -163,6 +179,26 @@ impl<'a> Cursor<'a> {
         self.ends_at_once = false;
         self.depth = element.depth.saturating_sub(1);
         Ok(())
+    }
+
+    /// Returns the offset after the start tag that was read last, for [`Self::rewind`].
+    pub fn mark(&self) -> Mark {
+        Mark {
+            offset: self.scanner.offset(),
+            ends_at_once: self.ends_at_once,
+            warnings: self.warnings.len(),
+        }
+    }
+
+    /// Continues after the start tag of the element.
+    pub fn rewind(&mut self, element: &Element<'a>, mark: Mark) {
+        self.scanner.begin_at(mark.offset);
+        self.ends_at_once = mark.ends_at_once;
+        self.warnings.truncate(mark.warnings);
+        self.depth = element.depth;
+        if let Some(level) = self.stack.get_mut(element.depth.saturating_sub(1)) {
+            level.seen = [0; NUMBERED];
+        }
     }
 
     /// Reads until the element at `depth` is closed.
