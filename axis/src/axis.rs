@@ -84,29 +84,29 @@ pub struct Axis {
     active: bool,
     plan: Plan,
     motion: Motion,
-    given: LoopState,
-    fixed: control_law::DerivedConstants,
+    loop_state: LoopState,
+    derived: control_law::DerivedConstants,
     profile: Profile,
     home: HomingRun,
     probes: Probes,
     probe_mapped: bool,
     brake_state: stop::BrakeState,
-    resets: stop::Resets,
+    auto_reset: stop::Resets,
     /// Times in seconds for which the axis has been in target and at rest.
     settled_s: f64,
     rested_s: f64,
     /// The commanded position of the last cycle; the actual position if no position is commanded.
     sent: Counts,
-    sent_before: Counts,
+    previous_target: Counts,
     dt_s: f64,
     /// True if the inputs of this cycle are fresh.
     fresh: bool,
-    watch: supervision::SupervisionState,
+    supervision: supervision::SupervisionState,
     held_by_range: bool,
     guarded_cycles: u32,
     stale_cycles: u32,
     /// Number of answers still expected from before a gap in the cycle.
-    overdue: u8,
+    stale_answers: u8,
     /// Cycles since the last frame that is known to have reached the drive.
     undelivered_cycles: u32,
     /// Consecutive fresh cycles without Statusword bit 12.
@@ -115,7 +115,7 @@ pub struct Axis {
     /// velocity.
     interrupted: bool,
     /// External set-point of this cycle.
-    fed: Option<Motion>,
+    external_setpoint: Option<Motion>,
     fault: Option<DriveFault>,
     trip: Option<Trip>,
 }
@@ -140,29 +140,29 @@ impl Axis {
             switch_failed: None,
             plan: Plan::braking(&config, config.mode),
             motion: Motion::default(),
-            given: LoopState::default(),
-            fixed: control_law::DerivedConstants::new(&config),
+            loop_state: LoopState::default(),
+            derived: control_law::DerivedConstants::new(&config),
             profile: Profile::new(),
             home: HomingRun::default(),
             probes: Probes::new(),
             probe_mapped: false,
             brake_state: stop::BrakeState::default(),
-            resets: stop::Resets::default(),
+            auto_reset: stop::Resets::default(),
             settled_s: 0.0,
             rested_s: 0.0,
             sent: Counts::default(),
-            sent_before: Counts::default(),
+            previous_target: Counts::default(),
             dt_s: 0.0,
             fresh: false,
-            watch: supervision::SupervisionState::default(),
+            supervision: supervision::SupervisionState::default(),
             held_by_range: false,
             guarded_cycles: 0,
             stale_cycles: 0,
-            overdue: 0,
+            stale_answers: 0,
             undelivered_cycles: 0,
             unfollowed_cycles: 0,
             interrupted: false,
-            fed: None,
+            external_setpoint: None,
             fault: None,
             trip: None,
             config,
@@ -219,8 +219,8 @@ impl Axis {
             0.0
         };
         self.dt_s = dt_s;
-        self.fresh = inputs.fresh && self.overdue == 0;
-        self.overdue = self.overdue.saturating_sub(1);
+        self.fresh = inputs.fresh && self.stale_answers == 0;
+        self.stale_answers = self.stale_answers.saturating_sub(1);
         if self.fresh {
             self.read(inputs);
             self.supervise();
@@ -231,7 +231,7 @@ impl Axis {
                 let under_way = 1 + u32::from(self.config.answers_late);
                 self.undelivered_cycles = self.undelivered_cycles.min(under_way);
             }
-            self.watch.lost(self.sent_before);
+            self.supervision.lost(self.previous_target);
         }
         self.actual.pass(dt_s);
     }
@@ -260,8 +260,8 @@ impl Axis {
             self.close_loops(fresh, dt_s);
         }
         self.settle_brake();
-        self.fed = None;
-        self.sent_before = sent;
+        self.external_setpoint = None;
+        self.previous_target = sent;
         self.update_settling_times(dt_s);
         self.outputs()
     }
@@ -338,7 +338,7 @@ impl Axis {
         } else if !self.active && self.goal == PowerGoal::On {
             self.active = true;
             self.track_actual();
-            self.watch = supervision::SupervisionState::starting_at(
+            self.supervision = supervision::SupervisionState::starting_at(
                 self.actual.position(),
                 &self.config.limits,
             );
@@ -349,7 +349,7 @@ impl Axis {
     fn track_actual(&mut self) {
         self.sent = self.actual.counts().unwrap_or_default();
         self.motion = Motion::at(self.config.scale.position_to_user(self.sent).0);
-        self.given = LoopState::default();
+        self.loop_state = LoopState::default();
         self.profile = Profile::new();
         self.plan = Plan::braking(&self.config, self.mode);
         self.held_by_range = false;

@@ -192,7 +192,7 @@ impl Axis {
     fn reset_fault(&mut self) {
         self.trip = None;
         self.reset_failed = false;
-        self.resets = Resets::default();
+        self.auto_reset = Resets::default();
         if self.state.is_fault() {
             self.reset = true;
         } else {
@@ -413,7 +413,7 @@ impl Axis {
                 });
             }
         }
-        self.fed = Some(before.then(position, velocity, self.dt_s));
+        self.external_setpoint = Some(before.then(position, velocity, self.dt_s));
         self.plan = Plan::External;
         Ok(())
     }
@@ -434,7 +434,7 @@ impl Axis {
         }
         self.check_ready()?;
         // A division by zero gives infinity; then the configured slope applies.
-        let asked = (percent - self.given.torque).abs() / ramp_s;
+        let asked = (percent - self.loop_state.torque).abs() / ramp_s;
         let slope = if asked > 0.0 {
             asked.min(self.config.torque_slope)
         } else {

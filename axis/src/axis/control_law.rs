@@ -84,10 +84,11 @@ impl Axis {
                     target: loops.csp.velocity * velocity,
                     slope: limits.acceleration,
                 };
-                self.given.velocity_offset = ramp.advance(self.given.velocity_offset, dt_s);
+                self.loop_state.velocity_offset =
+                    ramp.advance(self.loop_state.velocity_offset, dt_s);
             }
             Mode::Csv => match loops.csv {
-                None => self.given.velocity = velocity,
+                None => self.loop_state.velocity = velocity,
                 Some(law) => {
                     if fresh {
                         let error = self.expected(self.config.dead_time_s) - self.actual.position();
@@ -95,17 +96,17 @@ impl Axis {
                             target: bounded(law.correction(error), limits.velocity),
                             slope: limits.acceleration,
                         };
-                        self.given.correction = ramp.advance(self.given.correction, dt_s);
+                        self.loop_state.correction = ramp.advance(self.loop_state.correction, dt_s);
                     }
-                    let wanted = law.feed_forward * velocity + self.given.correction;
-                    self.given.velocity = bounded(wanted, limits.velocity);
+                    let wanted = law.feed_forward * velocity + self.loop_state.correction;
+                    self.loop_state.velocity = bounded(wanted, limits.velocity);
                 }
             },
             Mode::Cst if fresh && !matches!(self.plan, Plan::Torque(_)) => self.close_torque(dt_s),
             _ => {}
         }
         if self.mode != Mode::Csp || switch.is_some() {
-            self.given.velocity_offset = 0.0;
+            self.loop_state.velocity_offset = 0.0;
         }
         self.preload_next_mode();
     }
@@ -116,9 +117,11 @@ impl Axis {
         let limits = self.config.limits;
         match self.other_mode() {
             Some(Mode::Csv | Mode::Pv) if self.mode != Mode::Csv => {
-                self.given.velocity = bounded(self.motion.velocity, limits.velocity);
+                self.loop_state.velocity = bounded(self.motion.velocity, limits.velocity);
             }
-            Some(Mode::Cst) => self.given.torque = bounded(self.actual.torque(), limits.torque),
+            Some(Mode::Cst) => {
+                self.loop_state.torque = bounded(self.actual.torque(), limits.torque)
+            }
             _ => {}
         }
     }
@@ -133,12 +136,12 @@ impl Axis {
             velocity: self.motion.velocity - self.actual.velocity(),
             acceleration: self.motion.acceleration,
         };
-        if core::mem::take(&mut self.given.takes_over) {
-            self.given.integral = pid.starting_with(self.given.torque, seen);
+        if core::mem::take(&mut self.loop_state.takes_over) {
+            self.loop_state.integral = pid.starting_with(self.loop_state.torque, seen);
         }
         let slope = self.config.torque_slope;
-        (self.given.integral, self.given.torque) =
-            pid.advance(self.given.integral, seen, limit, slope, dt_s);
+        (self.loop_state.integral, self.loop_state.torque) =
+            pid.advance(self.loop_state.integral, seen, limit, slope, dt_s);
     }
 
     pub(super) fn outputs(&self) -> Outputs {
@@ -155,8 +158,8 @@ impl Axis {
                 0
             },
             brake_open: self.brake_state.open,
-            profile_velocity: self.fixed.speed,
-            profile_acceleration: self.fixed.acceleration,
+            profile_velocity: self.derived.speed,
+            profile_acceleration: self.derived.acceleration,
             ..Outputs::default()
         };
         if !self.active {
@@ -174,17 +177,17 @@ impl Axis {
                 .wrapped();
         }
         if counts(Mode::Csv) || (mode == Mode::Pv && self.mode != Mode::Pv) {
-            let RawVelocity(raw) = scale.velocity_to_raw(UserVelocity(self.given.velocity));
+            let RawVelocity(raw) = scale.velocity_to_raw(UserVelocity(self.loop_state.velocity));
             out.target_velocity = raw;
         }
         if counts(Mode::Cst) {
-            let PerMille(raw) = scale.torque_to_raw(Percent(self.given.torque));
+            let PerMille(raw) = scale.torque_to_raw(Percent(self.loop_state.torque));
             out.target_torque = raw;
         }
         if self.mode == Mode::Csp && self.switch.is_none() {
             let loops = self.config.loops.csp;
             if loops.velocity != 0.0 {
-                let offset = UserVelocity(self.given.velocity_offset);
+                let offset = UserVelocity(self.loop_state.velocity_offset);
                 out.velocity_offset = scale.velocity_to_raw(offset).0;
             }
             if loops.acceleration != 0.0 {

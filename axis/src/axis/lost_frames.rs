@@ -35,12 +35,12 @@ impl Axis {
         if cycles > 0 {
             self.stale_cycles = self.stale_cycles.saturating_add(cycles);
             self.undelivered_cycles = self.undelivered_cycles.saturating_add(cycles);
-            self.watch.lost(self.sent_before);
+            self.supervision.lost(self.previous_target);
             self.actual.pass(f64::from(cycles) * self.dt_s);
         }
         if self.setpoint_frozen() {
             // Answers still expected are from before the gap.
-            self.overdue = self.config.answers_late;
+            self.stale_answers = self.config.answers_late;
             self.revert_pending_mode();
             if self.active {
                 if heard {
@@ -55,7 +55,7 @@ impl Axis {
     /// The pending target was never sent: a drive in CSP stands at the target before it.
     fn restore_last_sent(&mut self) {
         if self.mode == Mode::Csp && !self.left_csp() && self.motion.velocity != 0.0 {
-            self.sent = self.sent_before;
+            self.sent = self.previous_target;
             self.motion.position = self.config.scale.position_to_user(self.sent).0;
         }
     }
@@ -94,7 +94,7 @@ impl Axis {
                     target: 0.0,
                     slope: self.config.torque_slope,
                 };
-                self.given.torque = ramp.advance(self.given.torque, dt_s);
+                self.loop_state.torque = ramp.advance(self.loop_state.torque, dt_s);
             }
             ControlledQuantity::Drive => {}
         }
@@ -121,7 +121,7 @@ impl Axis {
             _ => self.held_velocity(),
         };
         self.motion = self.motion_at_actual(velocity);
-        self.given.take_over();
+        self.loop_state.take_over();
         // The target may now be too near for the planned deceleration.
         let limit = self.config.limits.acceleration;
         let trapezoid = match &self.plan {

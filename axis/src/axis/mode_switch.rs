@@ -17,7 +17,7 @@ use crate::setpoint::Ramp;
 use crate::units::UserUnits;
 
 /// Fresh cycles that must show the new mode, if the drive received both modes in turn.
-const CERTAIN_CYCLES: u8 = 10;
+const MODE_CONFIRM_CYCLES: u8 = 10;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Switch {
@@ -138,7 +138,7 @@ impl Axis {
             && self.is_held_back(&switch)
         {
             // The next answers belong to frames that requested the previous mode.
-            (switch.asked, switch.certain) = (0, CERTAIN_CYCLES);
+            (switch.asked, switch.certain) = (0, MODE_CONFIRM_CYCLES);
             self.switch = Some(switch);
         }
     }
@@ -165,17 +165,18 @@ impl Axis {
     fn change_law(&mut self, to: Mode) {
         let from = self.mode;
         self.mode = to;
-        self.given.enter();
+        self.loop_state.enter();
         if to == Mode::Csp {
             // This position is already the target in the drive.
             let position = UserUnits(self.motion.position);
             self.sent = self.config.scale.position_to_counts(position);
         }
         if to != Mode::Cst {
-            self.given.torque = 0.0;
+            self.loop_state.torque = 0.0;
         }
         if from == Mode::Hm {
-            self.watch = SupervisionState::starting_at(self.actual.position(), &self.config.limits);
+            self.supervision =
+                SupervisionState::starting_at(self.actual.position(), &self.config.limits);
         }
         self.transfer_setpoint(from);
         if !self.plan.fits(self.config.control(to)) {

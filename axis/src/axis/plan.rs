@@ -123,7 +123,7 @@ impl Axis {
     pub(super) fn engage(&mut self) {
         if self.active && self.controlled_quantity() == ControlledQuantity::Torque {
             self.motion = self.motion_at_actual(self.held_velocity());
-            self.given.take_over();
+            self.loop_state.take_over();
         }
     }
 
@@ -196,7 +196,7 @@ impl Axis {
             Plan::Move(trapezoid) => self.motion = trapezoid.advance(before, dt_s),
             Plan::Velocity(ramp) => self.motion = self.run(ramp, before, dt_s),
             Plan::Torque(ramp) => {
-                self.given.torque = ramp.advance(self.given.torque, dt_s);
+                self.loop_state.torque = ramp.advance(self.loop_state.torque, dt_s);
                 self.motion = self.uncommanded();
             }
             Plan::DriveProfile => {
@@ -214,7 +214,7 @@ impl Axis {
                 }
                 self.motion = self.uncommanded();
             }
-            Plan::External => match self.fed {
+            Plan::External => match self.external_setpoint {
                 Some(motion) => self.motion = motion,
                 None => {
                     let hold = Hold {
@@ -288,7 +288,7 @@ impl Axis {
 
     pub(super) fn setpoint_at_rest(&self) -> bool {
         match self.plan {
-            Plan::Torque(_) => self.given.torque == 0.0,
+            Plan::Torque(_) => self.loop_state.torque == 0.0,
             Plan::DriveProfile => !self.home.running() && self.at_standstill(),
             _ => self.motion.velocity == 0.0,
         }
@@ -301,7 +301,7 @@ impl Axis {
             Plan::Move(trapezoid) => trapezoid.finished(self.motion),
             Plan::Jerk(ref source) => source.finished(self.motion),
             Plan::Velocity(ramp) => self.motion.velocity == ramp.target,
-            Plan::Torque(ramp) => self.given.torque == ramp.target,
+            Plan::Torque(ramp) => self.loop_state.torque == ramp.target,
             Plan::DriveProfile => self.profile_arrived(),
             Plan::External => self.motion.velocity == 0.0,
         }

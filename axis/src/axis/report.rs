@@ -50,9 +50,9 @@ impl Axis {
             target_position: goal_position.unwrap_or(self.motion.position),
             target_velocity: goal_velocity.unwrap_or(self.motion.velocity),
             target_acceleration: self.motion.acceleration,
-            target_torque: self.given.torque,
-            following_error: self.watch.following_error,
-            max_following_error: self.watch.max_following_error,
+            target_torque: self.loop_state.torque,
+            following_error: self.supervision.following_error,
+            max_following_error: self.supervision.max_following_error,
             final_error_counts: (arrived
                 && (matches!(self.plan, Plan::Move(_) | Plan::Jerk(_)) || goal_position.is_some()))
             .then_some(error_counts),
@@ -61,7 +61,7 @@ impl Axis {
             stale_cycles: self.stale_cycles,
             waiting: self.waiting(),
             probes: self.probes.status(),
-            resets_tried: self.resets.tried,
+            resets_tried: self.auto_reset.tried,
             homing: self.home.status,
             homed: self.home.homed,
             fault: self.fault,

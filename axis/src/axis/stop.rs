@@ -22,7 +22,7 @@ const UNSLOWED_S: f64 = 1.0;
 /// A drive that still reports power this long after the request does not obey.
 const POWER_OFF_S: f64 = 3.0;
 /// After this time enabled without a fault, all automatic resets are available again.
-const FORGET_S: f64 = 60.0;
+const AUTO_RESET_FORGET_S: f64 = 60.0;
 /// Longer than any brake or stop time; keeps sums finite.
 const LONGEST_S: f64 = 3600.0;
 
@@ -333,21 +333,21 @@ impl Axis {
             return;
         };
         if self.active {
-            self.resets.healthy_s += dt_s;
-            if self.resets.healthy_s > FORGET_S {
-                self.resets.tried = 0;
+            self.auto_reset.healthy_s += dt_s;
+            if self.auto_reset.healthy_s > AUTO_RESET_FORGET_S {
+                self.auto_reset.tried = 0;
             }
             return;
         }
-        self.resets.healthy_s = 0.0;
+        self.auto_reset.healthy_s = 0.0;
         if self.state != State::Fault || self.reset {
-            self.resets.waited_s = 0.0;
+            self.auto_reset.waited_s = 0.0;
             return;
         }
-        self.resets.waited_s += dt_s;
-        if self.resets.waited_s >= delay_s && self.resets.tried < tries {
-            self.resets.tried = self.resets.tried.saturating_add(1);
-            self.resets.waited_s = 0.0;
+        self.auto_reset.waited_s += dt_s;
+        if self.auto_reset.waited_s >= delay_s && self.auto_reset.tried < tries {
+            self.auto_reset.tried = self.auto_reset.tried.saturating_add(1);
+            self.auto_reset.waited_s = 0.0;
             self.reset_failed = false;
             self.reset = true;
         }

@@ -20,40 +20,40 @@ const FOLLOW_CYCLES: u8 = 10;
 const CATCH_UP_CYCLES: u8 = 2;
 
 /// Rounding of a product of f64s.
-const ROUNDING: f64 = 1.0 + 1e-9;
+const VELOCITY_TOLERANCE: f64 = 1.0 + 1e-9;
 
 /// Rounding of a second difference of positions: of the difference, and of the positions.
-const LOOSE: f64 = 2e-6;
-const ROUNDED: f64 = 4.0 * f64::EPSILON;
+const SECOND_DIFFERENCE_TOLERANCE: f64 = 2e-6;
+const POSITION_EPSILON: f64 = 4.0 * f64::EPSILON;
 
 /// Fraction of the acceleration used to plan braking at the end of the range. The rest covers
 /// rounding.
-const PLANNED: f64 = 1.0 - 1e-4;
+const BRAKING_RESERVE: f64 = 1.0 - 1e-4;
 
 /// The range of an axis without position limits.
-const EVERYWHERE: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
+const UNBOUNDED_RANGE: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
 
 /// State of supervision while an axis is enabled.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct SupervisionState {
     pub(super) following_error: f64,
     pub(super) max_following_error: f64,
-    fast_cycles: u8,
-    steep_cycles: u8,
+    over_velocity_cycles: u8,
+    over_acceleration_cycles: u8,
     /// Time in seconds for which the torque has exceeded its limit.
-    strained_s: f64,
+    over_torque_s: f64,
     /// The last target that the drive surely has, and the consecutive fresh cycles since.
-    known: Option<Counts>,
+    last_received_target: Option<Counts>,
     fresh_cycles: u8,
     /// The configured range, widened to the position at enabling. So an axis outside its range can
     /// return; the range narrows again as it does.
-    range: Option<[f64; 2]>,
+    active_range: Option<[f64; 2]>,
 }
 
 impl SupervisionState {
     pub(super) fn starting_at(position: f64, limits: &Limits) -> Self {
         Self {
-            range: limits
+            active_range: limits
                 .position
                 .map(|[low, high]| [low.min(position), high.max(position)]),
             ..Self::default()
@@ -62,14 +62,14 @@ impl SupervisionState {
 
     /// Records a lost frame; `sent` is the target of the last answered frame.
     pub(super) fn lost(&mut self, sent: Counts) {
-        if self.known.is_none() || self.fresh_cycles > 0 {
-            self.known = Some(sent);
+        if self.last_received_target.is_none() || self.fresh_cycles > 0 {
+            self.last_received_target = Some(sent);
         }
         self.fresh_cycles = 0;
     }
 
     fn narrow(&mut self, position: f64, limits: &Limits) {
-        if let (Some(range), Some([low, high])) = (&mut self.range, limits.position) {
+        if let (Some(range), Some([low, high])) = (&mut self.active_range, limits.position) {
             range[0] = range[0].max(low.min(position));
             range[1] = range[1].min(high.max(position));
         }
@@ -169,10 +169,10 @@ impl Axis {
             let scale = &self.config.scale;
             // This set-point is already one cycle old.
             let commanded = self.expected(self.config.dead_time_s - self.dt_s);
-            self.watch.following_error = commanded - position;
+            self.supervision.following_error = commanded - position;
             // Lost frames took their targets with them: the axis may be anywhere between the last
             // known and the present target.
-            let error = match self.watch.known {
+            let error = match self.supervision.last_received_target {
                 None => commanded - position,
                 Some(known) => {
                     let known = scale.position_to_user(known).0;
@@ -180,10 +180,11 @@ impl Axis {
                     nearest - position
                 }
             };
-            self.watch.max_following_error = self.watch.max_following_error.max(error.abs());
-            self.watch.fresh_cycles = self.watch.fresh_cycles.saturating_add(1);
-            if self.watch.fresh_cycles >= CATCH_UP_CYCLES {
-                self.watch.known = None;
+            self.supervision.max_following_error =
+                self.supervision.max_following_error.max(error.abs());
+            self.supervision.fresh_cycles = self.supervision.fresh_cycles.saturating_add(1);
+            if self.supervision.fresh_cycles >= CATCH_UP_CYCLES {
+                self.supervision.last_received_target = None;
             }
             if let Some(limit) = limits.following_error
                 && error.abs() > limit
@@ -191,7 +192,7 @@ impl Axis {
                 cause = Some(Trip::FollowingError { error, limit });
             }
         } else {
-            self.watch.following_error = 0.0;
+            self.supervision.following_error = 0.0;
         }
         if self.mode == Mode::Pp && self.profile.not_taken() {
             cause = Some(Trip::SetPointNotTaken);
@@ -199,7 +200,7 @@ impl Axis {
         // While homing, positions have no defined origin.
         if self.mode != Mode::Hm
             && self.actual.counts().is_some()
-            && let Some([low, high]) = self.watch.range
+            && let Some([low, high]) = self.supervision.active_range
         {
             let margin = limits.position_margin();
             if position < low - margin || position > high + margin {
@@ -209,19 +210,19 @@ impl Axis {
                     high,
                 }));
             }
-            self.watch.narrow(position, &limits);
+            self.supervision.narrow(position, &limits);
         }
         let velocity = self.actual.velocity();
         let slack = self.velocity_slack();
         let fast = velocity.abs() > limits.velocity * OVER_VELOCITY + slack;
         if let Some(watch) = self.config.supervision.torque {
             let torque = self.actual.torque();
-            self.watch.strained_s = if torque.abs() > watch.percent {
-                self.watch.strained_s + self.dt_s
+            self.supervision.over_torque_s = if torque.abs() > watch.percent {
+                self.supervision.over_torque_s + self.dt_s
             } else {
                 0.0
             };
-            if self.watch.strained_s > watch.time_s {
+            if self.supervision.over_torque_s > watch.time_s {
                 cause = cause.or(Some(Trip::OverTorque {
                     torque,
                     limit: watch.percent,
@@ -231,24 +232,24 @@ impl Axis {
         }
         if let Some(limit) = self.config.supervision.acceleration {
             let acceleration = self.actual.acceleration();
-            self.watch.steep_cycles = if acceleration.abs() > limit {
-                self.watch.steep_cycles.saturating_add(1)
+            self.supervision.over_acceleration_cycles = if acceleration.abs() > limit {
+                self.supervision.over_acceleration_cycles.saturating_add(1)
             } else {
                 0
             };
-            if self.watch.steep_cycles >= OVER_VELOCITY_CYCLES {
+            if self.supervision.over_acceleration_cycles >= OVER_VELOCITY_CYCLES {
                 cause = cause.or(Some(Trip::OverAcceleration {
                     acceleration,
                     limit,
                 }));
             }
         }
-        self.watch.fast_cycles = if fast {
-            self.watch.fast_cycles.saturating_add(1)
+        self.supervision.over_velocity_cycles = if fast {
+            self.supervision.over_velocity_cycles.saturating_add(1)
         } else {
             0
         };
-        if self.watch.fast_cycles >= OVER_VELOCITY_CYCLES {
+        if self.supervision.over_velocity_cycles >= OVER_VELOCITY_CYCLES {
             cause = cause.or(Some(Trip::OverVelocity {
                 velocity,
                 limit: limits.velocity,
@@ -259,7 +260,7 @@ impl Axis {
 
     /// Returns the error from the resolution of the velocity, user units per second.
     fn velocity_slack(&self) -> f64 {
-        let [measured, derived] = self.fixed.slack;
+        let [measured, derived] = self.derived.slack;
         if self.actual.velocity_is_measured() {
             measured
         } else {
@@ -299,7 +300,7 @@ impl Axis {
         }
         let (acceleration, ahead) = if self.controlled_quantity() == ControlledQuantity::Position {
             (
-                self.config.limits.acceleration * PLANNED,
+                self.config.limits.acceleration * BRAKING_RESERVE,
                 self.motion.position,
             )
         } else {
@@ -316,16 +317,17 @@ impl Axis {
     /// Limits the set-point before the outputs, independently of the plan.
     pub(super) fn clamp_setpoint(&mut self, grip: ControlledQuantity, before: Motion, dt_s: f64) {
         let limits = self.config.limits;
-        let planned = (self.motion, self.given.torque);
+        let planned = (self.motion, self.loop_state.torque);
         match grip {
             ControlledQuantity::Position => {
-                let most = limits.velocity * dt_s * ROUNDING;
+                let most = limits.velocity * dt_s * VELOCITY_TOLERANCE;
                 let coasting = before.position + before.velocity * dt_s;
                 let change = limits.acceleration * dt_s * dt_s;
-                let rounded = change * LOOSE + (coasting.abs() + before.position.abs()) * ROUNDED;
+                let rounded = change * SECOND_DIFFERENCE_TOLERANCE
+                    + (coasting.abs() + before.position.abs()) * POSITION_EPSILON;
                 // A motion taken over too near to the end of the range passes the end while
                 // braking.
-                let [low, high] = limits.position.map_or(EVERYWHERE, |[low, high]| {
+                let [low, high] = limits.position.map_or(UNBOUNDED_RANGE, |[low, high]| {
                     [
                         low.min(before.position).min(coasting + change - rounded),
                         high.max(before.position).max(coasting - change + rounded),
@@ -358,10 +360,10 @@ impl Axis {
             }
             ControlledQuantity::Drive => {}
             ControlledQuantity::Torque => {
-                self.given.torque = bounded(self.given.torque, limits.torque)
+                self.loop_state.torque = bounded(self.loop_state.torque, limits.torque)
             }
         }
-        if planned != (self.motion, self.given.torque) {
+        if planned != (self.motion, self.loop_state.torque) {
             self.guarded_cycles = self.guarded_cycles.saturating_add(1);
         }
     }
