@@ -35,7 +35,7 @@ const POLL: Duration = Duration::from_micros(200);
 /// The timeout for one word; a write takes at most 10 ms.
 const TIMEOUT: Duration = Duration::from_secs(1);
 /// The number of attempts. A chip that is still writing does not acknowledge.
-const TRIES: u32 = 5;
+const MAX_ATTEMPTS: u32 = 5;
 const RETRY: Duration = Duration::from_millis(10);
 
 /// An error of the EEPROM interface.
@@ -308,7 +308,7 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
         let [c0, c1] = command.to_le_bytes();
         let [a0, a1, a2, a3] = word.to_le_bytes();
         let mut status = 0;
-        for attempt in 0..TRIES {
+        for attempt in 0..MAX_ATTEMPTS {
             if attempt > 0 {
                 self.registers.wire.delay(RETRY).await;
             }

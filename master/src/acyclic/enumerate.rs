@@ -8,7 +8,7 @@ use crate::mailbox::DatagramError;
 use ecaxis_ecat::registers;
 
 /// The number of broadcasts without an answer after which a segment counts as silent.
-const TRIES: u32 = 5;
+const MAX_ATTEMPTS: u32 = 5;
 /// The first station address assigned, as in ethercrab.
 pub(crate) const FIRST_STATION: u16 = 0x1000;
 
@@ -157,7 +157,7 @@ pub async fn read_device(
 /// # Errors
 /// [`ServiceError::NoAnswer`], [`ServiceError::Segment`].
 pub async fn count(wire: &DatagramClient) -> Result<u16, ServiceError> {
-    for _ in 0..TRIES {
+    for _ in 0..MAX_ATTEMPTS {
         match wire.count().await {
             Ok(0) | Err(DatagramError::Timeout { .. }) => {}
             Ok(count) => return Ok(count),

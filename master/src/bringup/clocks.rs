@@ -23,7 +23,7 @@ const START_DELAY_PER_DEVICE: Nanos = 5_000_000;
 /// The minimum of that delay left after the last device was configured.
 const START_MARGIN: Nanos = 10_000_000;
 /// Lost datagrams can use up the delay; then the start is repeated with a longer one.
-const TRIES: u32 = 3;
+const MAX_ATTEMPTS: u32 = 3;
 
 /// Returns `None` if no device uses distributed clocks.
 pub(super) async fn configure(
@@ -54,7 +54,7 @@ pub(super) async fn configure(
     let cycle = machine.bus.cycle_ns;
     let mut ahead = START_DELAY
         + START_DELAY_PER_DEVICE * u64::try_from(wanting.len()).unwrap_or(u64::MAX / 1_000_000_000);
-    for _ in 0..TRIES {
+    for _ in 0..MAX_ATTEMPTS {
         let now = system_time(wire, reference).await?;
         let start = (now.wrapping_add(ahead) / cycle + 1).wrapping_mul(cycle);
         for (dc, device) in &wanting {

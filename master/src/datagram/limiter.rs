@@ -10,7 +10,7 @@ use std::task::{Poll, Waker};
 
 /// The size of the window, counted from the oldest permit. Each cycle sends one frame, and an
 /// answer takes at most two cycles: more datagrams would only wait.
-const AT_ONCE: u64 = 3;
+const MAX_IN_FLIGHT: u64 = 3;
 
 #[derive(Debug, Default)]
 pub(super) struct InFlightLimiter(Mutex<State>);
@@ -49,7 +49,7 @@ impl InFlightLimiter {
         };
         poll_fn(|context| {
             let mut state = self.state();
-            if number < state.oldest + AT_ONCE {
+            if number < state.oldest + MAX_IN_FLIGHT {
                 return Poll::Ready(());
             }
             if !state.waiting.iter().any(|w| w.will_wake(context.waker())) {

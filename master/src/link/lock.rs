@@ -17,7 +17,7 @@ use super::{
 };
 
 /// The holder may exit between two attempts.
-const TRIES: u32 = 3;
+const MAX_ATTEMPTS: u32 = 3;
 
 /// The lock on an interface.
 #[derive(Debug)]
@@ -40,7 +40,7 @@ impl NicLock {
     /// [`NicInUse`] if another program holds the lock.
     pub fn take(nic: &str) -> Result<Option<Self>, NicInUse> {
         let mut holder = NicInUse { pid: None };
-        for _ in 0..TRIES {
+        for _ in 0..MAX_ATTEMPTS {
             match bind_lock_socket(nic) {
                 Ok(held) => return Ok(Some(Self { _held: held })),
                 Err(Errno::ADDRINUSE) => {}

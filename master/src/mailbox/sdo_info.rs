@@ -18,7 +18,7 @@ const ENTRY: u8 = 5;
 const ERROR: u8 = 7;
 
 /// How often a request is repeated if fragments of its answer are missing.
-const TRIES: u32 = 3;
+const MAX_ATTEMPTS: u32 = 3;
 
 /// The longest answer is a list of all 65,536 indices.
 const MAX_ANSWER: usize = 2 + 2 * 0x1_0000;
@@ -305,7 +305,7 @@ impl CoeClient {
         let mut tries = 1;
         loop {
             match self.ask_once(w, asked, &total).await {
-                Err(InfoFailure::Gap(_)) if tries < TRIES => tries += 1,
+                Err(InfoFailure::Gap(_)) if tries < MAX_ATTEMPTS => tries += 1,
                 Err(InfoFailure::Gap(error) | InfoFailure::For(error)) => return Err(error),
                 Ok(data) => return Ok(data),
             }

@@ -18,9 +18,9 @@ pub const TIMEOUT: Nanos = 500_000_000;
 /// The timeout for one object of one device.
 const MAILBOX_TIMEOUT: Duration = Duration::from_millis(200);
 /// The number of consecutive lost frames after which reading ends.
-const SILENT: u32 = 2;
+const MAX_CONSECUTIVE_LOSSES: u32 = 2;
 /// The number of attempts per frame.
-const TRIES: u32 = 3;
+const MAX_ATTEMPTS: u32 = 3;
 
 const OP: u8 = 8;
 const ERROR_COUNTERS_LEN: usize = 0x14;
@@ -253,8 +253,8 @@ impl<'a> SnapshotReader<'a> {
 
     async fn ask<const N: usize>(&mut self, place: Place, register: u16) -> ReadOutcome<N> {
         let mut bytes = [0; N];
-        for _ in 0..TRIES {
-            if self.lost >= SILENT || self.wire.now() >= self.end {
+        for _ in 0..MAX_ATTEMPTS {
+            if self.lost >= MAX_CONSECUTIVE_LOSSES || self.wire.now() >= self.end {
                 return ReadOutcome::Nothing;
             }
             let asked = match place {

@@ -31,7 +31,7 @@ use probe::ProbeMove;
 /// The timeout in ns for an axis to follow after its set-point has arrived.
 const SETTLE_TIMEOUT: Nanos = 5_000_000_000;
 /// The time in ns at standstill velocity after which an axis is at rest.
-const STANDS: Nanos = 20_000_000;
+const STANDSTILL_TIME: Nanos = 20_000_000;
 
 /// The quantity that a step's target sets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -113,7 +113,7 @@ fn forwards(start: State, distance: f64, limits: MotionLimits) -> Profile {
 }
 
 /// A third of the tries halve the bracket: enough for all bits of an f64.
-const TRIES: u32 = 180;
+const MAX_ROUNDS: u32 = 180;
 
 /// Returns the argument at which `function` has the value `wanted`. The value at `below` is lower,
 /// at `above` higher.
@@ -130,7 +130,7 @@ fn find(mut below: f64, mut above: f64, wanted: f64, mut function: impl FnMut(f6
         (above, high)
     };
     let mut last_below = None;
-    for round in 0..TRIES {
+    for round in 0..MAX_ROUNDS {
         if best.1.abs() <= close {
             break;
         }

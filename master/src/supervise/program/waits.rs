@@ -3,7 +3,7 @@
 use ecaxis_axis::status::HomingStatus;
 use ecaxis_axis::{AxisStatus, Command, Mode};
 
-use super::{SETTLE_TIMEOUT, STANDS, Supervisor};
+use super::{SETTLE_TIMEOUT, STANDSTILL_TIME, Supervisor};
 use crate::clock::{self, Nanos};
 use crate::config::{Action, Condition, Step};
 use crate::report::RunError;
@@ -70,7 +70,7 @@ impl Supervisor {
             if settling.iter().any(|status| !status.at_rest) {
                 moved = now;
             }
-            let stand = settling.is_empty() || now.saturating_sub(moved) >= STANDS;
+            let stand = settling.is_empty() || now.saturating_sub(moved) >= STANDSTILL_TIME;
             if stand || self.over(start) || now.saturating_sub(begun) > SETTLE_TIMEOUT {
                 return Ok(());
             }

@@ -110,7 +110,7 @@ fn share(cut_off: f64) -> f64 {
 }
 
 /// The time without an edge after which the shaft counts as standing, in s.
-const STANDS: f64 = 0.05;
+const STANDSTILL_S: f64 = 0.05;
 
 #[derive(Debug, Clone)]
 struct Filter {
@@ -128,7 +128,7 @@ impl Filter {
         // The count alone bounds the speed: at most the counted edges and one that may follow.
         let most = if counted != 0.0 {
             (counted.abs() + 1.0) / DT
-        } else if self.since < STANDS {
+        } else if self.since < STANDSTILL_S {
             1.0 / self.since
         } else {
             0.0

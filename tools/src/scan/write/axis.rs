@@ -17,7 +17,7 @@ const USUAL_ACCELERATION: f64 = 10.0;
 const MOST_COUNTS: f64 = 2_147_483_648.0;
 /// Percent of the rated torque, which every motor tolerates.
 const TORQUE: f64 = 100.0;
-const SILENT: &str = "the drive does not say";
+const NOT_REPORTED: &str = "the drive does not say";
 
 /// Returns the initial mode: the first of the ESI that the drive does not exclude.
 pub(super) fn mode(device: &Device, described: Option<&EsiMatch>) -> Option<esi::Mode> {
@@ -95,7 +95,10 @@ fn encoder(device: &Device, drive: &DriveInfo, lines: &mut TomlWriter) -> f64 {
         ),
         (None, None) => (
             USUAL_ENCODER,
-            format!("{MARK} counts a motor turn; {}", unsaid(device, SILENT)),
+            format!(
+                "{MARK} counts a motor turn; {}",
+                unsaid(device, NOT_REPORTED)
+            ),
         ),
     };
     lines.add("encoder", &plain(counts), &comment);
@@ -144,7 +147,7 @@ fn limits(device: &Device, drive: &DriveInfo, scale: Scale, lines: &mut TomlWrit
         "limits.velocity",
         velocity,
         USUAL_VELOCITY.min(most),
-        ("turns/s", unsaid(device, SILENT)),
+        ("turns/s", unsaid(device, NOT_REPORTED)),
         lines,
     );
 
@@ -161,7 +164,7 @@ fn limits(device: &Device, drive: &DriveInfo, scale: Scale, lines: &mut TomlWrit
         "limits.acceleration",
         acceleration,
         USUAL_ACCELERATION,
-        ("turns/s²", unsaid(device, SILENT)),
+        ("turns/s²", unsaid(device, NOT_REPORTED)),
         lines,
     );
 
