@@ -7,6 +7,7 @@ mod damage;
 mod element_cache;
 mod fuzz;
 mod layouts;
+mod oddities;
 mod own_files;
 mod partial;
 mod selection;

@@ -101,7 +101,7 @@ fn epos4_csp_starts_like_the_vendor_example() {
     );
     let dc = csp.dc.unwrap();
     assert_eq!(
-        (dc.assign_activate, dc.sync0_cycle_ns, dc.sync1_cycle_ns),
+        (dc.assign_activate, dc.sync0_cycle_ns, dc.sync1_delay_ns),
         (0x300, 1_000_000, 0)
     );
     // 0x60A9 belongs to the device, 0x60C2 and 0x6065 to the module.

@@ -3,7 +3,7 @@
 use super::pdo::{PdoSelector, conflict, contains, direction_name};
 use super::{EntryRef, SelectError};
 use crate::mode::Mode;
-use crate::model::{Coe, Direction, Entry, Pdo, PdoMapping, Position, SlotDependence};
+use crate::model::{Direction, Entry, Pdo, PdoMapping, Position, SlotDependence};
 
 impl PdoSelector<'_> {
     pub(super) fn with_own_entries(
@@ -14,12 +14,7 @@ impl PdoSelector<'_> {
         mode: Option<Mode>,
     ) -> Result<Vec<Pdo>, SelectError> {
         let label = self.label();
-        let coe = self
-            .device
-            .mailbox
-            .as_ref()
-            .and_then(|mailbox| mailbox.coe.as_ref());
-        let configurable = coe.is_some_and(|coe: &Coe| coe.pdo_config);
+        let configurable = self.coe().is_some_and(|coe| coe.pdo_config);
         let carrier = default
             .iter()
             .chain(available)

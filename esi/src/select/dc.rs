@@ -17,10 +17,16 @@ pub struct DcSettings {
     pub sync0_cycle_ns: u32,
     /// SYNC0 shift in ns.
     pub sync0_shift_ns: i32,
-    /// SYNC1 cycle time in ns, register 0x09A4.
-    pub sync1_cycle_ns: u32,
-    /// SYNC1 shift in ns.
-    pub sync1_shift_ns: i32,
+    /// The time from SYNC0 to SYNC1 in ns, register 0x09A4: SYNC1 cycle − SYNC0 cycle + shift.
+    pub sync1_delay_ns: u32,
+}
+
+impl DcSettings {
+    /// Returns `true` if the device generates SYNC1.
+    #[must_use]
+    pub fn activates_sync1(&self) -> bool {
+        self.assign_activate & SYNC1 != 0
+    }
 }
 
 const SYNC0: u16 = 0x0200;
@@ -89,10 +95,15 @@ pub(super) fn settings(mode: &DcMode, cycle_ns: u64) -> Result<DcSettings, Selec
         0 if mode.assign_activate & SYNC0 != 0 => bus,
         cycle => cycle,
     };
-    let sync1 = match cycle(mode.sync1, sync0) {
-        _ if mode.assign_activate & SYNC1 == 0 => 0,
+    // A positive factor multiplies the bus cycle, a negative one divides the SYNC0 cycle.
+    let base = if mode.sync1.factor < 0 { sync0 } else { bus };
+    let sync1_cycle = match cycle(mode.sync1, base) {
         0 => sync0,
         cycle => cycle,
+    };
+    let sync1_delay = match mode.assign_activate & SYNC1 {
+        0 => 0,
+        _ => sync1_cycle - sync0 + shift(mode.sync1, sync0),
     };
     Ok(DcSettings {
         name: mode.name.clone(),
@@ -101,9 +112,7 @@ pub(super) fn settings(mode: &DcMode, cycle_ns: u64) -> Result<DcSettings, Selec
         sync0_cycle_ns: u32::try_from(sync0).map_err(|_| error("a SYNC0 cycle"))?,
         sync0_shift_ns: i32::try_from(shift(mode.sync0, sync0))
             .map_err(|_| error("a SYNC0 shift"))?,
-        sync1_cycle_ns: u32::try_from(sync1).map_err(|_| error("a SYNC1 cycle"))?,
-        sync1_shift_ns: i32::try_from(shift(mode.sync1, sync0))
-            .map_err(|_| error("a SYNC1 shift"))?,
+        sync1_delay_ns: u32::try_from(sync1_delay).map_err(|_| error("a SYNC1 delay"))?,
     })
 }
 

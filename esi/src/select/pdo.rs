@@ -3,7 +3,7 @@
 use super::module::PluggedModule;
 use super::{EntryRef, SelectError, oversampling};
 use crate::mode::Mode;
-use crate::model::{Device, Dictionary, Direction, Pdo, SmUse};
+use crate::model::{Coe, Device, Dictionary, Direction, Pdo, SmUse};
 
 /// A named list of PDOs by SyncManager: an `AlternativeSmMapping`, or the assignment of a DC mode.
 #[derive(Clone, Copy)]
@@ -89,6 +89,10 @@ impl PdoSelector<'_> {
         pdos
     }
 
+    pub(super) fn coe(&self) -> Option<&Coe> {
+        self.device.mailbox.as_ref()?.coe.as_ref()
+    }
+
     fn of_device(&self) -> &[Pdo] {
         match self.direction {
             Direction::Rx => &self.device.rx_pdos,
@@ -158,12 +162,14 @@ impl PdoSelector<'_> {
             let usage = self.device.sync_managers.get(usize::from(sm.0));
             usage.is_some_and(|sm| sm.usage == self.usage())
         };
+        // A `Sm` of an OpMode without a `Pdo` keeps the default.
+        let lists = |sm: &&(u8, Vec<u16>)| !assignment.whole_direction || !sm.1.is_empty();
         let named = |sm| {
-            let mut all = assignment.sync_managers.iter();
+            let mut all = assignment.sync_managers.iter().filter(lists);
             all.any(|(number, _)| *number == sm)
         };
-        let whole = assignment.whole_direction
-            && assignment.sync_managers.iter().any(|sm| of_direction(&sm));
+        let mut listed = assignment.sync_managers.iter().filter(lists);
+        let whole = assignment.whole_direction && listed.any(|sm| of_direction(&sm));
         for pdo in &mut available {
             if whole || pdo.sm.is_some_and(named) {
                 pdo.sm = None;
@@ -192,11 +198,18 @@ impl PdoSelector<'_> {
         Ok(first)
     }
 
-    /// Returns the device's default assignment. Mutual exclusions are resolved in file order.
+    /// Returns the device's default assignment. Mutual exclusions are resolved in file order;
+    /// PDOs of one named assignment do not exclude each other.
     fn default_set(&self, available: &[Pdo], notes: &mut Vec<String>) -> Vec<Pdo> {
+        let is_listed = |pdo: &Pdo| {
+            let lists = self.assignment.into_iter().flat_map(|a| a.sync_managers);
+            lists.into_iter().any(|(_, pdos)| pdos.contains(&pdo.index))
+        };
         let mut set: Vec<Pdo> = Vec::new();
         for pdo in available.iter().filter(|pdo| pdo.sm.is_some()) {
-            match set.iter().find(|other| conflict(other, pdo)) {
+            let excludes =
+                |other: &&Pdo| conflict(other, pdo) && !(is_listed(other) && is_listed(pdo));
+            match set.iter().find(excludes) {
                 Some(other) => notes.push(format!(
                     "PDO 0x{:04x} is assigned by default and excluded by 0x{:04x}; it is left out",
                     pdo.index, other.index
@@ -215,19 +228,29 @@ impl PdoSelector<'_> {
         notes: &mut Vec<String>,
     ) -> Result<Vec<Pdo>, SelectError> {
         let needed = self.needed(mode);
-        if needed.iter().all(|&index| contains(&default, index)) {
-            return Ok(default);
+        if let Some(set) = self.with_objects(available, &default, &needed) {
+            return Ok(match self.direction {
+                _ if !self.coe().is_some_and(|coe| coe.pdo_assign) => set,
+                Direction::Rx => without_repeats(set, &needed, notes),
+                Direction::Tx => self.with_position(available, &default, set, &needed),
+            });
         }
-        let one = |pdo: &&Pdo| {
-            needed
+        // A mapping object without contents takes what the mode needs.
+        let is_empty = |pdo: &&Pdo| !pdo.fixed && pdo.entries.is_empty();
+        let configurable = self.coe().is_some_and(|coe| coe.pdo_config);
+        if let Some(carrier) = available.iter().find(is_empty).filter(|_| configurable) {
+            let list: Vec<_> = needed
                 .iter()
-                .all(|&index| contains(std::slice::from_ref(*pdo), index))
-        };
-        if let Some(pdo) = available.iter().find(one) {
-            return Ok(self.alongside(pdo.clone(), &default));
-        }
-        if let Some(set) = cover(available, &default, &needed) {
-            return Ok(set);
+                .map(|&index| EntryRef { index, sub: 0 })
+                .collect();
+            let empty = std::slice::from_ref(carrier);
+            if let Ok(set) = self.with_own_entries(empty, &[], &list, Some(mode)) {
+                notes.push(format!(
+                    "PDO 0x{:04x} gets the objects of mode {mode}: no PDO of the ESI has them",
+                    carrier.index
+                ));
+                return Ok(set);
+            }
         }
         match self.direction {
             Direction::Rx => Err(SelectError::ModeNotOffered {
@@ -246,6 +269,49 @@ impl PdoSelector<'_> {
                 Ok(default)
             }
         }
+    }
+
+    /// Returns an assignment with all objects: the default, or a PDO with all of them alongside the
+    /// default, or several PDOs.
+    fn with_objects(
+        &self,
+        available: &[Pdo],
+        default: &[Pdo],
+        objects: &[u16],
+    ) -> Option<Vec<Pdo>> {
+        if objects.iter().all(|&index| contains(default, index)) {
+            return Some(default.to_vec());
+        }
+        let one = available.iter().find(|pdo| contains_all(pdo, objects));
+        one.map(|pdo| self.alongside(pdo.clone(), default))
+            .or_else(|| cover(available, default, objects))
+    }
+
+    /// Adds the actual position (0x6064) to inputs without it, if a PDO contains it. The axis
+    /// supervises its position in every mode.
+    fn with_position(
+        &self,
+        available: &[Pdo],
+        default: &[Pdo],
+        mut set: Vec<Pdo>,
+        needed: &[u16],
+    ) -> Vec<Pdo> {
+        const POSITION: u16 = 0x6064;
+        if contains(&set, POSITION) {
+            return set;
+        }
+        let with_position = available.iter().filter(|pdo| {
+            let room = self.capacity(pdo) > set.len();
+            let free = set.iter().all(|other| !conflict(other, pdo));
+            room && free && contains(std::slice::from_ref(*pdo), POSITION)
+        });
+        if let Some(pdo) = with_position.min_by_key(|pdo| pdo.bit_len()) {
+            set.push(pdo.clone());
+            return set;
+        }
+        let objects = [needed, &[POSITION]].concat();
+        let one = available.iter().find(|pdo| contains_all(pdo, &objects));
+        one.map_or(set, |pdo| self.alongside(pdo.clone(), default))
     }
 
     pub(super) fn needed(&self, mode: Mode) -> Vec<u16> {
@@ -345,6 +411,48 @@ pub(super) fn conflict(a: &Pdo, b: &Pdo) -> bool {
     a.index != b.index && (excludes(a, b) || excludes(b, a))
 }
 
+/// Drops the PDOs whose objects another PDO of the set repeats, except mandatory ones. A drive
+/// would take the Controlword from any of them.
+fn without_repeats(mut set: Vec<Pdo>, needed: &[u16], notes: &mut Vec<String>) -> Vec<Pdo> {
+    // The PDO with the most objects of the mode stays.
+    let main = set.iter().rev().max_by_key(|pdo| {
+        let objects = needed.iter();
+        objects
+            .filter(|&&index| contains(std::slice::from_ref(*pdo), index))
+            .count()
+    });
+    let Some(main) = main.map(|pdo| pdo.index) else {
+        return set;
+    };
+    let objects = |pdo: &Pdo| -> Vec<(u16, u8)> {
+        let mapped = pdo.entries.iter().filter(|entry| !entry.is_gap());
+        mapped.map(|entry| (entry.index, entry.sub)).collect()
+    };
+    let mut at = 0;
+    while let Some(pdo) = set.get(at) {
+        let others: Vec<_> = set
+            .iter()
+            .filter(|other| other.index != pdo.index)
+            .collect();
+        let own = objects(pdo);
+        let repeated = |object: &(u16, u8)| {
+            let mut all = others.iter().flat_map(|other| objects(other));
+            all.any(|other| other == *object)
+        };
+        let repeats = !own.is_empty() && own.iter().all(repeated);
+        if repeats && pdo.index != main && !pdo.mandatory {
+            notes.push(format!(
+                "PDO 0x{:04x} is assigned by default and left out: 0x{main:04x} and others have its objects",
+                pdo.index
+            ));
+            set.remove(at);
+        } else {
+            at += 1;
+        }
+    }
+    set
+}
+
 /// Returns several PDOs that together contain the objects of a mode, for devices with one object
 /// per PDO. Default PDOs come first, then the shortest PDO for each missing object.
 fn cover(available: &[Pdo], default: &[Pdo], needed: &[u16]) -> Option<Vec<Pdo>> {
@@ -363,6 +471,11 @@ fn cover(available: &[Pdo], default: &[Pdo], needed: &[u16]) -> Option<Vec<Pdo>>
         set.push(pdo.clone());
     }
     Some(set)
+}
+
+fn contains_all(pdo: &Pdo, objects: &[u16]) -> bool {
+    let mut objects = objects.iter();
+    objects.all(|&index| contains(std::slice::from_ref(pdo), index))
 }
 
 pub(super) fn contains(set: &[Pdo], index: u16) -> bool {

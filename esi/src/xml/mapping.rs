@@ -11,15 +11,38 @@ pub(super) fn complete(device: &mut Device) {
     if device.slots.is_some() {
         return;
     }
-    if device.rx_pdos.is_empty() {
-        device.rx_pdos = pdos(device, Direction::Rx);
+    let mut derived = Vec::new();
+    for direction in [Direction::Rx, Direction::Tx] {
+        let pdos = match direction {
+            Direction::Rx => &device.rx_pdos,
+            Direction::Tx => &device.tx_pdos,
+        };
+        if !pdos.is_empty() {
+            continue;
+        }
+        let pdos = pdos_of(device, direction);
+        derived.extend(pdos.iter().filter(|pdo| !pdo.fixed).map(|pdo| pdo.index));
+        match direction {
+            Direction::Rx => device.rx_pdos = pdos,
+            Direction::Tx => device.tx_pdos = pdos,
+        }
     }
-    if device.tx_pdos.is_empty() {
-        device.tx_pdos = pdos(device, Direction::Tx);
+    // Without PDO elements, the access of the mapping objects says what is configurable.
+    let coe = device
+        .mailbox
+        .as_mut()
+        .and_then(|mailbox| mailbox.coe.as_mut());
+    if let Some(coe) = coe.filter(|_| !derived.is_empty()) {
+        coe.pdo_config = true;
+        let assigns = |index| {
+            let count = device.dictionary.item(index, 0);
+            count.is_some_and(|count| count.access.write != Writable::Never)
+        };
+        coe.pdo_assign |= assigns(0x1c12) || assigns(0x1c13);
     }
 }
 
-fn pdos(device: &Device, direction: Direction) -> Vec<Pdo> {
+fn pdos_of(device: &Device, direction: Direction) -> Vec<Pdo> {
     let (range, usage) = match direction {
         Direction::Rx => (0x1600..=0x17ff, SmUse::Outputs),
         Direction::Tx => (0x1a00..=0x1bff, SmUse::Inputs),
@@ -50,7 +73,9 @@ fn pdos(device: &Device, direction: Direction) -> Vec<Pdo> {
         stated = true;
         for index in defaults(object) {
             let at = pdos.iter().position(|pdo| u32::from(pdo.index) == index);
-            if let Some(at) = at {
+            if let Some(at) =
+                at.filter(|at| pdos.get(*at).is_some_and(|pdo| !pdo.entries.is_empty()))
+            {
                 let mut pdo = pdos.remove(at);
                 pdo.sm = Some(sm);
                 assigned.push(pdo);
@@ -58,7 +83,8 @@ fn pdos(device: &Device, direction: Direction) -> Vec<Pdo> {
         }
     }
     // A device without assignment objects has one PDO in each direction.
-    if let (false, Some(first), Some(sm)) = (stated, pdos.first_mut(), sync_managers.first()) {
+    let mut used = pdos.iter_mut().filter(|pdo| !pdo.entries.is_empty());
+    if let (false, Some(first), Some(sm)) = (stated, used.next(), sync_managers.first()) {
         first.sm = Some(*sm);
     }
     assigned.append(&mut pdos);
@@ -86,7 +112,7 @@ fn pdo(dictionary: &Dictionary, direction: Direction, object: &Object) -> Option
         .items
         .first()
         .is_some_and(|count| count.access.write != Writable::Never);
-    (!entries.is_empty()).then(|| Pdo {
+    (!entries.is_empty() || writable).then(|| Pdo {
         position: object.position,
         direction,
         index: object.index,

@@ -70,12 +70,8 @@ pub fn error(error: &SelectError) -> String {
 pub fn dc(selection: &Selection) -> String {
     selection.dc.as_ref().map_or_else(String::new, |dc| {
         format!(
-            " dc {:04x} sync0 {}{:+} sync1 {}{:+}",
-            dc.assign_activate,
-            dc.sync0_cycle_ns,
-            dc.sync0_shift_ns,
-            dc.sync1_cycle_ns,
-            dc.sync1_shift_ns
+            " dc {:04x} sync0 {}{:+} sync1 {:+}",
+            dc.assign_activate, dc.sync0_cycle_ns, dc.sync0_shift_ns, dc.sync1_delay_ns
         )
     })
 }

@@ -63,7 +63,7 @@ pub(super) async fn configure(
                 (registers::DC_CYCLIC_CONTROL, &[0, 0][..]),
                 (registers::DC_START_TIME, &first.to_le_bytes()),
                 (registers::DC_SYNC0_CYCLE, &dc.sync0_cycle_ns.to_le_bytes()),
-                (registers::DC_SYNC1_CYCLE, &dc.sync1_cycle_ns.to_le_bytes()),
+                (registers::DC_SYNC1_CYCLE, &dc.sync1_delay_ns.to_le_bytes()),
                 (
                     registers::DC_CYCLIC_CONTROL,
                     &dc.assign_activate.to_le_bytes(),

@@ -175,14 +175,6 @@ fn clock(device: &DeviceConfig, out: &mut Document) {
         out.line("no distributed clock (0x0980 = 0x0000)");
         return;
     };
-    let sync = |name: &str, cycle: u32, shift: i32| match cycle {
-        0 => format!("  {name} off"),
-        cycle => {
-            let sign = if shift < 0 { "-" } else { "" };
-            let [cycle, shift] = [cycle, shift.unsigned_abs()].map(|ns| duration::show(ns.into()));
-            format!("  {name} every {cycle}, shifted by {sign}{shift}")
-        }
-    };
     let (esi, position) = (device.esi_path.display(), &dc.position);
     out.line(format!(
         "distributed clock: OpMode {:?}, {esi}:{position}",
@@ -193,8 +185,19 @@ fn clock(device: &DeviceConfig, out: &mut Document) {
         "  AssignActivate 0x{:04x}: 0x0980 = 0x{low:02x}, 0x0981 = 0x{high:02x}",
         dc.assign_activate,
     ));
-    out.line(sync("SYNC0", dc.sync0_cycle_ns, dc.sync0_shift_ns));
-    out.line(sync("SYNC1", dc.sync1_cycle_ns, dc.sync1_shift_ns));
+    let show = |ns: u32| duration::show(ns.into());
+    out.line(match dc.sync0_cycle_ns {
+        0 => "  SYNC0 off".to_owned(),
+        cycle => {
+            let sign = if dc.sync0_shift_ns < 0 { "-" } else { "" };
+            let shift = show(dc.sync0_shift_ns.unsigned_abs());
+            format!("  SYNC0 every {}, shifted by {sign}{shift}", show(cycle))
+        }
+    });
+    out.line(match dc.activates_sync1() {
+        false => "  SYNC1 off".to_owned(),
+        true => format!("  SYNC1 {} after SYNC0 (0x09a4)", show(dc.sync1_delay_ns)),
+    });
 }
 
 /// Preamble, Ethernet header, FCS, gap.
