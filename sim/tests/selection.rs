@@ -1,6 +1,7 @@
 //! The drives of an ESI become simulated drives, in every cyclic mode.
 
 use crate::common::*;
+use crate::main_device::bring_up;
 use ecaxis_esi::model::{Device, Entry, EsiFile};
 use ecaxis_esi::{Mode, SelectOptions, offered_modes, select};
 use ecaxis_sim::{DeviceOptions, SimDevice};
@@ -160,4 +161,46 @@ fn drive_detected_by_its_pdos_obeys_a_torque_limit_of_zero() {
     };
     assert_eq!(speed(&mut bus, 0), 0);
     assert!((19_000..21_000).contains(&speed(&mut bus, 1000)));
+}
+
+/// ETG.1000.6, table 74: a mapping entry states its own length, which may be less than the object's.
+#[test]
+fn mapping_entry_takes_its_own_length() {
+    use ecaxis_esi::model::{Direction, Writable};
+    let mut device = coe_device();
+    let wide = [0x7010, 0x6010].map(|index| {
+        let rw = Writable::Always;
+        let parts = (1..=2).map(|sub| item(sub, 16, 16 * u32::from(sub), rw, &[0x55, 0x66]));
+        let count = [item(0, 8, 0, Writable::Never, &[2])];
+        object(index, count.into_iter().chain(parts).collect())
+    });
+    device.dictionary.objects.extend(wide);
+    device.rx_pdos = vec![pdo(
+        Direction::Rx,
+        0x1600,
+        2,
+        &[(0x7010, 1, 8), (0x7010, 2, 16)],
+    )];
+    device.tx_pdos = vec![pdo(Direction::Tx, 0x1a00, 3, &[(0x6010, 1, 8)])];
+    let mut bus = Bus::new(vec![sim(&device)]);
+    assert_eq!(bus.address_all(), 1);
+    let (_, mapped) = bring_up(&mut bus, 0x1001).unwrap();
+    assert_eq!((mapped.outputs, mapped.inputs), (3, 1));
+    let exchange = |bus: &mut Bus| {
+        let (data, counter) = bus.logical(12, mapped.logical, &[0x11, 0x22, 0x33]);
+        bus.wait(1_000_000);
+        (data[0], counter)
+    };
+    exchange(&mut bus);
+    // The device copies its outputs to its inputs.
+    assert_eq!(exchange(&mut bus), (0x11, 3));
+    let value = |sub| {
+        bus.segment
+            .device(0)
+            .unwrap()
+            .object(0x7010, sub)
+            .unwrap()
+            .to_vec()
+    };
+    assert_eq!((value(1), value(2)), (vec![0x11, 0x66], vec![0x22, 0x33]));
 }

@@ -463,11 +463,13 @@ impl PdoRules {
                 let [_, sub, low, high] = entry.to_le_bytes();
                 let index = u16::from_le_bytes([low, high]);
                 let slot = store.slot(index, sub).filter(|_| index != 0);
+                let stated = entry & 0xff;
                 // For items above 255 bits, the mapping holds only the low byte of the length.
-                let bits = match slot.and_then(|slot| store.item(slot)) {
-                    Some(item) => usize::try_from(item.bit_len).unwrap_or(0),
-                    None => (entry & 0xff) as usize,
-                };
+                let item = slot.and_then(|slot| store.item(slot));
+                let bits = item
+                    .map(|item| item.bit_len)
+                    .filter(|bits| *bits > 0xff && bits & 0xff == stated)
+                    .unwrap_or(stated) as usize;
                 if let Some(slot) = slot {
                     out.push(Mapped { slot, bit, bits });
                 }

@@ -314,7 +314,7 @@ fn sm(usage: SmUse, start_address: u16, default_size: u16, control_byte: u8) -> 
     }
 }
 
-fn pdo(direction: Direction, index: u16, sm: u8, entries: &[(u16, u8, u16)]) -> Pdo {
+pub fn pdo(direction: Direction, index: u16, sm: u8, entries: &[(u16, u8, u16)]) -> Pdo {
     Pdo {
         position: Default::default(),
         direction,
@@ -404,7 +404,7 @@ pub fn item(sub: u8, bit_len: u32, bit_offset: u32, write: Writable, default: &[
     }
 }
 
-fn object(index: u16, items: Vec<ObjectItem>) -> Object {
+pub fn object(index: u16, items: Vec<ObjectItem>) -> Object {
     Object {
         index,
         name: format!("object {index:04x}").into(),
