@@ -111,22 +111,12 @@ impl Counts {
     }
 }
 
-#[derive(Debug, Default)]
-struct Shared {
-    stop: AtomicBool,
-    counts: Mutex<Counts>,
-}
-
-impl Shared {
-    fn publish(&self, counts: &Counts) {
-        *self.counts.lock().unwrap_or_else(PoisonError::into_inner) = *counts;
-    }
-}
-
 /// A running bus; dropping it stops the thread.
 #[derive(Debug)]
 pub struct Bus {
-    shared: Arc<Shared>,
+    stop: Arc<AtomicBool>,
+    /// The bus thread publishes without waiting for readers.
+    counts: Mutex<triple_buffer::Output<Counts>>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -139,9 +129,10 @@ impl Bus {
     /// # Errors
     /// Fails if `open` fails or no thread can be started.
     pub fn start(open: ThreadSetup, segment: Segment, options: Options) -> io::Result<Self> {
-        let shared = Arc::new(Shared::default());
+        let stop = Arc::new(AtomicBool::new(false));
+        let (published, counts) = triple_buffer::triple_buffer(&Counts::default());
         let (ready, started): (Sender<io::Result<()>>, Receiver<_>) = channel();
-        let theirs = Arc::clone(&shared);
+        let stopped = Arc::clone(&stop);
         let thread =
             thread::Builder::new()
                 .name("ecaxis-bus".to_owned())
@@ -150,14 +141,15 @@ impl Bus {
                         // A missing permission shows in the number of delayed replies.
                         let _ = rt_thread::become_realtime(options.priority, options.cpu);
                         let _ = ready.send(Ok(()));
-                        Worker::new(link, segment, options, &theirs).serve();
+                        Worker::new(link, segment, options, published).serve(&stopped);
                     }
                     Err(error) => {
                         let _ = ready.send(Err(error));
                     }
                 })?;
         let bus = Self {
-            shared,
+            stop,
+            counts: Mutex::new(counts),
             thread: Some(thread),
         };
         started
@@ -209,26 +201,26 @@ impl Bus {
 
     #[must_use]
     pub fn counts(&self) -> Counts {
-        let counts = self.shared.counts.lock();
-        *counts.unwrap_or_else(PoisonError::into_inner)
+        let mut counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
+        *counts.read()
     }
 }
 
 impl Drop for Bus {
     fn drop(&mut self) {
-        self.shared.stop.store(true, Ordering::Relaxed);
+        self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
     }
 }
 
-struct Worker<'a> {
+struct Worker {
     link: Box<dyn Link>,
     segment: Segment,
     options: Options,
-    shared: &'a Shared,
     counts: Counts,
+    published: triple_buffer::Input<Counts>,
     held: FrameQueue,
     /// The buffer for a frame if the queue is full.
     spare: [u8; MAX_FRAME],
@@ -237,14 +229,19 @@ struct Worker<'a> {
     looked: Nanos,
 }
 
-impl<'a> Worker<'a> {
-    fn new(link: Box<dyn Link>, segment: Segment, options: Options, shared: &'a Shared) -> Self {
+impl Worker {
+    fn new(
+        link: Box<dyn Link>,
+        segment: Segment,
+        options: Options,
+        published: triple_buffer::Input<Counts>,
+    ) -> Self {
         Self {
             link,
             segment,
             options,
-            shared,
             counts: Counts::default(),
+            published,
             held: FrameQueue::new(MAX_REPLIES),
             spare: [0; MAX_FRAME],
             free: 0,
@@ -252,12 +249,12 @@ impl<'a> Worker<'a> {
         }
     }
 
-    fn serve(&mut self) {
+    fn serve(&mut self, stop: &AtomicBool) {
         let cycle = self.options.cycle_ns;
         let margin = LONGEST_MARGIN.min(cycle / 4);
         // The first frame of the last cycle, and the last frame.
         let (mut began, mut last) = (0, 0);
-        while !self.shared.stop.load(Ordering::Relaxed) {
+        while !stop.load(Ordering::Relaxed) {
             let now = clock::now();
             let unseen = now.saturating_sub(self.looked);
             if self.take(now) {
@@ -355,12 +352,12 @@ impl<'a> Worker<'a> {
             }
             self.counts.held_up += u64::from(late > HELD_UP);
             self.counts.too_late += u64::from(late > self.options.slack_ns);
-            self.shared.publish(&self.counts);
+            self.publish();
         }
     }
 
-    fn publish(&self) {
-        self.shared.publish(&self.counts);
+    fn publish(&mut self) {
+        self.published.write(self.counts);
     }
 }
 
