@@ -1,4 +1,4 @@
-//! Formatting of counts with nouns.
+//! Formatting of numbers.
 
 /// Returns a count with its noun: `1 frame`, `2 frames`.
 #[must_use]
@@ -6,5 +6,22 @@ pub fn pluralize(count: usize, noun: &str) -> String {
     match count {
         1 => format!("1 {noun}"),
         _ => format!("{count} {noun}s"),
+    }
+}
+
+/// Rounds to six decimals, without digits that come from computing.
+#[must_use]
+pub fn rounded(x: f64) -> f64 {
+    let rounded = (x * 1e6).round() / 1e6;
+    if rounded.is_finite() { rounded } else { x }
+}
+
+/// Returns 0.0 for a number that would print as `-0.000` with this number of decimals.
+#[must_use]
+pub fn positive_zero(x: f64, decimals: i32) -> f64 {
+    if x.abs() < 0.5 * 10_f64.powi(-decimals) {
+        0.0
+    } else {
+        x
     }
 }

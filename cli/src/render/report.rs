@@ -7,7 +7,7 @@ use ecaxis_master::rt::stats::Percentiles;
 use ecaxis_master::session::{
     AxisSummary, DeviceErrors, EmergencyLine, EventLine, Summary, ThreadSummary,
 };
-use ecaxis_master::text::pluralize;
+use ecaxis_master::text::{pluralize, positive_zero};
 use ecaxis_tools::cells;
 use ecaxis_tools::document::format::{hex_bytes, hex16};
 use ecaxis_tools::document::{Document, Table};
@@ -280,7 +280,7 @@ fn axes(summary: &Summary, out: &mut Document) {
 
 fn axis(axis: &AxisSummary) -> [String; 7] {
     let unit = &axis.unit;
-    let position = |x: f64| format!("{:.4} {unit}", positive_zero(x));
+    let position = |x: f64| format!("{:.4} {unit}", positive_zero(x, 4));
     let cyclic_position = axis.mode == "csp" && axis.was_enabled;
     let heard = axis.last_heard_s.is_none();
     let only = |show: bool, text: String| if show { text } else { "-".to_owned() };
@@ -304,11 +304,6 @@ fn axis(axis: &AxisSummary) -> [String; 7] {
         only(cyclic_position, position(axis.largest_following_error)),
         state
     ]
-}
-
-/// Replaces negative zero, which would print as `-0.0000`.
-fn positive_zero(x: f64) -> f64 {
-    if x.abs() < 0.000_05 { 0.0 } else { x }
 }
 
 #[cfg(test)]

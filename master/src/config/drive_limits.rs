@@ -9,8 +9,8 @@ use ecaxis_esi as esi;
 
 use super::problem::Problems;
 use super::raw::RawSdo;
-use super::units::rounded;
 use super::{AxisSetup, UnitSource};
+use crate::text::rounded;
 use ecaxis_ecat::object::NamedObject;
 
 const POSITION_RANGE: u16 = 0x607b;

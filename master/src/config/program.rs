@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use ecaxis_axis::{Edge, StopMethod};
 
-use super::units::rounded;
 use super::{Machine, duration};
+use crate::text::rounded;
 
 /// One step of the program.
 #[derive(Debug, Clone, PartialEq)]

@@ -52,9 +52,3 @@ pub(crate) fn unit(given: Option<&Spanned<String>>, p: &mut Problems<'_>) -> Opt
 pub(crate) fn is_turn(unit: &str) -> bool {
     TURNS.contains(&unit)
 }
-
-/// Rounds to six decimals for display.
-pub(crate) fn rounded(x: f64) -> f64 {
-    let rounded = (x * 1e6).round() / 1e6;
-    if rounded.is_finite() { rounded } else { x }
-}

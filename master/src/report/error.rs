@@ -12,7 +12,7 @@ use crate::bringup::BringUpError;
 use crate::config::LimitConflict;
 use crate::link::{LinkError, OpenError};
 use crate::rt::image::{NotMapped, TooLarge};
-use crate::text::pluralize;
+use crate::text::{pluralize, rounded};
 
 use super::{DiagnosisMessage, EmergencyReport, StepRef};
 use ecaxis_ecat::al_status_code::al_status_text;
@@ -300,12 +300,6 @@ fn al_note(al_status: Option<(u8, u16)>) -> String {
         }
         None => "cyclic frames do not return in time".to_owned(),
     }
-}
-
-/// Returns the number without digits that come from rounding.
-fn rounded(x: f64) -> f64 {
-    let short = (x * 1e6).round() / 1e6;
-    if short.is_finite() { short } else { x }
 }
 
 fn mode_note(confirmed: bool) -> &'static str {

@@ -15,6 +15,7 @@ use crate::mailbox::Mailboxes;
 use crate::rt::channel::{PhaseStatus, Snapshot};
 use crate::rt::stats::Counters;
 use crate::sys::rt_thread::{RtSetupError, RtThrottlingRisk};
+use crate::text::positive_zero;
 
 /// Receives the progress of a run.
 pub trait Observer {
@@ -109,15 +110,10 @@ impl std::fmt::Display for ProbeCapture {
             self.axis,
             self.edge,
             self.input,
-            positive_zero(at),
+            positive_zero(at, 4),
             self.unit
         )
     }
-}
-
-/// Returns `0.0` instead of `-0.0`, which would print as `-0.0000`.
-pub(crate) fn positive_zero(x: f64) -> f64 {
-    if x.abs() < 0.000_05 { 0.0 } else { x }
 }
 
 /// The machine at one moment.

@@ -2,6 +2,7 @@
 
 use anstyle::{AnsiColor, Style};
 use ecaxis_axis::State;
+use ecaxis_master::text::positive_zero;
 
 use super::panel::{AxisPanel, Messages, Panel, number};
 use super::ui::Ui;
@@ -118,9 +119,9 @@ impl Screen<'_> {
                     PLAIN,
                     format!(
                         "{:>12.3}{:>11.3}{:>9.2}",
-                        positive_zero(axis.position),
-                        positive_zero(axis.velocity),
-                        positive_zero(axis.torque)
+                        positive_zero(axis.position, 3),
+                        positive_zero(axis.velocity, 3),
+                        positive_zero(axis.torque, 2)
                     ),
                 ),
             ]
@@ -139,7 +140,7 @@ impl Screen<'_> {
                 format!(
                     "  target {} {unit}  following error {:.4} {unit}{homed}",
                     number(axis.target),
-                    positive_zero(axis.following_error),
+                    positive_zero(axis.following_error, 4),
                 ),
             ),
         ]];
@@ -223,10 +224,6 @@ fn clipped(text: &str, most: usize) -> String {
     let mut clipped: String = text.chars().take(most.saturating_sub(1)).collect();
     clipped.extend((most > 0).then_some('…'));
     clipped
-}
-
-fn positive_zero(x: f64) -> f64 {
-    if x.abs() < 0.000_5 { 0.0 } else { x }
 }
 
 #[cfg(test)]

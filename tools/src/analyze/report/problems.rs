@@ -2,19 +2,12 @@
 
 use super::{CycleReport, Report, WkcRun, called};
 use crate::document::format::time;
+use ecaxis_master::text::pluralize;
 
 /// Clocks with a larger difference in ns are not synchronized.
 const CLOCK_NS: u64 = 10_000;
 /// The maximum number of lines of one kind; further ones are counted.
 const LINES: usize = 5;
-
-fn plural(count: u64, one: &str, many: &str) -> String {
-    if count == 1 {
-        format!("1 {one}")
-    } else {
-        format!("{count} {many}")
-    }
-}
 
 pub(super) fn of(report: &Report) -> Vec<String> {
     let mut found = Vec::new();
@@ -31,7 +24,7 @@ pub(super) fn of(report: &Report) -> Vec<String> {
     if file.lost > 0 && file.answered > 0 {
         found.push(format!(
             "{} of {} sent did not come back",
-            plural(file.lost, "frame", "frames"),
+            pluralize(file.lost as usize, "frame"),
             file.sent
         ));
     }
@@ -40,15 +33,15 @@ pub(super) fn of(report: &Report) -> Vec<String> {
         let (odd, first) = odd(cycle);
         if odd > 0 {
             found.push(format!(
-                "{name}: {} another working counter than {}, the first at {first:.6} s",
-                plural(odd, "cycle has", "cycles have"),
+                "{name}: {} with another working counter than {}, the first at {first:.6} s",
+                pluralize(odd as usize, "cycle"),
                 cycle.usual_wkc.unwrap_or(0)
             ));
         }
         if let Some((at, longest)) = cycle.gaps.first() {
             found.push(format!(
                 "{name}: {} longer than the cycle of {}, the longest {} at {at:.6} s",
-                plural(cycle.gaps.len() as u64, "interval is", "intervals are"),
+                pluralize(cycle.gaps.len(), "interval"),
                 time(cycle.cycle_ns),
                 time(*longest),
             ));
