@@ -41,16 +41,6 @@ pub enum ObjectList {
     Settings = 5,
 }
 
-impl ObjectList {
-    pub const EACH: [Self; 5] = [
-        Self::All,
-        Self::RxMappable,
-        Self::TxMappable,
-        Self::Backup,
-        Self::Settings,
-    ];
-}
-
 /// A request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum InfoRequest {
@@ -213,7 +203,7 @@ pub struct EntryDescription {
 }
 
 impl CoeClient {
-    /// Returns the number of objects in each list, in the order of [`ObjectList::EACH`].
+    /// Returns the number of objects in each list, in the order of [`ObjectList`].
     pub async fn list_lengths<W: MailboxTransport>(
         &mut self,
         w: &W,

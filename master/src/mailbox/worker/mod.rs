@@ -172,19 +172,6 @@ impl DeviceMailbox {
         self.ask(index, sub, false, Some(data)).await.map(drop)
     }
 
-    /// Writes an object from `sub` (0 or 1) on by complete access.
-    ///
-    /// # Errors
-    /// As [`DeviceMailbox::upload`].
-    pub async fn download_complete(
-        &self,
-        index: u16,
-        sub: u8,
-        data: &[u8],
-    ) -> Result<(), MailboxError> {
-        self.ask(index, sub, true, Some(data)).await.map(drop)
-    }
-
     async fn ask(
         &self,
         index: u16,
