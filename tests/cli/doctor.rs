@@ -23,7 +23,7 @@ fn ids(report: &Report) -> Vec<String> {
 /// Compares the whole text with its reviewed snapshot.
 #[track_caller]
 fn reviewed(name: &str, report: &Report) {
-    let text = report.to_string();
+    let text = report.document().text(Some(80));
     assert_fits(&text);
     assert_snapshot(&format!("doctor/{name}.txt"), &text);
 }
@@ -141,7 +141,10 @@ fn doctor_survives_invalid_contents_in_every_file() {
         b"cpu\ncpu0\ncpu99999\n",
         long.as_bytes(),
     ] {
-        let text = machines::malformed(nonsense).examined().to_string();
+        let text = machines::malformed(nonsense)
+            .examined()
+            .document()
+            .text(Some(80));
         assert!(text.len() < 20_000, "{}", text.len());
         assert!(
             !text.contains(|c: char| c.is_control() && c != '\n'),
@@ -383,7 +386,8 @@ fn doctor_reports_late_wake_ups() {
         machine.tried.wake_up = Some(measured(too_late));
         let report = machine.examined();
         assert_eq!(ids(&report), expected, "{too_late}");
-        assert!(report.to_string().contains("1500 wake-ups"), "{report}");
+        let text = report.document().text(None);
+        assert!(text.contains("1500 wake-ups"), "{text}");
     }
 }
 
@@ -463,7 +467,7 @@ fn doctor_checks_an_existing_and_a_missing_interface() {
     let ran = run(["doctor", "nonet7", "--seconds", "0"]);
     assert_eq!(ran.out, "");
     ran.fails(2, &["`nonet7` does not exist"]);
-    let nics = ecaxis_tools::doctor::Host::here().interfaces();
+    let nics = ecaxis_tools::host::Host::here().interfaces();
     let Some(nic) = nics.first() else {
         return skip(NO_INTERFACE);
     };

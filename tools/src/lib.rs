@@ -5,6 +5,7 @@
 //! - [`parameters`]: object names and values; saved to files, compared, restored;
 //! - [`firmware`]: firmware updates;
 //! - [`doctor`]: checks of host settings that delay the cycle;
+//! - [`host`]: the state of a computer from its files;
 //! - [`mod@bench`]: the measurements of the benchmark;
 //! - [`analyze`]: analysis of recordings;
 //! - [`document`]: reports as data, as text and as HTML.
@@ -17,5 +18,6 @@ pub mod compare;
 pub mod doctor;
 pub mod document;
 pub mod firmware;
+pub mod host;
 pub mod parameters;
 pub mod scan;

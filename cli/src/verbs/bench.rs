@@ -13,8 +13,10 @@ use ecaxis_master::rt::spin::Spin;
 use ecaxis_master::session::Observer;
 use ecaxis_tools::bench::bus::{FaultInjection, ReplyDelay};
 use ecaxis_tools::bench::plan::{Baseline, Plan, Target, exchange_name};
-use ecaxis_tools::bench::run::{self, BenchError, BenchObserver};
+use ecaxis_tools::bench::run::{self, BenchError, BenchObserver, HostCheck};
 use ecaxis_tools::bench::{document, fixture, host, veth};
+use ecaxis_tools::doctor::{self, Measurements, RunProfile, Severity};
+use ecaxis_tools::host::Host;
 
 use crate::args::files::{Inputs, check_output, unwritable};
 use crate::args::signals;
@@ -218,7 +220,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         &bus,
         args.verbosity.plain(),
     ));
-    let report = run::run(&plan, &stop, &mut reported).map_err(|e| failure(&e, &plan))?;
+    let report = run::run(&plan, &stop, &mut reported, || check_host(&plan))
+        .map_err(|e| failure(&e, &plan))?;
     drop(reported);
     let Some(report) = report else {
         return Err(Failure::new(
@@ -246,6 +249,25 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::new(hints::INTERRUPTED, message));
     }
     Ok(())
+}
+
+/// Returns the results of `ecaxis doctor`, which explain the figures.
+fn check_host(plan: &Plan) -> HostCheck {
+    let profile = RunProfile {
+        nic: None,
+        cpu: Some(plan.cpu),
+        priority: plan.priority,
+        cycle_ns: plan.cycle_ns,
+        spin: plan.spin,
+        program: std::env::current_exe().unwrap_or_default(),
+    };
+    let report = doctor::examine(&Host::here(), &profile, Measurements::default());
+    let findings = report.findings.into_iter();
+    let findings = findings.filter(|finding| finding.severity != Severity::Note);
+    HostCheck {
+        facts: report.facts,
+        findings: findings.map(|finding| finding.found).collect(),
+    }
 }
 
 fn save(path: &Path, text: &str) -> Result<(), Failure> {

@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use ecaxis_master::config::{self, Nic, duration};
 use ecaxis_master::link::OpenError;
 use ecaxis_master::rt::spin::Spin;
-use ecaxis_tools::doctor::{self, Host, Measurements, RunProfile, Severity, ethtool, wakeup};
+use ecaxis_tools::doctor::{self, Measurements, RunProfile, Severity, ethtool, wakeup};
+use ecaxis_tools::host::Host;
 
 use crate::hints::{self, Failure};
 use crate::render::{note, print_json, print_page, stderr_is_terminal};

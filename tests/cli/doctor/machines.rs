@@ -6,7 +6,8 @@ use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
 use ecaxis_tools::doctor::ethtool::{Answers, Coalescing, EnergyEfficient};
-use ecaxis_tools::doctor::{Host, Measurements, Report, RunProfile, examine};
+use ecaxis_tools::doctor::{Measurements, Report, RunProfile, examine};
+use ecaxis_tools::host::Host;
 
 pub struct Machine {
     files: BTreeMap<String, Vec<u8>>,

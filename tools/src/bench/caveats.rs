@@ -2,6 +2,7 @@
 
 use super::plan::{Plan, Target};
 use super::report::{FEW, Variant, losses};
+use crate::host::Host;
 
 /// The stolen share of CPU time above which rare wake-ups are affected.
 const STEAL: f64 = 0.0005;
@@ -21,7 +22,7 @@ pub fn of(plan: &Plan, variants: &[Variant]) -> Vec<String> {
             "there is one CPU only: the bus and the cycle take turns on it, and no time is meaningful".to_owned(),
         );
     }
-    if crate::doctor::is_virtual() {
+    if Host::here().is_virtual() {
         remarks.push(
             "this is a virtual machine: p99.9 and max are as much the hypervisor's as this program's; compare within the table only".to_owned(),
         );
@@ -45,12 +46,13 @@ fn of_one(plan: &Plan, variant: &Variant) -> Vec<String> {
     let mut remarks = Vec::new();
     let name = &variant.name;
     let wall = variant.cycles.saturating_mul(plan.cycle_ns) as f64;
-    if let Some(taken) = &variant.taken
-        && taken.steal_ns as f64 > wall * STEAL
+    let steal_ns = variant.taken.as_ref().and_then(|taken| taken.steal_ns);
+    if let Some(steal_ns) = steal_ns
+        && steal_ns as f64 > wall * STEAL
     {
         remarks.push(format!(
             "{name}: the hypervisor took {:.1} % of CPU {} for others: its p99.9 and max say nothing of this program",
-            taken.steal_ns as f64 / wall * 100.0,
+            steal_ns as f64 / wall * 100.0,
             plan.cpu
         ));
     }

@@ -2,10 +2,12 @@
 
 use ecaxis_master::config::duration::show as duration;
 
-use super::report::{Fact, LatencySummary, Measure, Report, Variant, losses};
+use super::report::{LatencySummary, Measure, Report, Variant, losses};
 use crate::cells;
 use crate::document::format::{or_dash, time};
 use crate::document::{Axis, Chart, Document, Series, Shape, Table};
+use crate::host::Fact;
+use crate::host::counters::CpuTimeDelta;
 
 /// Returns the whole report.
 #[must_use]
@@ -189,6 +191,23 @@ fn counters(out: &mut Document, report: &Report) {
     }
 }
 
+/// Formats the time of a CPU taken by others, or `None` if nothing is known.
+fn cpu_taken(taken: &CpuTimeDelta) -> Option<String> {
+    let mut known = Vec::new();
+    if let Some(steal) = taken.steal_ns {
+        known.push(format!("by the hypervisor {}", time(steal)));
+    }
+    let most = taken.most.iter().take(2);
+    let most: Vec<String> = most.map(|i| format!("{} {}", i.count, i.name)).collect();
+    let most = taken.interrupts.map(|_| format!("({})", most.join(", ")));
+    let interrupts = taken.interrupt_ns.map(time).into_iter().chain(most);
+    let interrupts: Vec<String> = interrupts.collect();
+    if !interrupts.is_empty() {
+        known.push(format!("by interrupts {}", interrupts.join(" ")));
+    }
+    (!known.is_empty()).then(|| format!("CPU taken {}", known.join(", ")))
+}
+
 /// Formats the non-zero counters of a variant.
 fn details(v: &Variant) -> Vec<String> {
     let mut all = Vec::new();
@@ -208,16 +227,7 @@ fn details(v: &Variant) -> Vec<String> {
         );
         all.push(format!("{faults} page faults, {waits} times made to wait"));
     }
-    if let Some(taken) = &v.taken {
-        let most = taken.most.iter().take(2);
-        let most: Vec<String> = most.map(|i| format!("{} {}", i.count, i.name)).collect();
-        all.push(format!(
-            "CPU taken by the hypervisor {}, by interrupts {} ({})",
-            time(taken.steal_ns),
-            time(taken.interrupt_ns),
-            most.join(", ")
-        ));
-    }
+    all.extend(v.taken.as_ref().and_then(cpu_taken));
     if let Some(bus) = v.bus.filter(|bus| bus.held_up > 0) {
         let (held, frames) = (bus.held_up, bus.frames);
         all.push(format!(

@@ -6,9 +6,7 @@ use std::thread::{self, JoinHandle};
 
 use rustix::thread::{CpuSet, sched_getaffinity};
 
-use super::plan::Plan;
-use super::report::Fact;
-use crate::doctor::{self, Host, Measurements, RunProfile, Severity};
+use crate::host::{Fact, Host};
 use ecaxis_master::sys::rt_thread::pin;
 
 /// Returns the CPU for the cycle, isolated if possible, and the CPU for all other work. Both are
@@ -43,41 +41,21 @@ pub fn without(cpu: usize) -> Option<String> {
     (!online.contains(cpu)).then(|| online.to_string())
 }
 
-/// Returns facts about the computer and the findings of `ecaxis doctor`, which explain the figures.
-#[must_use]
-pub fn examined(plan: &Plan) -> (Vec<Fact>, Vec<String>) {
-    let info = Host::here().text("proc/cpuinfo").unwrap_or_default();
+/// Adds the processor and the load to the facts about the computer.
+pub(super) fn facts(known: Vec<Fact>) -> Vec<Fact> {
+    let host = Host::here();
+    let info = host.text("proc/cpuinfo").unwrap_or_default();
     let model = info.lines().find_map(|line| {
         let (name, value) = line.split_once(':')?;
         (name.trim() == "model name").then(|| value.trim().to_owned())
     });
-    let mut facts = Vec::new();
-    let mut add = |name, value: Option<String>| {
-        if let Some(value) = value {
-            facts.push(Fact { name, value });
-        }
-    };
-    add("processor", model);
-    let intent = RunProfile {
-        nic: None,
-        cpu: Some(plan.cpu),
-        priority: plan.priority,
-        cycle_ns: plan.cycle_ns,
-        spin: plan.spin,
-        program: std::env::current_exe().unwrap_or_default(),
-    };
-    let report = doctor::examine(&Host::here(), &intent, Measurements::default());
-    for fact in report.facts {
-        add(fact.name, Some(fact.value));
-    }
-    let load = Host::here().text("proc/loadavg");
-    add(
-        "load at the end",
-        load.and_then(|l| Some(l.split_whitespace().next()?.to_owned())),
-    );
-    let bad = |f: &doctor::Finding| f.severity != Severity::Note;
-    let findings = report.findings.into_iter().filter(bad);
-    (facts, findings.map(|finding| finding.found).collect())
+    let load = host.text("proc/loadavg");
+    let load = load.and_then(|load| Some(load.split_whitespace().next()?.to_owned()));
+    let fact = |name, value: Option<String>| value.map(|value| Fact { name, value });
+    let mut facts: Vec<Fact> = fact("processor", model).into_iter().collect();
+    facts.extend(known);
+    facts.extend(fact("load at the end", load));
+    facts
 }
 
 /// A SCHED_OTHER thread that loads a CPU and the memory bus until dropped.
@@ -132,7 +110,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn examined_returns_facts_about_this_computer() {
+    fn cpus_are_two_different_ones() {
         let (cpu, other) = cpus();
         assert_ne!(Some(cpu), other);
     }

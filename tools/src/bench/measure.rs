@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use super::bus::{Bus, Counts};
 use super::fixture::{self, RigError, Setup};
-use super::kernel::{CpuCounters, CpuTimeDelta};
+use crate::host::counters::{CpuCounters, CpuTimeDelta};
 use ecaxis_master::clock::{self, Clock, Nanos};
 use ecaxis_master::rt::channel::HostEndpoint;
 use ecaxis_master::rt::cycle::{Engine, EngineConfig};

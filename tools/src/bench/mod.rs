@@ -5,7 +5,7 @@
 //! - [`segment`]: drives as seen by cyclic frames; [`bus`] answers with them, from another CPU or on
 //!   the same thread;
 //! - [`fixture`]: a machine of such axes, built from the parts of the real cycle;
-//! - [`measure`]: runs and measures it; [`kernel`]: the kernel's counters of a CPU;
+//! - [`measure`]: runs and measures it;
 //! - [`wakeup`]: wake-up latency by the cycle's clock and by cyclictest;
 //! - [`exchange`]: the round-trip cost of a frame;
 //! - [`plan`], [`run`]: the variants and their rounds; [`peer`]: another MainDevice; [`machine`]:
@@ -18,7 +18,6 @@ mod document;
 pub mod exchange;
 pub mod fixture;
 pub mod host;
-pub mod kernel;
 pub mod machine;
 pub mod measure;
 pub mod peer;

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 
 use super::bus::Counts;
-use super::kernel::CpuTimeDelta;
-pub use crate::doctor::Fact;
+use crate::host::Fact;
+use crate::host::counters::CpuTimeDelta;
 use ecaxis_master::rt::stats::{Counters, LatencyHistogram};
 use ecaxis_master::sys::process::ThreadUsage;
 

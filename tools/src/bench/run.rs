@@ -8,14 +8,15 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use super::bus::{Bus, InProcess, Options};
 use super::fixture::{self, RigError, Setup};
 use super::host::{self, Hog};
-use super::kernel::CpuCounters;
 use super::measure::{self, Measured, Thread, TurnError};
 use super::peer;
 use super::plan::{Baseline, Plan, Target, exchange_name};
-use super::report::{Fact, LatencySummary, Report, Variant, ratios};
+use super::report::{LatencySummary, Report, Variant, ratios};
 use super::veth::VethPair;
 use super::wakeup::Cyclictest;
 use super::{caveats, machine};
+use crate::host::Fact;
+use crate::host::counters::CpuCounters;
 use ecaxis_master::config::Exchange;
 use ecaxis_master::config::duration::show as duration;
 use ecaxis_master::link::{self, Link, OpenError, SocketKind};
@@ -82,7 +83,15 @@ pub trait BenchObserver {
     fn warning(&mut self, text: &str);
 }
 
+/// Facts about the computer, and settings that disturb a cycle.
+#[derive(Debug, Clone, Default)]
+pub struct HostCheck {
+    pub facts: Vec<Fact>,
+    pub findings: Vec<String>,
+}
+
 /// Runs the plan. `stop` ends it early with the results so far; `None` if there are none.
+/// `check_host` runs after the measurements.
 ///
 /// # Errors
 /// Fails if a variant cannot be run.
@@ -90,6 +99,7 @@ pub fn run(
     plan: &Plan,
     stop: &Arc<AtomicBool>,
     watcher: &mut dyn BenchObserver,
+    check_host: impl FnOnce() -> HostCheck,
 ) -> Result<Option<Report>, BenchError> {
     let (_held, denied) = CpuWakeGuard::take(plan.awake.then_some(plan.cpu));
     for denied in denied {
@@ -126,11 +136,11 @@ pub fn run(
             }
         }
     }
-    let (facts, findings) = host::examined(plan);
+    let check = check_host();
     Ok(Some(Report {
         version: env!("CARGO_PKG_VERSION"),
-        facts,
-        findings,
+        facts: host::facts(check.facts),
+        findings: check.findings,
         settings: settings(plan),
         ratios: ratios(&variants, plan.fixed_hold()),
         variants,

@@ -1,8 +1,8 @@
 //! CPU checks: isolation of the cycle's CPU, and what slows its wake-up.
 
 use super::fix::{Fix, boot, file, write};
-use super::host::{Cpus, Host};
 use super::{Context, ReportBuilder, Severity};
+use crate::host::{Cpus, Host};
 use ecaxis_master::rt::exchange::ExchangeMode;
 
 const FOLDER: &str = "sys/devices/system/cpu";

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::host::Host;
+use crate::host::Host;
 
 /// One step of a fix.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]

@@ -1,8 +1,8 @@
 //! Interrupt checks: which CPU serves which interrupt.
 
 use super::fix::{Fix, boot};
-use super::host::{Cpus, Host};
 use super::{Context, ReportBuilder, Severity};
+use crate::host::{Cpus, Host};
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Interrupt {

@@ -5,8 +5,8 @@ use std::io::Read;
 use flate2::read::GzDecoder;
 
 use super::fix::{Fix, boot, sysctl};
-use super::host::Host;
 use super::{Context, ReportBuilder, Severity};
+use crate::host::Host;
 
 /// The maximum size of an unpacked kernel configuration in bytes; typical is 300 kB.
 const LONGEST_CONFIG: u64 = 4 << 20;
@@ -343,18 +343,13 @@ fn clock(context: &Context<'_>, notes: &mut ReportBuilder) {
     );
 }
 
-/// Returns the name of the hypervisor, or `None` on a physical computer.
-pub(super) fn hypervisor(host: &Host) -> Option<String> {
-    let cpu = host.text("proc/cpuinfo").unwrap_or_default();
-    let flags = cpu.lines().find(|line| line.starts_with("flags"));
-    let guest = flags.is_some_and(|line| line.split_whitespace().any(|f| f == "hypervisor"));
-    let kind = host
-        .text("sys/hypervisor/type")
-        .filter(|kind| !kind.is_empty());
-    if !guest && kind.is_none() {
+/// Returns a description of the hypervisor, or `None` on a physical computer.
+fn hypervisor(host: &Host) -> Option<String> {
+    if !host.is_virtual() {
         return None;
     }
-    let name = kind.or_else(|| host.text("sys/class/dmi/id/product_name"));
+    let product = || host.text("sys/class/dmi/id/product_name");
+    let name = host.hypervisor_kind().or_else(product);
     let name = name.map(|name| format!(" ({})", super::text::short(&name)));
     let stolen = stolen(host)
         .map(|share| format!(", which took {:.1} % of its CPU time so far", 100.0 * share));

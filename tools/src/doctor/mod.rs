@@ -1,7 +1,6 @@
 //! Finds host settings that delay the cycle: each finding with its effect and the command that
 //! fixes it.
 //!
-//! - `host`: the files of this computer, or a copy in a folder;
 //! - `kernel`, `cpu`, `interrupts`, `threads`, `permission`, `nic`: the checks;
 //! - [`ethtool`]: settings known only to the network driver;
 //! - `fix`: commands for the present system;
@@ -13,7 +12,6 @@
 mod cpu;
 pub mod ethtool;
 mod fix;
-mod host;
 mod interrupts;
 mod kernel;
 mod nic;
@@ -26,13 +24,12 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
+use crate::host::{Cpus, Fact, Host};
 use ecaxis_master::config::Bus;
 use ecaxis_master::rt::spin::Spin;
 use ecaxis_master::sys::rt_thread::RtSetupError;
 
 pub use fix::Fix;
-use host::Cpus;
-pub use host::Host;
 use kernel::Kernel;
 use wakeup::WakeUp;
 
@@ -58,13 +55,6 @@ pub struct Finding {
     /// The effect on the cycle if it is not fixed.
     pub cost: String,
     pub fix: Vec<Fix>,
-}
-
-/// A setting that is correct or cannot be changed.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Fact {
-    pub name: &'static str,
-    pub value: String,
 }
 
 /// The intended configuration of the run.
@@ -110,6 +100,7 @@ pub struct Measurements {
 #[derive(Debug, Clone, Serialize)]
 pub struct Report {
     pub intent: RunProfile,
+    /// Settings that are correct or cannot be changed.
     pub facts: Vec<Fact>,
     pub findings: Vec<Finding>,
     pub wake_up: Option<WakeUp>,
@@ -200,11 +191,6 @@ impl<'a> Context<'a> {
 pub fn cycle_cpu(host: &Host, intent: &RunProfile) -> Option<usize> {
     let isolated = || host.cpus("sys/devices/system/cpu/isolated")?.first();
     intent.cpu.or_else(isolated)
-}
-
-/// True on a virtual machine.
-pub(crate) fn is_virtual() -> bool {
-    kernel::hypervisor(&Host::here()).is_some()
 }
 
 /// Runs all checks.

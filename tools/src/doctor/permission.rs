@@ -3,8 +3,8 @@
 use ecaxis_master::sys::rt_thread::RtSetupError;
 
 use super::fix::Fix;
-use super::host::Host;
 use super::{Context, ReportBuilder, Severity};
+use crate::host::Host;
 
 /// Bit and name from capabilities(7).
 const NET_RAW: (u32, &str) = (13, "cap_net_raw");

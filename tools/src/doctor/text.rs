@@ -135,12 +135,6 @@ impl Report {
     }
 }
 
-impl Display for Report {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.document().text(Some(COLUMNS)))
-    }
-}
-
 impl WakeUp {
     fn add_to(&self, out: &mut Document) {
         let policy = match self.denials.is_empty() {
@@ -175,10 +169,9 @@ impl WakeUp {
         }
         out.table(table);
         for (name, method) in methods {
-            if method.involuntary_switches > 0 {
+            if let Some(switches @ 1..) = method.involuntary_switches {
                 out.line(format!(
-                    "{name}: taken off its CPU {} times by threads of higher priority or throttling",
-                    method.involuntary_switches
+                    "{name}: taken off its CPU {switches} times by threads of higher priority or throttling",
                 ));
             }
         }

@@ -1,8 +1,8 @@
 //! Thread checks: threads with higher priority, and programs that change settings during operation.
 
 use super::fix::Fix;
-use super::host::{Cpus, Host};
 use super::{Context, ReportBuilder, Severity};
+use crate::host::{Cpus, Host};
 
 /// `PF_KTHREAD` of the flags in /proc/…/stat.
 const KERNEL_THREAD: u64 = 0x0020_0000;

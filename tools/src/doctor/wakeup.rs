@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::fix::Fix;
 use super::{ReportBuilder, Severity};
-use crate::bench::kernel::CpuCounters;
+use crate::host::counters::{CpuCounters, CpuTimeDelta};
 use ecaxis_master::clock::{self, Clock};
 use ecaxis_master::config::duration;
 use ecaxis_master::rt::exchange::ExchangeMode;
@@ -33,11 +33,12 @@ pub struct WaitMethod {
     pub lateness: Percentiles,
     /// The number of wake-ups later than a quarter of the cycle.
     pub too_late: u64,
-    /// The number of times the thread was preempted.
-    pub involuntary_switches: u64,
+    /// The number of times the thread was preempted. `None`: unknown.
+    pub involuntary_switches: Option<u64>,
     /// Interrupts on the CPU during the measurement, or on all CPUs if the thread is not pinned.
+    /// `None`: unknown.
     pub interrupts: Option<u64>,
-    /// Stolen time in ms with a resolution of 10 ms, of the CPU or of all.
+    /// Stolen time in ms with a resolution of 10 ms, of the CPU or of all. `None`: unknown.
     pub stolen_ms: Option<u64>,
 }
 
@@ -110,7 +111,24 @@ fn run(setup: Setup) -> WakeUp {
 struct Sampling {
     margin: SpinWindow,
     lateness: LatencyHistogram,
-    way: WaitMethod,
+    too_late: u64,
+    /// The increments of the turns so far; `None` before the first.
+    usage: Option<TurnUsage>,
+}
+
+/// The increments of the kernel's counters in one turn or several.
+#[derive(Debug)]
+struct TurnUsage {
+    involuntary_switches: Option<u64>,
+    cpu: CpuTimeDelta,
+}
+
+impl TurnUsage {
+    fn add(&mut self, other: &Self) {
+        let switches = self.involuntary_switches.zip(other.involuntary_switches);
+        self.involuntary_switches = switches.map(|(a, b)| a + b);
+        self.cpu.add(&other.cpu);
+    }
 }
 
 impl Sampling {
@@ -118,13 +136,13 @@ impl Sampling {
         Self {
             margin: SpinWindow::new(spin, cycle, ExchangeMode::SameCycle),
             lateness: LatencyHistogram::new(),
-            way: WaitMethod::default(),
+            too_late: 0,
+            usage: None,
         }
     }
 
     fn turn(&mut self, cpu: Option<usize>, cycle: u64) {
-        let switches = || ThreadUsage::now().map_or(0, |used| used.involuntary_switches);
-        let (before, switches_before) = (CpuCounters::now(cpu), switches());
+        let (cpu_before, thread_before) = (CpuCounters::now(cpu), ThreadUsage::now().ok());
         let mut next = clock::now() + cycle;
         for _ in 0..(TURN_NS / cycle).max(4) {
             let slept = Clock::Real.sleep_until(next, self.margin.get());
@@ -132,22 +150,31 @@ impl Sampling {
             let now = clock::now();
             let late = now.saturating_sub(next);
             self.lateness.record(late);
-            self.way.too_late += u64::from(late > cycle / SHARE);
+            self.too_late += u64::from(late > cycle / SHARE);
             // Skip cycles that are already over.
             next += cycle * (1 + late / cycle);
         }
-        let way = &mut self.way;
-        way.involuntary_switches += switches().saturating_sub(switches_before);
-        if let Some(taken) = CpuCounters::now(cpu).visible_since(&before) {
-            *way.interrupts.get_or_insert(0) += taken.interrupts;
-            *way.stolen_ms.get_or_insert(0) += taken.steal_ns / 1_000_000;
+        let thread = ThreadUsage::now().ok().zip(thread_before);
+        let usage = TurnUsage {
+            involuntary_switches: thread
+                .map(|(now, before)| now.since(before).involuntary_switches),
+            cpu: CpuCounters::now(cpu).since(&cpu_before),
+        };
+        match &mut self.usage {
+            Some(sum) => sum.add(&usage),
+            None => self.usage = Some(usage),
         }
     }
 
     fn way(self) -> WaitMethod {
+        let usage = self.usage.as_ref();
+        let steal_ns = usage.and_then(|usage| usage.cpu.steal_ns);
         WaitMethod {
             lateness: self.lateness.summary(),
-            ..self.way
+            too_late: self.too_late,
+            involuntary_switches: usage.and_then(|usage| usage.involuntary_switches),
+            interrupts: usage.and_then(|usage| usage.cpu.interrupts),
+            stolen_ms: steal_ns.map(|ns| ns / 1_000_000),
         }
     }
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use crate::doctor::Host;
+use super::Host;
 
 /// `USER_HZ`, the unit of /proc/stat; 100 on every Linux.
 const TICKS_PER_SECOND: u64 = 100;
@@ -12,22 +12,22 @@ const NANOS_PER_TICK: u64 = 1_000_000_000 / TICKS_PER_SECOND;
 /// The maximum number of interrupt sources reported.
 const MAX_REPORTED: usize = 4;
 
-/// Counters of one CPU, or of all, since boot.
+/// Counters of one CPU, or of all, since boot. `None`: the kernel does not provide them.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct CpuCounters {
-    steal: u64,
-    interrupt_time: u64,
-    interrupts: BTreeMap<String, u64>,
+    steal_ns: Option<u64>,
+    interrupt_ns: Option<u64>,
+    interrupts: Option<BTreeMap<String, u64>>,
 }
 
-/// The increments of a CPU's counters.
+/// The increments of a CPU's counters. `None`: the kernel does not provide them.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct CpuTimeDelta {
     /// Time taken by the hypervisor; resolution 10 ms.
-    pub steal_ns: u64,
+    pub steal_ns: Option<u64>,
     /// Time taken by interrupts; resolution 10 ms.
-    pub interrupt_ns: u64,
-    pub interrupts: u64,
+    pub interrupt_ns: Option<u64>,
+    pub interrupts: Option<u64>,
     /// The most frequent interrupts.
     pub most: Vec<Interrupt>,
 }
@@ -39,7 +39,7 @@ pub struct Interrupt {
 }
 
 impl CpuCounters {
-    /// Returns the present counters of a CPU or of all; empty if the kernel does not provide them.
+    /// Returns the present counters of a CPU or of all.
     #[must_use]
     pub fn now(cpu: Option<usize>) -> Self {
         let read = |path| Host::here().text(path).unwrap_or_default();
@@ -47,44 +47,40 @@ impl CpuCounters {
     }
 
     fn parse(cpu: Option<usize>, stat: &str, interrupts: &str) -> Self {
-        let name = cpu.map_or("cpu".to_owned(), |cpu| format!("cpu{cpu}"));
-        let line = stat
-            .lines()
-            .map(|line| line.split_whitespace().collect::<Vec<_>>())
-            .find(|words| words.first() == Some(&name.as_str()))
-            .unwrap_or_default();
+        let ticks = ticks(cpu, stat);
         // user nice system idle iowait irq softirq steal, see proc_stat(5)
-        let ticks = |n: usize| line.get(n).and_then(|n| n.parse().ok()).unwrap_or(0_u64);
+        let nanos = |n: usize| Some(ticks.as_ref()?.get(n)? * NANOS_PER_TICK);
         Self {
-            steal: ticks(8) * NANOS_PER_TICK,
-            interrupt_time: (ticks(6) + ticks(7)) * NANOS_PER_TICK,
+            steal_ns: nanos(7),
+            interrupt_ns: nanos(5).zip(nanos(6)).map(|(hard, soft)| hard + soft),
             interrupts: counts(cpu, interrupts),
         }
-    }
-
-    /// Returns the increments since `before`; `None` if the counters are not visible here.
-    pub(crate) fn visible_since(&self, before: &Self) -> Option<CpuTimeDelta> {
-        (*self != Self::default()).then(|| self.since(before))
     }
 
     /// Returns the increments since `before`.
     #[must_use]
     pub fn since(&self, before: &Self) -> CpuTimeDelta {
-        let mut most: Vec<Interrupt> = self
-            .interrupts
-            .iter()
-            .map(|(name, count)| Interrupt {
-                name: name.clone(),
-                count: count.saturating_sub(before.interrupts.get(name).copied().unwrap_or(0)),
+        let difference = |now: Option<u64>, before: Option<u64>| {
+            now.zip(before)
+                .map(|(now, before)| now.saturating_sub(before))
+        };
+        let counts = self.interrupts.as_ref().zip(before.interrupts.as_ref());
+        let mut most: Vec<Interrupt> = counts
+            .into_iter()
+            .flat_map(|(now, before)| {
+                now.iter().map(|(name, count)| Interrupt {
+                    name: name.clone(),
+                    count: count.saturating_sub(before.get(name).copied().unwrap_or(0)),
+                })
             })
             .filter(|interrupt| interrupt.count > 0)
             .collect();
         most.sort_by_key(|i| std::cmp::Reverse(i.count));
-        let interrupts = most.iter().map(|interrupt| interrupt.count).sum();
+        let interrupts = counts.map(|_| most.iter().map(|interrupt| interrupt.count).sum());
         most.truncate(MAX_REPORTED);
         CpuTimeDelta {
-            steal_ns: self.steal.saturating_sub(before.steal),
-            interrupt_ns: self.interrupt_time.saturating_sub(before.interrupt_time),
+            steal_ns: difference(self.steal_ns, before.steal_ns),
+            interrupt_ns: difference(self.interrupt_ns, before.interrupt_ns),
             interrupts,
             most,
         }
@@ -92,11 +88,12 @@ impl CpuCounters {
 }
 
 impl CpuTimeDelta {
-    /// Adds the increments of another measurement.
+    /// Adds the increments of another measurement. A sum with an unknown part is unknown.
     pub fn add(&mut self, other: &Self) {
-        self.steal_ns += other.steal_ns;
-        self.interrupt_ns += other.interrupt_ns;
-        self.interrupts += other.interrupts;
+        let sum = |a: Option<u64>, b: Option<u64>| a.zip(b).map(|(a, b)| a + b);
+        self.steal_ns = sum(self.steal_ns, other.steal_ns);
+        self.interrupt_ns = sum(self.interrupt_ns, other.interrupt_ns);
+        self.interrupts = sum(self.interrupts, other.interrupts);
         for interrupt in &other.most {
             match self.most.iter_mut().find(|i| i.name == interrupt.name) {
                 Some(known) => known.count += interrupt.count,
@@ -108,32 +105,47 @@ impl CpuTimeDelta {
     }
 }
 
-/// Returns counts by device name, or by short name if there is no device.
-fn counts(cpu: Option<usize>, text: &str) -> BTreeMap<String, u64> {
+/// Returns the columns of a CPU in /proc/stat. Some containers show zeros only: `None`.
+fn ticks(cpu: Option<usize>, stat: &str) -> Option<Vec<u64>> {
+    let name = cpu.map_or("cpu".to_owned(), |cpu| format!("cpu{cpu}"));
+    let ticks = stat.lines().find_map(|line| {
+        let (first, columns) = line.split_once(' ')?;
+        (first == name).then(|| {
+            let columns = columns.split_whitespace();
+            columns.map_while(|word| word.parse().ok()).collect()
+        })
+    });
+    ticks.filter(|ticks: &Vec<u64>| ticks.iter().any(|n| *n > 0))
+}
+
+/// Returns counts by device name, or by short name if there is no device. `None` without a column
+/// of `cpu`.
+fn counts(cpu: Option<usize>, text: &str) -> Option<BTreeMap<String, u64>> {
     let mut lines = text.lines();
-    let head: Vec<&str> = lines
-        .next()
-        .unwrap_or_default()
-        .split_whitespace()
-        .collect();
-    let named = |head: &str| cpu.is_none_or(|cpu| head == format!("CPU{cpu}"));
-    let columns: Vec<usize> = (0..head.len()).filter(|n| named(head[*n])).collect();
+    let head: Vec<&str> = lines.next()?.split_whitespace().collect();
+    let column = match cpu {
+        Some(cpu) => Some(head.iter().position(|h| *h == format!("CPU{cpu}"))?),
+        None => None,
+    };
+    if !head.iter().any(|name| name.starts_with("CPU")) {
+        return None;
+    }
     let mut counts = BTreeMap::new();
     for line in lines {
         let Some((short, rest)) = line.split_once(':') else {
             continue;
         };
         let words: Vec<&str> = rest.split_whitespace().collect();
-        let count = |n: &usize| words.get(*n)?.parse::<u64>().ok();
-        let Some(count) = columns
-            .iter()
-            .map(count)
-            .reduce(|a, b| Some(a? + b?))
-            .flatten()
-        else {
-            continue;
+        let columns = words.iter().take(head.len());
+        let columns: Vec<u64> = columns.map_while(|word| word.parse().ok()).collect();
+        let count = match column {
+            // ERR and MIS have one column for all CPUs.
+            Some(_) if columns.len() < head.len() => continue,
+            Some(column) => columns[column],
+            None if columns.is_empty() => continue,
+            None => columns.iter().sum(),
         };
-        let reported = words.get(head.len()..).unwrap_or_default();
+        let reported = &words[columns.len()..];
         // Numbered interrupts end with the device; others have a description.
         let name = match (short.trim().parse::<u32>(), reported.last()) {
             (Ok(_), Some(device)) => (*device).to_owned(),
@@ -142,46 +154,102 @@ fn counts(cpu: Option<usize>, text: &str) -> BTreeMap<String, u64> {
         };
         *counts.entry(name).or_insert(0) += count;
     }
-    counts
+    Some(counts)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const STAT: &str = "cpu  9 9 9 9 9 9 9 9 0 0\ncpu0 1 2 3 4 5 6 7 8 0 0\ncpu1 10 20 30 40 50 60 70 80 0 0\nctxt 1\n";
-    const INTERRUPTS: &str = "           CPU0       CPU1       \n 36:          0    1687085 PCI-MSIX-0000:00:02.0   1-edge      virtio1-req.0\n\
-        LOC:    7129672    7491558   Local timer interrupts\nERR:          3\n";
+    const STAT: &str = "\
+cpu  11 22 33 44 55 66 77 88 0 0
+cpu0 1 2 3 4 5 6 7 8 0 0
+cpu1 10 20 30 40 50 60 70 80 0 0
+ctxt 1
+";
+    const INTERRUPTS: &str = "           CPU0       CPU1
+ 36:          0    1687085 PCI-MSIX-0000:00:02.0   1-edge      virtio1-req.0
+LOC:    7129672    7491558   Local timer interrupts
+ERR:          3
+MIS:          0
+";
+
+    fn named(delta: &CpuTimeDelta) -> Vec<(&str, u64)> {
+        let most = delta.most.iter();
+        most.map(|i| (i.name.as_str(), i.count)).collect()
+    }
 
     #[test]
     fn counters_read_one_cpu_from_both_files() {
         let view = CpuCounters::parse(Some(1), STAT, INTERRUPTS);
-        assert_eq!(view.steal, 800_000_000);
-        assert_eq!(view.interrupt_time, 1_300_000_000);
-        let mut later = view.clone();
-        later.steal += 20_000_000;
-        *later.interrupts.get_mut("Local timer interrupts").unwrap() += 5;
-        *later.interrupts.get_mut("virtio1-req.0").unwrap() += 7;
-        let taken = later.since(&view);
-        assert_eq!((taken.steal_ns, taken.interrupts), (20_000_000, 12));
-        let names: Vec<_> = taken
-            .most
-            .iter()
-            .map(|i| (i.name.as_str(), i.count))
-            .collect();
-        assert_eq!(names, [("virtio1-req.0", 7), ("Local timer interrupts", 5)]);
-        let all = CpuCounters::parse(None, STAT, INTERRUPTS);
-        assert_eq!(all.steal, 90_000_000);
-        assert_eq!(all.interrupts["Local timer interrupts"], 14_621_230);
+        assert_eq!(view.steal_ns, Some(800_000_000));
+        assert_eq!(view.interrupt_ns, Some(1_300_000_000));
+        let stat = STAT.replace(" 80 ", " 82 ");
+        let interrupts = INTERRUPTS
+            .replace("1687085", "1687092")
+            .replace("7491558", "7491563")
+            .replace("ERR:          3", "ERR:          9");
+        let taken = CpuCounters::parse(Some(1), &stat, &interrupts).since(&view);
+        assert_eq!(taken.steal_ns, Some(20_000_000));
+        assert_eq!(taken.interrupts, Some(12));
+        assert_eq!(
+            named(&taken),
+            [("virtio1-req.0", 7), ("Local timer interrupts", 5)]
+        );
     }
 
     #[test]
-    fn counters_of_a_missing_cpu_are_empty() {
-        let view = CpuCounters::parse(Some(7), STAT, INTERRUPTS);
-        assert_eq!(view, CpuCounters::default());
-        assert_eq!(
-            CpuCounters::parse(Some(0), "", "garbage\n: :\n"),
-            CpuCounters::default()
-        );
+    fn counters_of_all_cpus_sum_the_columns_that_exist() {
+        let all = CpuCounters::parse(None, STAT, INTERRUPTS);
+        assert_eq!(all.steal_ns, Some(880_000_000));
+        let interrupts = all.interrupts.as_ref().expect("there are columns");
+        assert_eq!(interrupts["Local timer interrupts"], 14_621_230);
+        assert_eq!((interrupts["ERR"], interrupts["MIS"]), (3, 0));
+        let later = INTERRUPTS.replace("ERR:          3", "ERR:          5");
+        let taken = CpuCounters::parse(None, STAT, &later).since(&all);
+        assert_eq!(named(&taken), [("ERR", 2)]);
+    }
+
+    #[test]
+    fn counters_of_a_missing_source_are_unknown() {
+        let unknown = CpuCounters::default();
+        assert_eq!(CpuCounters::parse(Some(7), STAT, INTERRUPTS), unknown);
+        for (stat, interrupts) in [
+            ("", ""),
+            ("", "garbage\n: :\n"),
+            ("cpu  0 0 0 0 0 0 0 0 0 0\ncpu0 0 0 0 0 0 0 0 0 0 0\n", ""),
+        ] {
+            assert_eq!(CpuCounters::parse(Some(0), stat, interrupts), unknown);
+            assert_eq!(CpuCounters::parse(None, stat, interrupts), unknown);
+        }
+        let times = CpuCounters::parse(Some(0), STAT, "");
+        let taken = times.since(&times);
+        assert_eq!((taken.steal_ns, taken.interrupt_ns), (Some(0), Some(0)));
+        assert_eq!(taken.interrupts, None);
+        let counts = CpuCounters::parse(Some(0), "", INTERRUPTS);
+        let taken = counts.since(&counts);
+        assert_eq!((taken.steal_ns, taken.interrupt_ns), (None, None));
+        assert_eq!(taken.interrupts, Some(0));
+        // Before Linux 2.6.11 there is no column `steal`.
+        let old = CpuCounters::parse(Some(0), "cpu0 1 2 3 4 5 6 7\n", "");
+        assert_eq!((old.steal_ns, old.interrupt_ns), (None, Some(130_000_000)));
+    }
+
+    #[test]
+    fn a_sum_with_an_unknown_part_is_unknown() {
+        let known = CpuTimeDelta {
+            steal_ns: Some(1),
+            interrupt_ns: Some(2),
+            interrupts: Some(3),
+            most: Vec::new(),
+        };
+        let mut sum = known.clone();
+        sum.add(&known);
+        assert_eq!(sum.interrupts, Some(6));
+        sum.add(&CpuTimeDelta {
+            interrupts: None,
+            ..known
+        });
+        assert_eq!((sum.steal_ns, sum.interrupts), (Some(3), None));
     }
 }

@@ -1,5 +1,7 @@
 //! Reads the state of a computer from its files. Paths are relative to a root folder, so that
-//! copies of other computers can be examined.
+//! copies of other computers can be examined. [`counters`]: the kernel's counters of a CPU.
+
+pub mod counters;
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
@@ -7,10 +9,19 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
+use serde::Serialize;
+
 /// The maximum number of bytes read from a file.
 const LONGEST: u64 = 1 << 20;
 /// The maximum number of CPUs.
 const MOST_CPUS: usize = 8192;
+
+/// A property of a computer or of a measurement.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Fact {
+    pub name: &'static str,
+    pub value: String,
+}
 
 /// A computer, described by its files.
 #[derive(Debug, Clone)]
@@ -35,12 +46,12 @@ impl Host {
         self.root.join(path)
     }
 
-    pub(super) fn exists(&self, path: &str) -> bool {
+    pub(crate) fn exists(&self, path: &str) -> bool {
         self.path(path).exists()
     }
 
     /// Returns the content, or `None` if the file is missing or unreadable.
-    pub(super) fn bytes(&self, path: &str) -> Option<Vec<u8>> {
+    pub(crate) fn bytes(&self, path: &str) -> Option<Vec<u8>> {
         let mut bytes = Vec::new();
         let file = File::open(self.path(path)).ok()?;
         file.take(LONGEST).read_to_end(&mut bytes).ok()?;
@@ -53,7 +64,7 @@ impl Host {
         Some(String::from_utf8_lossy(&bytes).trim().to_owned())
     }
 
-    pub(super) fn number<T: FromStr>(&self, path: &str) -> Option<T> {
+    pub(crate) fn number<T: FromStr>(&self, path: &str) -> Option<T> {
         self.text(path)?.parse().ok()
     }
 
@@ -62,7 +73,7 @@ impl Host {
     }
 
     /// Returns the sorted entries of a folder, or nothing if it is missing.
-    pub(super) fn names(&self, folder: &str) -> Vec<String> {
+    pub(crate) fn names(&self, folder: &str) -> Vec<String> {
         let Ok(entries) = fs::read_dir(self.path(folder)) else {
             return Vec::new();
         };
@@ -74,7 +85,7 @@ impl Host {
     }
 
     /// Returns the numeric entries of [`Self::names`], sorted by value.
-    pub(super) fn numbers(&self, folder: &str) -> Vec<u32> {
+    pub(crate) fn numbers(&self, folder: &str) -> Vec<u32> {
         let names = self.names(folder);
         let mut numbers: Vec<u32> = names.iter().filter_map(|n| n.parse().ok()).collect();
         numbers.sort_unstable();
@@ -82,13 +93,13 @@ impl Host {
     }
 
     /// Returns the last path component of a symlink's target.
-    pub(super) fn link(&self, path: &str) -> Option<String> {
+    pub(crate) fn link(&self, path: &str) -> Option<String> {
         let target = fs::read_link(self.path(path)).ok()?;
         Some(target.file_name()?.to_str()?.to_owned())
     }
 
     /// True if the file can be opened for writing. Writes nothing.
-    pub(super) fn writable(&self, path: &str) -> bool {
+    pub(crate) fn writable(&self, path: &str) -> bool {
         let path: &Path = &self.path(path);
         fs::OpenOptions::new().write(true).open(path).is_ok()
     }
@@ -104,6 +115,20 @@ impl Host {
         }
         names.retain(|name| name != "lo" && name != "bonding_masters");
         names
+    }
+
+    /// Returns the kind of the hypervisor, if the kernel knows it.
+    pub(crate) fn hypervisor_kind(&self) -> Option<String> {
+        let kind = self.text("sys/hypervisor/type");
+        kind.filter(|kind| !kind.is_empty())
+    }
+
+    /// True on a virtual machine.
+    pub(crate) fn is_virtual(&self) -> bool {
+        let cpu = self.text("proc/cpuinfo").unwrap_or_default();
+        let flags = cpu.lines().find(|line| line.starts_with("flags"));
+        let guest = flags.is_some_and(|line| line.split_whitespace().any(|f| f == "hypervisor"));
+        guest || self.hypervisor_kind().is_some()
     }
 }
 
