@@ -1,9 +1,11 @@
 //! The command line.
 //!
 //! - `args`: arguments that several subcommands share, and the files they name;
+//! - `access`: the bus and the device that a subcommand works on;
 //! - `verbs`: one file or folder per subcommand, each with its arguments and `run`;
 //! - `render`: text for people: summaries, tables, fault reports, progress;
-//! - `hints`: exit code, message and advice for each failure.
+//! - `hints`: message and advice for each failure;
+//! - `failure`: a failure for the user, with its exit code.
 //!
 //! Results go to stdout, progress and errors to stderr.
 
@@ -11,7 +13,9 @@ use std::process::ExitCode;
 
 use clap::Parser;
 
+mod access;
 mod args;
+mod failure;
 mod hints;
 mod render;
 mod verbs;
@@ -45,12 +49,12 @@ struct Cli {
 fn main() -> ExitCode {
     let verb = Cli::parse().verb;
     if let Some(verbosity) = verb.verbosity() {
-        verbosity.start_logging();
+        render::output::start_logging(verbosity.log_filter());
     }
     match verb.run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            failure.print();
+            render::show_failure(&failure);
             ExitCode::from(failure.code)
         }
     }

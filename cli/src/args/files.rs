@@ -9,8 +9,7 @@ use std::path::{Path, PathBuf};
 use ecaxis_master::config::Machine;
 use tempfile::NamedTempFile;
 
-use crate::hints;
-use crate::hints::Failure;
+use crate::failure::{Failure, WRONG};
 
 /// The maximum number of backups of a file.
 const MAX_BACKUPS: u32 = 1000;
@@ -34,13 +33,13 @@ pub(crate) fn write_new(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
 /// Returns the failure for a file that cannot be written.
 pub(crate) fn unwritable(path: &Path, error: &io::Error) -> Failure {
     let message = format!("cannot write {}: {error}", path.display());
-    Failure::new(hints::WRONG, message).hint(WRITABLE)
+    Failure::new(WRONG, message).hint(WRITABLE)
 }
 
 const WRITABLE: &str = "name a file in a folder that exists and can be written";
 
 pub(crate) fn already_exists(path: &Path) -> Failure {
-    Failure::new(hints::WRONG, format!("{} exists already", path.display()))
+    Failure::new(WRONG, format!("{} exists already", path.display()))
         .hint("existing files are not overwritten; name another file or remove that one")
 }
 
@@ -91,9 +90,8 @@ pub(crate) fn check_output(
     inputs: &Inputs,
 ) -> Result<(), Failure> {
     let shown = target.display();
-    let refuse = |what: String, hint: &str| {
-        Err(Failure::new(hints::WRONG, format!("{option}: {what}")).hint(hint))
-    };
+    let refuse =
+        |what: String, hint: &str| Err(Failure::new(WRONG, format!("{option}: {what}")).hint(hint));
     for (input, what) in &inputs.0 {
         if same_file(input, target) {
             return refuse(format!("{shown} is {what}"), "name another file");

@@ -1,14 +1,8 @@
 //! Arguments that several subcommands share, and the files they name.
 
-use tracing_subscriber::EnvFilter;
-
-use crate::render::{output, style};
-
-pub(crate) mod bus;
-pub(crate) mod device;
 pub(crate) mod files;
+pub(crate) mod numbers;
 pub(crate) mod record;
-pub(crate) mod signals;
 pub(crate) mod trace;
 
 #[derive(Debug, clap::Args)]
@@ -24,19 +18,13 @@ impl Verbosity {
         self.verbose > 0
     }
 
-    pub fn start_logging(&self) {
-        let level = match self.verbose {
+    /// Returns the log filter.
+    pub fn log_filter(&self) -> &'static str {
+        match self.verbose {
             0 => "warn,ethercrab=error",
             1 => "info,ecaxis=debug",
             2 => "debug,ecaxis=trace",
             _ => "trace",
-        };
-        let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
-        tracing_subscriber::fmt()
-            .with_env_filter(filter)
-            .with_writer(|| output::Log)
-            .with_ansi(style::on_stderr())
-            .with_timer(tracing_subscriber::fmt::time::uptime())
-            .init();
+        }
     }
 }

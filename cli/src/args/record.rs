@@ -5,7 +5,7 @@ use std::path::Path;
 use ecaxis_master::link::capture;
 
 use crate::args::files::{Inputs, check_output};
-use crate::hints::Failure;
+use crate::failure::Failure;
 
 /// Fails if the parts of a limited recording would overwrite another file.
 pub(crate) fn check_parts(target: &Path, force: bool, inputs: &Inputs) -> Result<(), Failure> {

@@ -1,4 +1,4 @@
-//! Failures for the user: exit code, message and advice.
+//! The message and the advice for each failure.
 
 use std::io::ErrorKind;
 use std::path::Path;
@@ -15,7 +15,7 @@ use ecaxis_master::mailbox::{NamedObject, SdoError};
 use ecaxis_master::session::RunError;
 use ecaxis_sim::ServeError;
 
-use crate::render::note;
+pub(crate) use crate::failure::{FAILED, Failure, INTERRUPTED, WRONG};
 
 mod fault_report;
 mod firmware;
@@ -27,59 +27,6 @@ pub(crate) use firmware::{firmware, shared_bus};
 use host::interfaces;
 pub(crate) use host::{capabilities, concern, denied, interface, overload};
 pub(crate) use service::{image, restore, service, with_other_main_device};
-
-/// Exit code: the machine or the bus failed.
-pub(crate) const FAILED: u8 = 1;
-/// Exit code: the file or the command line is wrong.
-pub(crate) const WRONG: u8 = 2;
-/// Exit code: a signal ended the work without another failure (128 + SIGINT).
-pub(crate) const INTERRUPTED: u8 = 130;
-
-#[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Failure {
-    pub code: u8,
-    /// The complete message. A list of problems is already formatted.
-    pub message: String,
-    pub hints: Vec<String>,
-    /// A line printed after the hints.
-    pub after: Option<String>,
-}
-
-impl Failure {
-    pub fn new(code: u8, message: impl Into<String>) -> Self {
-        Self {
-            code,
-            message: message.into(),
-            hints: Vec::new(),
-            after: None,
-        }
-    }
-
-    /// The failure of work that a signal ended.
-    pub fn interrupted() -> Self {
-        Self::new(INTERRUPTED, RunError::Interrupted.to_string())
-    }
-
-    pub fn hint(mut self, hint: impl Into<String>) -> Self {
-        self.hints.push(hint.into());
-        self
-    }
-
-    pub fn print(&self) {
-        let prefix = if self.code == INTERRUPTED || self.message.starts_with("error: ") {
-            ""
-        } else {
-            "error: "
-        };
-        note(&format!("{prefix}{}", self.message));
-        for hint in &self.hints {
-            note(&format!("  = help: {hint}"));
-        }
-        if let Some(after) = &self.after {
-            note(after);
-        }
-    }
-}
 
 /// Returns the advice for the error code of an emergency message, as for 0x603F.
 pub(crate) fn emergency(code: u16) -> &'static str {

@@ -14,7 +14,7 @@ use ecaxis_tools::document::format::{civil, hex16, times, utc};
 use ecaxis_tools::document::{Document, Table};
 
 use super::report;
-use crate::hints::{self, Failure};
+use crate::failure::{FAILED, Failure};
 use crate::render::note;
 
 /// The page width in columns.
@@ -341,7 +341,7 @@ pub(crate) fn keep(
     };
     let failed = |path: &Path, error: &std::io::Error| {
         Failure::new(
-            hints::FAILED,
+            FAILED,
             format!(
                 "the fault report cannot be written to {}: {error}",
                 path.display()

@@ -5,7 +5,7 @@ use std::io::{self, IsTerminal, Write};
 use ecaxis_tools::document::{Document, Table};
 use serde::Serialize;
 
-use crate::hints::{self, Failure};
+use crate::failure::{FAILED, Failure, INTERRUPTED};
 
 pub(crate) mod fault_report;
 pub(crate) mod output;
@@ -46,7 +46,7 @@ pub(crate) fn print_page(document: &Document) -> Result<(), Failure> {
 
 /// Prints a result as JSON, its keys in order.
 pub(crate) fn print_json(value: &impl Serialize) -> Result<(), Failure> {
-    let failed = |e| Failure::new(hints::FAILED, format!("cannot write the result: {e}"));
+    let failed = |e| Failure::new(FAILED, format!("cannot write the result: {e}"));
     let json = serde_json::to_string_pretty(value).map_err(failed)?;
     result(&(json + "\n"))
 }
@@ -55,7 +55,7 @@ pub(crate) fn print_json(value: &impl Serialize) -> Result<(), Failure> {
 fn written(done: io::Result<()>) -> Result<(), Failure> {
     match done {
         Err(e) if e.kind() != io::ErrorKind::BrokenPipe => Err(Failure::new(
-            hints::FAILED,
+            FAILED,
             format!("cannot write the result: {e}"),
         )),
         _ => Ok(()),
@@ -66,6 +66,22 @@ fn written(done: io::Result<()>) -> Result<(), Failure> {
 pub(crate) fn note(text: &str) {
     let text = output::wrapped(text, output::stderr_width());
     let _ = output::print_line(|mut err| style::complaint(&mut err, &text));
+}
+
+/// Prints a failure with its hints on stderr.
+pub(crate) fn show_failure(failure: &Failure) {
+    let prefix = if failure.code == INTERRUPTED || failure.message.starts_with("error: ") {
+        ""
+    } else {
+        "error: "
+    };
+    note(&format!("{prefix}{}", failure.message));
+    for hint in &failure.hints {
+        note(&format!("  = help: {hint}"));
+    }
+    if let Some(after) = &failure.after {
+        note(after);
+    }
 }
 
 pub(crate) fn stderr_is_terminal() -> bool {
@@ -82,7 +98,7 @@ mod tests {
         let gone = io::Error::from(io::ErrorKind::BrokenPipe);
         assert_eq!(written(Err(gone)), Ok(()));
         let full = written(Err(io::Error::from(io::ErrorKind::StorageFull))).unwrap_err();
-        assert_eq!(full.code, hints::FAILED);
+        assert_eq!(full.code, FAILED);
         assert!(full.message.contains("cannot write the result"));
     }
 }

@@ -7,6 +7,7 @@ use std::io::{self, IsTerminal, Write};
 use std::sync::{Mutex, PoisonError};
 
 use indicatif::ProgressBar;
+use tracing_subscriber::EnvFilter;
 
 use crate::render::style;
 
@@ -77,7 +78,7 @@ pub(crate) fn detach_bar() {
 
 /// A writer for log lines, which are permanent. It ignores write errors, because the subscriber
 /// would report them on stderr and panic.
-pub(crate) struct Log;
+struct Log;
 
 impl Write for Log {
     fn write(&mut self, buf: &[u8]) -> io::Result<usize> {
@@ -88,6 +89,17 @@ impl Write for Log {
     fn flush(&mut self) -> io::Result<()> {
         Ok(())
     }
+}
+
+/// Logs events to stderr. RUST_LOG overrides `level`.
+pub(crate) fn start_logging(level: &str) {
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(|| Log)
+        .with_ansi(style::on_stderr())
+        .with_timer(tracing_subscriber::fmt::time::uptime())
+        .init();
 }
 
 /// The width of stderr, or `None` if it is not a terminal.

@@ -18,8 +18,8 @@ use ecaxis_tools::bench::{document, fixture, host, veth};
 use ecaxis_tools::doctor::{self, Measurements, RunProfile, Severity};
 use ecaxis_tools::host::Host;
 
+use crate::access::signals;
 use crate::args::files::{Inputs, check_output, unwritable};
-use crate::args::signals;
 use crate::hints::{self, Failure};
 use crate::render::progress::ProgressPrinter;
 use crate::render::{note, print_json, print_page};

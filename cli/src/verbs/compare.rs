@@ -10,7 +10,7 @@ use ecaxis_tools::compare::{self, Comparison, Difference};
 use ecaxis_tools::scan::{self, Scan};
 use serde_json::{Value, json};
 
-use crate::args::bus::{self, Bus};
+use crate::access::bus::{self, Bus};
 use crate::args::files::{back_up, replace};
 use crate::hints::{self, Failure};
 use crate::render::{note, page, print_json};

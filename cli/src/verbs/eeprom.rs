@@ -11,10 +11,11 @@ use ecaxis_master::acyclic::{DatagramClient, ServiceError};
 use ecaxis_master::text::pluralize;
 use serde_json::json;
 
+use crate::access::bus;
+use crate::access::device::{DeviceArgs, DeviceError, OpenDevice, counter};
 use crate::args::Verbosity;
-use crate::args::bus;
-use crate::args::device::{DeviceArgs, DeviceError, OpenDevice, counter};
 use crate::args::files::write_new;
+use crate::args::numbers::number_16;
 use crate::hints::{self, Failure};
 use crate::render::{note, print_json, result};
 
@@ -78,7 +79,7 @@ struct ReadArgs {
     #[arg(required = true, value_name = "WORD")]
     words: Vec<String>,
     /// Read only this category, such as 30 (general) or 41 (SyncManagers)
-    #[arg(long, value_name = "TYPE", value_parser = crate::verbs::esi::number_16)]
+    #[arg(long, value_name = "TYPE", value_parser = number_16)]
     category: Option<u16>,
     /// Read the whole chip, not only up to the end of the image
     #[arg(long, conflicts_with = "category")]
@@ -108,7 +109,7 @@ struct WriteArgs {
     #[arg(required = true, value_name = "WORD")]
     words: Vec<String>,
     /// The file contains only this category
-    #[arg(long, value_name = "TYPE", value_parser = crate::verbs::esi::number_16)]
+    #[arg(long, value_name = "TYPE", value_parser = number_16)]
     category: Option<u16>,
     /// Write even if the image is for another device
     #[arg(long)]
@@ -224,9 +225,7 @@ fn replace(args: &WriteArgs) -> Result<(), Failure> {
 fn alias(args: &AliasArgs) -> Result<(), Failure> {
     let (target, rest) = args.place.take(&args.words, "an alias")?;
     let alias = match rest {
-        [alias] => {
-            crate::verbs::esi::number_16(alias).map_err(|error| format!("`{alias}`: {error}"))
-        }
+        [alias] => number_16(alias).map_err(|error| format!("`{alias}`: {error}")),
         _ => Err("one alias, decimal or 0x…".to_owned()),
     };
     let alias = alias.map_err(|error| Failure::new(hints::WRONG, error))?;

@@ -11,9 +11,9 @@ use ecaxis_master::session::{self, Options, Outcome, Summary};
 use ecaxis_sim::FaultScript;
 use serde_json::{Value, json};
 
+use crate::access::signals;
 use crate::args::files::{Inputs, check_output};
 use crate::args::record;
-use crate::args::signals;
 use crate::hints::{self, Failure};
 use crate::render::fault_report::{self, ReportDestination};
 use crate::render::progress::ProgressPrinter;

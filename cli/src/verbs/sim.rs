@@ -16,8 +16,8 @@ use serde_json::{Value, json};
 
 use ecaxis_master::text::pluralize;
 
+use crate::access::signals;
 use crate::args::files::{Inputs, check_output, unwritable, write_new};
-use crate::args::signals;
 use crate::args::trace::Trace;
 use crate::hints::{self, Failure};
 use crate::render::{note, result};

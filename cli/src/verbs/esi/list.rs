@@ -8,6 +8,7 @@ use ecaxis_tools::cells;
 use ecaxis_tools::document::Table;
 use ecaxis_tools::document::format::hex32;
 
+use crate::args::numbers::number;
 use crate::hints::{self, Failure};
 use crate::render::{note, print_json, print_table};
 
@@ -25,13 +26,13 @@ pub(crate) struct Args {
     #[arg(value_name = "PATH")]
     path: PathBuf,
     /// Vendor ID, decimal or 0x…
-    #[arg(long, value_parser = super::number)]
+    #[arg(long, value_parser = number)]
     vendor: Option<u32>,
     /// Product code, decimal or 0x…
-    #[arg(long, value_parser = super::number)]
+    #[arg(long, value_parser = number)]
     product: Option<u32>,
     /// Revision of the device, decimal or 0x…; needs `--vendor` and `--product`
-    #[arg(long, value_parser = super::number, requires = "vendor", requires = "product")]
+    #[arg(long, value_parser = number, requires = "vendor", requires = "product")]
     revision: Option<u32>,
     /// Match rule for revisions: equal, newer (the device may be newer than its description),
     /// high-word, low-word, ignore

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use ecaxis_esi::sii::{self, SiiOptions};
 
 use super::DeviceArgs;
+use crate::args::numbers::number;
 use crate::hints::{self, Failure};
 use crate::render::note;
 
@@ -23,7 +24,7 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "IMAGE")]
     output: PathBuf,
     /// Serial number
-    #[arg(long, default_value = "0", value_parser = super::number)]
+    #[arg(long, default_value = "0", value_parser = number)]
     serial: u32,
     /// Station alias
     #[arg(long, default_value_t = 0)]

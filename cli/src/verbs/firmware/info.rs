@@ -3,8 +3,8 @@
 use ecaxis_tools::firmware;
 
 use super::{TargetArgs, show};
-use crate::args::bus;
-use crate::args::device::{self, Target};
+use crate::access::bus;
+use crate::access::device::{self, Target};
 use crate::hints::{self, Failure};
 use crate::render::{print, print_json};
 

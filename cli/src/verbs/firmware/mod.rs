@@ -11,7 +11,7 @@ use ecaxis_master::clock::Clock;
 use ecaxis_master::config::Nic;
 use ecaxis_master::session::Options;
 
-use crate::args::device::{DeviceArgs, Target};
+use crate::access::device::{DeviceArgs, Target};
 use crate::args::files::{Inputs, check_output};
 use crate::hints::{Failure, WRONG};
 use crate::verbs::run;

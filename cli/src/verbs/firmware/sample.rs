@@ -5,11 +5,11 @@ use std::path::PathBuf;
 use ecaxis_master::config;
 use ecaxis_sim::FirmwareHeader;
 
-use crate::args::device::named;
+use crate::access::device::named;
 use crate::args::files::write_new;
+use crate::args::numbers::number;
 use crate::hints::{self, Failure};
 use crate::render::note;
-use crate::verbs::esi::number;
 
 /// The maximum program size in bytes.
 const MOST: usize = 16 << 20;

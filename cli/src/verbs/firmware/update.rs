@@ -14,11 +14,11 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
 use super::{TargetArgs, show, wrong};
-use crate::args::bus;
-use crate::args::device::Target;
+use crate::access::bus;
+use crate::access::device::Target;
+use crate::args::numbers::number;
 use crate::hints::{self, Failure};
 use crate::render::{note, output, print, print_json, style};
-use crate::verbs::esi::number;
 
 /// The maximum file size in bytes.
 const MOST: u64 = 256 << 20;

@@ -19,6 +19,7 @@ use super::panel::{AxisPanel, Panel, number};
 use crate::hints;
 use crate::hints::Failure;
 use crate::render::progress::ProgressPrinter;
+use crate::render::show_failure;
 
 /// The number of lines read ahead; then the writer blocks.
 const AHEAD: usize = 64;
@@ -221,7 +222,7 @@ impl Script {
             let mut first = self.failure.lock().unwrap_or_else(PoisonError::into_inner);
             first.get_or_insert(failure);
         } else {
-            failure.print();
+            show_failure(&failure);
         }
         self.strict
     }

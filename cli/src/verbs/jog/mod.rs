@@ -27,8 +27,8 @@ use ecaxis_master::supervise::jog::{
     HOLD_TO_RUN_TIMEOUT, Operator, OperatorInput, Presence, Request, View,
 };
 
+use crate::access::signals;
 use crate::args::files::{Inputs, check_output};
-use crate::args::signals;
 use crate::hints;
 use crate::hints::Failure;
 use crate::render::print;
@@ -45,7 +45,7 @@ mod draw;
 mod keys;
 mod lines;
 mod panel;
-pub(crate) mod terminal;
+mod terminal;
 mod ui;
 
 /// The maximum silence of the terminal in ns; then the operator counts as absent.
@@ -120,7 +120,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return lines::run(machine, options, stop, args.json);
     }
     let terminal = Terminal::take().map_err(no_terminal)?;
-    signals::stop_quietly(&stop);
+    signals::stop_quietly(&stop, terminal::restore);
     let shared = Arc::new(Shared::default());
     let Outcome {
         summary,

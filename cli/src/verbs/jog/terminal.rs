@@ -137,7 +137,7 @@ pub(super) fn ours() -> bool {
 }
 
 /// Restores the terminal if it was set up. Only the first call has an effect.
-pub(crate) fn restore() {
+pub(super) fn restore() {
     let mut taken = TAKEN.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(before) = taken.take() {
         // A closed terminal needs no restoring.

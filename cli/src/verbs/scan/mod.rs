@@ -6,7 +6,7 @@ use ecaxis_master::config::{self, Nic};
 use ecaxis_master::esi_library::{self, Library};
 use ecaxis_tools::scan::{self, EsiMatch, MainDeviceEvidence, Scan, esi_match};
 
-use crate::args::bus::{self, Bus};
+use crate::access::bus::{self, Bus};
 use crate::hints::{self, Failure};
 use crate::render::{note, print_json, print_page, result};
 

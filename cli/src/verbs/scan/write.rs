@@ -7,7 +7,7 @@ use ecaxis_master::text::pluralize;
 use ecaxis_tools::scan::write::{self, MARK, OutputPath};
 
 use super::ScanResult;
-use crate::args::bus;
+use crate::access::bus;
 use crate::args::files::replace;
 use crate::hints::{self, Failure};
 use crate::render::{note, result};

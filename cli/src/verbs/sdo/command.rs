@@ -4,7 +4,7 @@ use ecaxis_master::mailbox::MailboxTransport;
 use ecaxis_tools::parameters::command::Command;
 use serde_json::json;
 
-use crate::args::device::{DeviceArgs, Open, no_more};
+use crate::access::device::{DeviceArgs, Open, no_more};
 use crate::hints::{self, Failure};
 use crate::render::{note, print_json};
 

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::dump::taken;
 use super::{Common, as_json, load, print_differences};
-use crate::args::device::Open;
+use crate::access::device::Open;
 use crate::hints::{self, Failure};
 use crate::render::print_json;
 

@@ -7,8 +7,8 @@ use ecaxis_tools::parameters::upload::collect;
 use serde_json::json;
 
 use super::{Common, refusal};
-use crate::args::bus;
-use crate::args::device::{Open, address, counter};
+use crate::access::bus;
+use crate::access::device::{Open, address, counter};
 use crate::args::files::write_new;
 use crate::hints::{self, Failure};
 use crate::render::{note, print_json};

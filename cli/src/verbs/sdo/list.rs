@@ -1,7 +1,7 @@
 //! `ecaxis sdo list`.
 
 use super::Common;
-use crate::args::device::{Open, no_more};
+use crate::access::device::{Open, no_more};
 use crate::hints::Failure;
 use crate::verbs::esi::objects;
 

@@ -14,8 +14,8 @@ use ecaxis_tools::parameters::dump::Dump;
 use ecaxis_tools::parameters::lookup::{FindError, ObjectQuery, find};
 use serde_json::{Value, json};
 
+use crate::access::device::{DeviceArgs, Target, address};
 use crate::args::Verbosity;
-use crate::args::device::{DeviceArgs, Target, address};
 use crate::hints::{self, Failure};
 use crate::render::{print_table, result};
 

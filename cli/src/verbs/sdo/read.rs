@@ -12,7 +12,7 @@ use ecaxis_tools::parameters::{DataType, dictionary, name_of, type_of};
 use serde_json::json;
 
 use super::{Common, Line, print_lines, wanted};
-use crate::args::device::{Open, address};
+use crate::access::device::{Open, address};
 use crate::hints::{self, Failure};
 use crate::render::{note, print_json};
 

@@ -6,8 +6,8 @@ use ecaxis_tools::parameters::restore::{Restored, restore};
 use serde_json::json;
 
 use super::{Common, as_json, load, print_differences, refusal};
-use crate::args::bus;
-use crate::args::device::{Open, address, counter};
+use crate::access::bus;
+use crate::access::device::{Open, address, counter};
 use crate::hints::{self, Failure};
 use crate::render::{note, print_json};
 

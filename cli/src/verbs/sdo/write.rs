@@ -10,7 +10,7 @@ use serde_json::json;
 
 use super::read::{data_type, describe, hex, parts};
 use super::{Common, Line, print_lines};
-use crate::args::device::{Open, address};
+use crate::access::device::{Open, address};
 use crate::hints::{self, Failure};
 use crate::render::{note, print_json};
 

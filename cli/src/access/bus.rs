@@ -10,9 +10,8 @@ use ecaxis_master::config::{Machine, Nic};
 use ecaxis_master::link::{self, Link, SocketKind};
 use ecaxis_master::session::{self, Options, RunError};
 
-use crate::args::signals;
-use crate::hints;
-use crate::hints::Failure;
+use crate::access::signals;
+use crate::hints::{self, Failure};
 use crate::render::note;
 use crate::render::output;
 

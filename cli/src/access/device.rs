@@ -15,10 +15,9 @@ use ecaxis_master::mailbox::{CoeClient, NamedObject};
 use ecaxis_tools::parameters::dictionary;
 use ecaxis_tools::parameters::dump::Origin;
 
-use crate::args::bus::{self, Bus};
-use crate::hints;
-use crate::hints::Failure;
-use crate::verbs::esi::number_16;
+use crate::access::bus::{self, Bus};
+use crate::args::numbers::number_16;
+use crate::hints::{self, Failure};
 
 /// Options that select one device
 #[derive(Debug, Clone, clap::Args)]

@@ -10,25 +10,24 @@ use ecaxis_master::session::{self, SignalReport};
 use tokio::runtime::Builder;
 use tokio::signal::unix::{SignalKind, signal};
 
-use crate::hints::FAILED;
+use crate::failure::FAILED;
 use crate::render::note;
-use crate::verbs::jog;
 
 /// Sets `stop` at the first signal that ends the program; the next signal exits at once. An
 /// installation failure is only reported, because the program ends without signals, too.
 pub(crate) fn stop_on_interrupt(stop: &Arc<AtomicBool>) {
-    listen(stop, true);
+    listen(stop, true, || {});
 }
 
-/// Like [`stop_on_interrupt`], but prints nothing until the program exits.
-pub(crate) fn stop_quietly(stop: &Arc<AtomicBool>) {
-    listen(stop, false);
+/// Like [`stop_on_interrupt`], but prints nothing until the program exits. `restore` runs first.
+pub(crate) fn stop_quietly(stop: &Arc<AtomicBool>, restore: impl Fn() + Send + 'static) {
+    listen(stop, false, restore);
 }
 
-fn listen(stop: &Arc<AtomicBool>, aloud: bool) {
+fn listen(stop: &Arc<AtomicBool>, aloud: bool, restore: impl Fn() + Send + 'static) {
     let listens = session::stop_on_signals(Arc::clone(stop), move |report| {
         if report == SignalReport::StopRepeated {
-            jog::terminal::restore();
+            restore();
             note(&report.to_string());
             std::process::exit(i32::from(FAILED));
         }

@@ -1,0 +1,5 @@
+//! The bus and the device that a subcommand works on, and the signals that end the work.
+
+pub(crate) mod bus;
+pub(crate) mod device;
+pub(crate) mod signals;
