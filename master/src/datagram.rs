@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use ecaxis_ecat::registers;
 use ethercrab::error::Error;
-use ethercrab::{Command, MainDevice};
+use ethercrab::{Command, MainDevice, WrappedRead, WrappedWrite};
 
 use crate::cancel::CancelToken;
 use crate::clock::{self, Nanos};
@@ -62,12 +62,8 @@ impl DatagramClient {
         register: u16,
         buf: &mut [u8],
     ) -> Result<u16, DatagramError> {
-        let len = length(buf)?;
-        let _turn = self.turns.take().await;
-        let answer = Command::aprd(position, register)
-            .receive_slice(self.device, len)
-            .await;
-        working_counter(answer.map(|pdu| copy(&pdu, buf)), 1, position, register)
+        let command = Command::aprd(position, register);
+        self.read_one(command, position, register, buf).await
     }
 
     /// Writes by position in the segment (APWR). Returns the working counter.
@@ -80,11 +76,42 @@ impl DatagramClient {
         register: u16,
         data: &[u8],
     ) -> Result<u16, DatagramError> {
+        let command = Command::apwr(position, register);
+        self.write_one(command, position, register, data).await
+    }
+
+    /// Reads from one SubDevice. `address`: its position or station, for errors.
+    async fn read_one(
+        &self,
+        command: WrappedRead,
+        address: u16,
+        register: u16,
+        buf: &mut [u8],
+    ) -> Result<u16, DatagramError> {
+        let len = u16::try_from(buf.len()).map_err(|_| {
+            DatagramError::Other(format!("a datagram cannot read {} bytes", buf.len()))
+        })?;
         let _turn = self.turns.take().await;
-        let answer = Command::apwr(position, register)
-            .send_receive_slice(self.device, data)
-            .await;
-        working_counter(answer.map(|_| ()), 1, position, register)
+        let answer = command.receive_slice(self.device, len).await;
+        let answer = answer.map(|pdu| {
+            for (to, from) in buf.iter_mut().zip(pdu.iter()) {
+                *to = *from;
+            }
+        });
+        working_counter(answer, 1, address, register)
+    }
+
+    /// Writes to one SubDevice. `address`: its position or station, for errors.
+    async fn write_one(
+        &self,
+        command: WrappedWrite,
+        address: u16,
+        register: u16,
+        data: &[u8],
+    ) -> Result<u16, DatagramError> {
+        let _turn = self.turns.take().await;
+        let answer = command.send_receive_slice(self.device, data).await;
+        working_counter(answer.map(|_| ()), 1, address, register)
     }
 }
 
@@ -117,17 +144,6 @@ impl DatagramClient {
     }
 }
 
-fn length(buf: &[u8]) -> Result<u16, DatagramError> {
-    u16::try_from(buf.len())
-        .map_err(|_| DatagramError::Other(format!("a datagram cannot read {} bytes", buf.len())))
-}
-
-fn copy(from: &[u8], to: &mut [u8]) {
-    for (to, from) in to.iter_mut().zip(from) {
-        *to = *from;
-    }
-}
-
 impl MailboxTransport for DatagramClient {
     async fn read(
         &self,
@@ -135,20 +151,13 @@ impl MailboxTransport for DatagramClient {
         register: u16,
         buf: &mut [u8],
     ) -> Result<u16, DatagramError> {
-        let len = length(buf)?;
-        let _turn = self.turns.take().await;
-        let answer = Command::fprd(station, register)
-            .receive_slice(self.device, len)
-            .await;
-        working_counter(answer.map(|pdu| copy(&pdu, buf)), 1, station, register)
+        let command = Command::fprd(station, register);
+        self.read_one(command, station, register, buf).await
     }
 
     async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, DatagramError> {
-        let _turn = self.turns.take().await;
-        let answer = Command::fpwr(station, register)
-            .send_receive_slice(self.device, data)
-            .await;
-        working_counter(answer.map(|_| ()), 1, station, register)
+        let command = Command::fpwr(station, register);
+        self.write_one(command, station, register, data).await
     }
 
     async fn delay(&self, duration: Duration) {
