@@ -5,13 +5,22 @@ use std::path::Path;
 use ecaxis_master::link::capture;
 
 use crate::args::files::{Inputs, check_output};
-use crate::failure::Failure;
+use crate::failure::{Failure, WRONG};
 
-/// Fails if the parts of a limited recording would overwrite another file.
+/// Fails if the parts of a limited recording would overwrite another file, such as a part of an
+/// older recording.
 pub(crate) fn check_parts(target: &Path, force: bool, inputs: &Inputs) -> Result<(), Failure> {
-    let parts = capture::parts_of(target).unwrap_or_default();
-    let mut parts = parts.iter();
-    parts.try_for_each(|part| check_output("--record-limit", part, force, inputs))
+    for part in capture::parts_of(target).unwrap_or_default() {
+        check_output("--record-limit", &part, true, inputs)?;
+        let old = std::fs::metadata(&part).is_ok_and(|file| file.len() > 0);
+        if old && !force {
+            let shown = part.display();
+            let message = format!("--record-limit: {shown} is a part of an older recording");
+            return Err(Failure::new(WRONG, message)
+                .hint("name another file, or overwrite the older recording with `--force`"));
+        }
+    }
+    Ok(())
 }
 
 /// The minimum size: the first of four parts should hold the bring-up of a long bus.
@@ -103,7 +112,9 @@ mod tests {
         assert_eq!(check_parts(&path, false, &Inputs::default()), Ok(()));
         std::fs::write(folder.path().join("run.0002.pcapng"), "part").unwrap();
         let failure = check_parts(&path, false, &Inputs::default()).unwrap_err();
-        assert!(failure.message.contains("run.0002.pcapng"), "{failure:?}");
+        let expected = "run.0002.pcapng is a part of an older recording";
+        assert!(failure.message.ends_with(expected), "{failure:?}");
+        assert!(failure.hints[0].contains("`--force`"), "{failure:?}");
         assert_eq!(check_parts(&path, true, &Inputs::default()), Ok(()));
     }
 }
