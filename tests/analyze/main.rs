@@ -166,7 +166,10 @@ fn analyze_reports_bring_up_cycle_and_motion_of_an_own_run() {
             .collect::<Vec<_>>()
     );
 
-    let html = analyze::document("run.pcapng", &report, &[], false).html();
+    let html = analyze::document("run.pcapng", &report, &[], true).html();
+    assert!(html.contains("<th>states</th>"), "{html}");
+    let states = report.devices[0].states.join(" → ");
+    assert!(html.contains(&format!("<td>{states}</td>")), "{states}");
     let (charts, _) = assert_well_formed(&html);
     assert_eq!(
         charts,

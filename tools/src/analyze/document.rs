@@ -73,11 +73,15 @@ fn devices(report: &Report, all: bool, out: &mut Document) {
     let answering = report.answering;
     let answering = answering.map_or(String::new(), |n| format!(" ({n} answer at most)"));
     out.heading(format!("Devices: {}{answering}", report.devices.len()));
-    let mut table = Table::new("#|station|name|vendor|product|revision|reached|last");
+    let head = "#|station|name|vendor|product|revision|reached|last";
+    let mut table = match all {
+        true => Table::new(&format!("{head}|states")),
+        false => Table::new(head),
+    };
     let mut configured = Table::new("#|name|out|in|FMMUs|SYNC0|SDO read|written|failed");
     let mut managers = Table::new("#|SyncManager|start|bytes|usage");
     for (place, device) in report.devices.iter().enumerate() {
-        table.row(cells![
+        let mut row = Vec::from(cells![
             place,
             or_dash(device.station.map(hex16)),
             or_dash(device.name.as_ref()),
@@ -87,6 +91,10 @@ fn devices(report: &Report, all: bool, out: &mut Document) {
             or_dash(highest(device)),
             or_dash(device.state.as_ref()),
         ]);
+        if all {
+            row.push(device.states.join(" → "));
+        }
+        table.line(row);
         if device.fmmus == 0 && device.sync_managers.is_empty() && device.sync0_ns.is_none() {
             continue;
         }

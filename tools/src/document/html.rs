@@ -26,6 +26,10 @@ impl Document {
         for block in &self.blocks {
             out += &match block {
                 Block::Heading(text) => format!("<h2>{}</h2>\n", escape(text)),
+                Block::Item { lead, text } if text.is_empty() => {
+                    let lead = lead.trim_end_matches([' ', ':']);
+                    format!("<p>{}</p>\n", escape(lead))
+                }
                 Block::Item { lead, text } => {
                     format!("<p>{}{}</p>\n", escape(lead), escape(text))
                 }
@@ -76,4 +80,19 @@ pub(super) fn escape(text: &str) -> String {
         }
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn item_without_text_shows_its_name() {
+        let mut document = Document::new("x");
+        document.item("sleep: ", "");
+        document.item("spin: ", "1 < 2");
+        let page = document.html();
+        assert!(page.contains("<p>sleep</p>"), "{page}");
+        assert!(page.contains("<p>spin: 1 &lt; 2</p>"), "{page}");
+    }
 }
