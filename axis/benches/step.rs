@@ -1,7 +1,9 @@
-//! What an axis costs: 100 of them, each with its state machine, set-point, limits, supervision and status, as the cycle does it.
+//! What an axis costs: 100 of them, each with its state machine, set-point, limits, supervision and
+//! status, as the cycle does it.
 //!
-//! `cargo bench -p ecaxis-axis` prints the median of many short slices for every case. `-- CASE CYCLES` does that many cycles of
-//! one case and nothing else, for counting instructions from outside: take two counts and divide their difference.
+//! `cargo bench -p ecaxis-axis` prints the median of many short slices for every case.
+//! `-- CASE CYCLES` does that many cycles of one case and nothing else, for counting instructions
+//! from outside: take two counts and divide their difference.
 
 #![allow(clippy::print_stdout, reason = "a benchmark's report")]
 
@@ -156,8 +158,8 @@ fn cases() -> Vec<Case> {
     ]
 }
 
-/// Nanoseconds per axis and cycle, of each of `slices`. A slice is shorter than a scheduler's, so that the least of them was
-/// not interrupted.
+/// Nanoseconds per axis and cycle, of each of `slices`. A slice is shorter than a scheduler's, so
+/// that the least of them was not interrupted.
 fn run(case: &Case, slices: usize, cycles: usize) -> Vec<f64> {
     let mut rigs: Vec<Rig> = (0..AXES).map(|_| Rig::new(case.1)).collect();
     let mut times = Vec::with_capacity(slices);

@@ -2,8 +2,8 @@
 //!
 //! # Modules
 //!
-//! Time arrives as `dt_s`, process data as plain integers. Functions that allocate say so; `RT` marks
-//! functions of the cycle. From the bottom up:
+//! Time arrives as `dt_s`, process data as plain integers. Functions that allocate say so; `RT`
+//! marks functions of the cycle. From the bottom up:
 //!
 //! | module | contents |
 //! |---|---|

@@ -3,7 +3,8 @@
 //! ```
 //! use ecaxis_ecat::datagram::{Command, Header};
 //!
-//! let header = Header { command: Command::FPRD, index: 7, address: 0x0130_1001, len: 2, more: false };
+//! let command = Command::FPRD;
+//! let header = Header { command, index: 7, address: 0x0130_1001, len: 2, more: false };
 //! assert_eq!(Header::parse(&header.emit()), header);
 //! assert_eq!(header.command.name(), "FPRD");
 //! ```

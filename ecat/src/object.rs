@@ -74,7 +74,8 @@ impl fmt::Display for NamedObject {
     }
 }
 
-/// Returns the name of a known object: of the communication area, of CiA 402 and of modular devices.
+/// Returns the name of a known object: of the communication area, of CiA 402 and of modular
+/// devices.
 #[must_use]
 pub fn object_name(index: u16, sub: u8) -> Option<&'static str> {
     name(index, sub)

@@ -1,4 +1,5 @@
-//! Registers of an EtherCAT SubDevice Controller (ETG.1000.4, clause 6; names as in ESC data sheets).
+//! Registers of an EtherCAT SubDevice Controller (ETG.1000.4, clause 6; names as in ESC data
+//! sheets).
 //!
 //! Each constant is the physical address of a register's first byte.
 //!

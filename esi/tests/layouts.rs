@@ -1,9 +1,9 @@
 //! The process data of every device of every recorded vendor file, for each choice in its ESI. The
 //! snapshots in `snapshots/` are reviewed against the XML.
 //!
-//! `ECAXIS_UPDATE_SNAPSHOTS=1 cargo test -p ecaxis-esi --test main layouts` writes the snapshots again.
-//! The difference then needs the same review. Snapshots contain only numbers: a device is its
-//! identity and line, a module its identity, an OpMode or assignment its index in the file.
+//! `ECAXIS_UPDATE_SNAPSHOTS=1 cargo test -p ecaxis-esi --test main layouts` writes the snapshots
+//! again. The difference then needs the same review. Snapshots contain only numbers: a device is
+//! its identity and line, a module its identity, an OpMode or assignment its index in the file.
 
 mod choices;
 mod text;

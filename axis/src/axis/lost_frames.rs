@@ -1,10 +1,10 @@
 //! The set-point while frames are lost or late.
 //!
 //! A lost frame loses its targets. The next frame that arrives carries the sum of all lost steps,
-//! which the drive executes at once. To bound this jump, an axis plans only [`RIDE_THROUGH_CYCLES`] cycles without an answer;
-//! then its set-point waits, like a drive at its last target. When an answer arrives, the set-point
-//! continues from what the drive has done meanwhile. In CSP the drive stands at its last target; in
-//! every other mode it has moved on.
+//! which the drive executes at once. To bound this jump, an axis plans only [`RIDE_THROUGH_CYCLES`]
+//! cycles without an answer; then its set-point waits, like a drive at its last target. When an
+//! answer arrives, the set-point continues from what the drive has done meanwhile. In CSP the drive
+//! stands at its last target; in every other mode it has moved on.
 //!
 //! A late answer proves that the targets arrive: the set-point then decelerates within its limits.
 //!

@@ -28,7 +28,8 @@
 //!
 //! let limits = MotionLimits { velocity: 100.0, acceleration: 1000.0, jerk: 20_000.0 };
 //! let mut motion = Motion::default();
-//! let mut plan = JerkLimited::new(MoveRequest::within(Goal::Position(10.0), limits), motion, 0.001)?;
+//! let request = MoveRequest::within(Goal::Position(10.0), limits);
+//! let mut plan = JerkLimited::new(request, motion, 0.001)?;
 //! while !plan.finished(motion) {
 //!     motion = plan.advance(motion, 0.001);
 //!     assert!(motion.velocity <= limits.velocity * (1.0 + 1e-9));

@@ -81,8 +81,8 @@ impl Inputs {
     }
 }
 
-/// Fails if `target`, given with `option`, cannot be written, is one of the inputs, or has a content
-/// and `force` is false.
+/// Fails if `target`, given with `option`, cannot be written, is one of the inputs, or has a
+/// content and `force` is false.
 pub(crate) fn check_output(
     option: &str,
     target: &Path,

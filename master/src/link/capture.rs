@@ -1,9 +1,9 @@
 //! Records all frames of a link in a pcapng file.
 //!
-//! [`Recorder`] has two sides: one is called from the cycle, the other writes the file. With [`WriterMode::Background`] a
-//! ring of bytes connects the cycle to a writer thread, and a counter counts the frames that do not
-//! fit. [`WriterMode::Inline`] writes in the calling thread and loses nothing, which is acceptable
-//! in virtual time.
+//! [`Recorder`] has two sides: one is called from the cycle, the other writes the file. With
+//! [`WriterMode::Background`] a ring of bytes connects the cycle to a writer thread, and a counter
+//! counts the frames that do not fit. [`WriterMode::Inline`] writes in the calling thread and loses
+//! nothing, which is acceptable in virtual time.
 //!
 //! With a limit, a recording is written in parts. Each part is a complete file of a quarter of the
 //! limit. The first part, under the requested name, is kept: it shows the devices on the bus and

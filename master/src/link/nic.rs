@@ -1,10 +1,10 @@
 //! An interface through an AF_PACKET socket.
 //!
-//! With [`SocketKind::Ring`], received frames are stored in mapped memory: polling for a frame costs
-//! a memory read instead of a system call. The ring has version 2 (TPACKET_V2), which releases each
-//! frame at once. Version 3 releases whole blocks of frames, when they are full or after a timer of
-//! at least one millisecond. Frames are sent one by one: a transmit ring would need a system call
-//! each as well.
+//! With [`SocketKind::Ring`], received frames are stored in mapped memory: polling for a frame
+//! costs a memory read instead of a system call. The ring has version 2 (TPACKET_V2), which
+//! releases each frame at once. Version 3 releases whole blocks of frames, when they are full or
+//! after a timer of at least one millisecond. Frames are sent one by one: a transmit ring would
+//! need a system call each as well.
 
 use super::filter::{LinkStats, ReceivedFrame, RejectReason, classify_frame};
 use super::interface::{self, OpenError};

@@ -136,8 +136,8 @@ impl SimDevice {
         self.drive().map(|drive| drive.outputs(&self.store))
     }
 
-    /// Sets an object without access checks. An input object of an I/O device then no longer mirrors
-    /// an output. Returns false if the object does not exist.
+    /// Sets an object without access checks. An input object of an I/O device then no longer
+    /// mirrors an output. Returns false if the object does not exist.
     pub fn set_input(&mut self, index: u16, sub: u8, value: i64) -> bool {
         let Some(slot) = self.store.slot(index, sub) else {
             return false;

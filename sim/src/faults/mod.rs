@@ -54,7 +54,8 @@
 //!     device = 3
 //!     kind = 'power-off'",
 //! )?;
-//! let one = Topology::by_order(&[[Medium::Mii, Medium::Mii, Medium::None, Medium::None]]).unwrap();
+//! let ports = [Medium::Mii, Medium::Mii, Medium::None, Medium::None];
+//! let one = Topology::by_order(&[ports]).unwrap();
 //! let error = script.check(&one).unwrap_err();
 //! assert_eq!(error.to_string(), "line 4: there is no device 3; the bus has 1, counted from 0");
 //! # Ok::<(), ecaxis_sim::ScriptError>(())

@@ -8,7 +8,8 @@
 //! use ecaxis_sim::network::topology::{Topology, Uplink};
 //!
 //! // Ports 0, 1 and 2 of a junction, then two devices with two ports.
-//! let media = [[Mii, Mii, Mii, Missing], [Mii, Mii, Missing, Missing], [Mii, Mii, Missing, Missing]];
+//! let end = [Mii, Mii, Missing, Missing];
+//! let media = [[Mii, Mii, Mii, Missing], end, end];
 //! let topology = Topology::by_order(&media).unwrap();
 //! assert_eq!(topology.uplink(0), None); // the MainDevice
 //! assert_eq!(topology.uplink(2), Some(Uplink { device: 1, port: 1 }));

@@ -2,8 +2,8 @@
 //! real cycle of a machine. May block and allocate.
 //!
 //! - [`veth`]: a pair of connected virtual interfaces;
-//! - [`segment`]: drives as seen by cyclic frames; [`bus`] answers with them, from another CPU or on
-//!   the same thread;
+//! - [`segment`]: drives as seen by cyclic frames; [`bus`] answers with them, from another CPU or
+//!   on the same thread;
 //! - [`fixture`]: a machine of such axes, built from the parts of the real cycle;
 //! - [`measure`]: runs and measures it;
 //! - [`wakeup`]: wake-up latency by the cycle's clock and by cyclictest;

@@ -16,7 +16,8 @@ pub(super) struct ProcessDatagram {
     /// Offset in the image.
     pub(super) image: usize,
     pub(super) expected_wkc: u16,
-    /// The range of its devices in [`Exchange`](super::Exchange)'s `order`: the first, and one past the last.
+    /// The range of its devices in [`Exchange`](super::Exchange)'s `order`: the first, and one past
+    /// the last.
     pub(super) devices: (usize, usize),
 }
 

@@ -1,4 +1,5 @@
-//! The process image: logical addresses, datagrams and frames ([`mod@plan`]), and the bits of objects.
+//! The process image: logical addresses, datagrams and frames ([`mod@plan`]), and the bits of
+//! objects.
 
 use ecaxis_esi::address;
 use ecaxis_esi::layout::{Field, Layout};

@@ -47,8 +47,8 @@ impl Limit {
 }
 
 /// Returns the counts of 0x6076 per N·m. The unit comes from the dictionary (ETG.1004: newton metre
-/// is 0x56, the highest byte a power of ten). Without one, the unit is µNm for a maxon drive and mNm
-/// otherwise. A dictionary without a vendor counts as maxon's.
+/// is 0x56, the highest byte a power of ten). Without one, the unit is µNm for a maxon drive and
+/// mNm otherwise. A dictionary without a vendor counts as maxon's.
 fn counts_per_newton_metre(b: &Binder<'_>, rated_torque: EntryHandle) -> f64 {
     const NEWTON_METRE: u32 = 0x56;
     const MAXON: i64 = 0xfb;
