@@ -12,7 +12,7 @@ use ecaxis_master::rt::spin::{Spin, SpinWindow};
 use ecaxis_master::sys::rt_thread::{self, CpuWakeGuard};
 use ecaxis_tools::bench::bus::{Bus, FaultInjection, Options, ReplyDelay};
 use ecaxis_tools::bench::exchange::Exchanges;
-use ecaxis_tools::bench::segment::Segment;
+use ecaxis_tools::bench::segment::BenchSegment;
 use ecaxis_tools::bench::veth::VethPair;
 
 const PRIORITY: u8 = 80;
@@ -46,7 +46,7 @@ fn main() {
             cpu: Some(0),
             slack_ns: cycle / 2,
         };
-        let bus = Bus::on(&pair, Segment::new([], 0), options).expect("the other end answers");
+        let bus = Bus::on(&pair, BenchSegment::new([], 0), options).expect("the other end answers");
         let cycles = u32::try_from(u64::from(round_ms) * rate / 1_000).unwrap_or(1_000);
         let mut results = vec![Exchanges::default(); SocketKind::ALL.len()];
         for round in 0..ROUNDS {

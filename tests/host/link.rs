@@ -9,7 +9,7 @@ use ecaxis_master::sys::packet::{PacketSocket, interface_index};
 use ecaxis_test_support::host::over_a_pair;
 use ecaxis_test_support::program;
 use ecaxis_tools::bench::bus::{Bus, FaultInjection, Options, ReplyDelay};
-use ecaxis_tools::bench::segment::Segment;
+use ecaxis_tools::bench::segment::BenchSegment;
 use ecaxis_tools::bench::veth::VethPair;
 
 const TIMEOUT: Duration = Duration::from_secs(5);
@@ -49,7 +49,7 @@ fn reflect(pair: &VethPair) -> Bus {
         cpu: None,
         slack_ns: 0,
     };
-    Bus::on(pair, Segment::new([], 0), options).expect("answers")
+    Bus::on(pair, BenchSegment::new([], 0), options).expect("answers")
 }
 
 /// Returns the next frame, or `None` after a timeout.

@@ -38,7 +38,7 @@ pub use report::{
 };
 
 use match_frames::Pairing;
-use segment::Segment;
+use segment::RecordedSegment;
 
 /// The maximum number of distinguished VLANs.
 const CARRIERS: usize = 16;
@@ -68,7 +68,7 @@ struct PacketCounts {
 pub fn analyze<R: Read>(parts: Vec<Reader<R>>, interface: Option<u32>, known: Context) -> Report {
     let mut counted = PacketCounts::default();
     let mut pairing = Pairing::default();
-    let mut segment = Segment::new(known);
+    let mut segment = RecordedSegment::new(known);
     let mut remarks = Vec::new();
     let several = parts.len() > 1;
     for (number, mut reader) in (1..).zip(parts) {
@@ -113,7 +113,7 @@ pub fn analyze<R: Read>(parts: Vec<Reader<R>>, interface: Option<u32>, known: Co
     report::report(remarks, &counted, segment)
 }
 
-fn drain(pairing: &mut Pairing, segment: &mut Segment) {
+fn drain(pairing: &mut Pairing, segment: &mut RecordedSegment) {
     while let Some(exchange) = pairing.next() {
         segment.exchange(&exchange);
     }

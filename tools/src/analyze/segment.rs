@@ -55,7 +55,7 @@ impl Device {
 
 /// A bus and its events.
 #[derive(Debug, Default)]
-pub struct Segment {
+pub struct RecordedSegment {
     pub devices: Vec<Device>,
     /// The highest working counter of a broadcast read.
     pub answering: Option<u16>,
@@ -80,7 +80,7 @@ pub struct Segment {
     last: u64,
 }
 
-impl Segment {
+impl RecordedSegment {
     pub fn new(known: Context) -> Self {
         Self {
             known,

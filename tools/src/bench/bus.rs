@@ -13,7 +13,7 @@ use std::thread::{self, JoinHandle};
 
 use serde::Serialize;
 
-use super::segment::Segment;
+use super::segment::BenchSegment;
 use super::veth::{self, VethPair};
 use ecaxis_master::clock::{self, Clock, Nanos};
 use ecaxis_master::link::{self, FrameQueue, Link, LinkError, MAX_FRAME, SocketKind};
@@ -128,7 +128,7 @@ impl Bus {
     ///
     /// # Errors
     /// Fails if `open` fails or no thread can be started.
-    pub fn start(open: ThreadSetup, segment: Segment, options: Options) -> io::Result<Self> {
+    pub fn start(open: ThreadSetup, segment: BenchSegment, options: Options) -> io::Result<Self> {
         let stop = Arc::new(AtomicBool::new(false));
         let (published, counts) = triple_buffer::triple_buffer(&Counts::default());
         let (ready, started): (Sender<io::Result<()>>, Receiver<_>) = channel();
@@ -163,7 +163,7 @@ impl Bus {
     ///
     /// # Errors
     /// Fails if the interface cannot be moved, brought up or opened.
-    pub fn on(pair: &VethPair, segment: Segment, options: Options) -> io::Result<Self> {
+    pub fn on(pair: &VethPair, segment: BenchSegment, options: Options) -> io::Result<Self> {
         let (report, reported): (Sender<Option<i32>>, Receiver<_>) = channel();
         let (go, gone): (Sender<()>, Receiver<()>) = channel();
         let nic = pair.b.clone();
@@ -217,7 +217,7 @@ impl Drop for Bus {
 
 struct Worker {
     link: Box<dyn Link>,
-    segment: Segment,
+    segment: BenchSegment,
     options: Options,
     counts: Counts,
     published: triple_buffer::Input<Counts>,
@@ -232,7 +232,7 @@ struct Worker {
 impl Worker {
     fn new(
         link: Box<dyn Link>,
-        segment: Segment,
+        segment: BenchSegment,
         options: Options,
         published: triple_buffer::Input<Counts>,
     ) -> Self {
@@ -361,17 +361,17 @@ impl Worker {
     }
 }
 
-/// A link to a [`Segment`] on the same thread.
+/// A link to a [`BenchSegment`] on the same thread.
 #[derive(Debug)]
 pub struct InProcess {
-    segment: Segment,
+    segment: BenchSegment,
     hold: ReplyDelay,
     held: FrameQueue,
 }
 
 impl InProcess {
     #[must_use]
-    pub fn new(segment: Segment, hold: ReplyDelay) -> Self {
+    pub fn new(segment: BenchSegment, hold: ReplyDelay) -> Self {
         Self {
             segment,
             hold,

@@ -1,4 +1,4 @@
-//! A machine with axes on a [`Segment`] without a bring-up: the parts of the real cycle and a
+//! A machine with axes on a [`BenchSegment`] without a bring-up: the parts of the real cycle and a
 //! minimal supervisor.
 
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -9,7 +9,7 @@ use ecaxis_axis::setpoint::{Motion, PositionWave, SetpointError, Shape, Wave};
 use ecaxis_axis::{Axis, AxisConfig, Command, Limits, Mode, Scale, StopMethod};
 use ecaxis_esi::layout::{Field, Layout};
 
-use super::segment::{DRIVE_BYTES, FIRST_STATION, Segment};
+use super::segment::{BenchSegment, DRIVE_BYTES, FIRST_STATION};
 use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config::{self, StopSetup};
 use ecaxis_master::link::Link;
@@ -114,10 +114,10 @@ fn plan(axes: usize) -> Result<ImagePlan, RigError> {
 ///
 /// # Errors
 /// Fails if there are too many axes.
-pub fn segment(axes: usize) -> Result<Segment, RigError> {
+pub fn segment(axes: usize) -> Result<BenchSegment, RigError> {
     let plan = plan(axes)?;
     let regions = plan.regions.iter().flatten();
-    Ok(Segment::new(
+    Ok(BenchSegment::new(
         regions.map(|region| region.logical),
         DRIFT_PPM,
     ))

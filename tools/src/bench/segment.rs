@@ -94,12 +94,12 @@ impl Drive {
 
 /// A line of drives.
 #[derive(Debug, Clone)]
-pub struct Segment {
+pub struct BenchSegment {
     drives: Vec<Drive>,
     drift_ppm: i64,
 }
 
-impl Segment {
+impl BenchSegment {
     /// Creates drives whose outputs and inputs share these logical addresses. Their clocks run
     /// `drift_ppm` faster than the computer's.
     #[must_use]

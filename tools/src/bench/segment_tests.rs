@@ -5,9 +5,9 @@ use super::*;
 
 const BASE: u32 = 0x0001_0000;
 
-fn segment(devices: u32) -> Segment {
+fn segment(devices: u32) -> BenchSegment {
     let len = u32::try_from(DRIVE_BYTES).unwrap();
-    Segment::new((0..devices).map(|n| BASE + n * len), 0)
+    BenchSegment::new((0..devices).map(|n| BASE + n * len), 0)
 }
 
 fn datagrams(frame: &[u8]) -> Vec<Datagram> {
@@ -21,7 +21,7 @@ fn datagrams(frame: &[u8]) -> Vec<Datagram> {
 }
 
 /// Exchanges one LRW over all drives. Returns inputs and working counter.
-fn exchange(segment: &mut Segment, outputs: &[u8]) -> (Vec<u8>, u16) {
+fn exchange(segment: &mut BenchSegment, outputs: &[u8]) -> (Vec<u8>, u16) {
     let mut frame = FrameBuilder::default().logical(12, BASE, outputs).build();
     assert_eq!(segment.answer(&mut frame, 0), Kind::EtherCat);
     let lrw = &datagrams(&frame)[0];

@@ -9,7 +9,7 @@
 //! - With a limit below the present velocity, slowing down to the limit takes longer and farther
 //!   than the direct stop. Then some velocity in between fits.
 
-use super::profile::{Profile, Segment, State, coasting, mirrored, travel, velocity_change};
+use super::profile::{JerkSegment, Profile, State, coasting, mirrored, travel, velocity_change};
 use crate::setpoint::MotionLimits;
 
 /// Plans from `start` (position 0) to `distance`. The limits must be usable
@@ -60,7 +60,7 @@ pub(crate) fn stop_span(start: State, limits: MotionLimits) -> [f64; 2] {
     Profile::of(&[&stopping(start, limits)]).span(start)
 }
 
-fn stopping(start: State, limits: MotionLimits) -> [Segment; 3] {
+fn stopping(start: State, limits: MotionLimits) -> [JerkSegment; 3] {
     velocity_change(start, 0.0, limits.acceleration, limits.jerk)
 }
 
@@ -86,11 +86,11 @@ fn forwards(start: State, distance: f64, limits: MotionLimits) -> Profile {
         let (first, last, reached) = through(v);
         let left = (distance - reached).max(0.0);
         let cruise = if v > 0.0 { left / v } else { 0.0 };
-        let profile = Profile::of(&[&first, &[Segment::cruise(cruise)], &last]);
+        let profile = Profile::of(&[&first, &[JerkSegment::cruise(cruise)], &last]);
         // Corrects the cruise by the rounding error.
         let missing = distance - profile.end(start).position;
         let cruise = if v > 0.0 { cruise + missing / v } else { 0.0 };
-        Profile::of(&[&first, &[Segment::cruise(cruise)], &last])
+        Profile::of(&[&first, &[JerkSegment::cruise(cruise)], &last])
     };
     if through(velocity).2 <= distance {
         return with_cruise(velocity);
@@ -99,7 +99,7 @@ fn forwards(start: State, distance: f64, limits: MotionLimits) -> Profile {
     let lowest = coasting.max(0.0);
     if coasting > 0.0 && start.acceleration < 0.0 && through(coasting).2 > distance {
         let released = |time: f64| {
-            let first = Segment::new(jerk, time);
+            let first = JerkSegment::new(jerk, time);
             let between = travel(start, &[first]);
             let last = velocity_change(between, 0.0, acceleration, jerk);
             (first, last, travel(between, &last).position)

@@ -33,14 +33,14 @@ impl State {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(crate) struct Segment {
+pub(crate) struct JerkSegment {
     pub(crate) jerk: f64,
     pub(crate) time: f64,
     /// Starts with acceleration 0. A rounding residue would add up over a long cruise.
     level: bool,
 }
 
-impl Segment {
+impl JerkSegment {
     pub(crate) fn new(jerk: f64, time: f64) -> Self {
         // Rounding makes some times slightly negative.
         Self {
@@ -71,12 +71,12 @@ pub(crate) const SEGMENTS: usize = 10;
 
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct Profile {
-    segments: [Segment; SEGMENTS],
+    segments: [JerkSegment; SEGMENTS],
     used: usize,
 }
 
 impl Profile {
-    pub(crate) fn of(parts: &[&[Segment]]) -> Self {
+    pub(crate) fn of(parts: &[&[JerkSegment]]) -> Self {
         let mut profile = Self::default();
         let given = parts.iter().flat_map(|part| part.iter());
         for (place, &segment) in profile.segments.iter_mut().zip(given) {
@@ -86,11 +86,11 @@ impl Profile {
         profile
     }
 
-    pub(crate) fn get(&self, index: usize) -> Option<Segment> {
+    pub(crate) fn get(&self, index: usize) -> Option<JerkSegment> {
         self.segments().get(index).copied()
     }
 
-    pub(crate) fn segments(&self) -> &[Segment] {
+    pub(crate) fn segments(&self) -> &[JerkSegment] {
         self.segments.get(..self.used).unwrap_or(&self.segments)
     }
 
@@ -140,7 +140,7 @@ impl Profile {
     }
 }
 
-pub(crate) fn travel(start: State, segments: &[Segment]) -> State {
+pub(crate) fn travel(start: State, segments: &[JerkSegment]) -> State {
     segments
         .iter()
         .fold(start, |state, s| s.enter(state).after(s.jerk, s.time))
@@ -168,7 +168,7 @@ pub(crate) fn velocity_change(
     velocity: f64,
     acceleration: f64,
     jerk: f64,
-) -> [Segment; 3] {
+) -> [JerkSegment; 3] {
     let sign = if velocity >= coasting(start, jerk) {
         1.0
     } else {
@@ -180,26 +180,29 @@ pub(crate) fn velocity_change(
     let peak = (jerk * change + a * a / 2.0).max(0.0).sqrt().max(a);
     if peak <= acceleration {
         return [
-            Segment::new(up, (peak - a) / jerk),
-            Segment::default(),
-            Segment::new(-up, peak / jerk),
+            JerkSegment::new(up, (peak - a) / jerk),
+            JerkSegment::default(),
+            JerkSegment::new(-up, peak / jerk),
         ];
     }
     let (first, rest) = if a <= acceleration {
         let gained = (acceleration * acceleration - a * a) / (2.0 * jerk);
-        (Segment::new(up, (acceleration - a) / jerk), change - gained)
+        (
+            JerkSegment::new(up, (acceleration - a) / jerk),
+            change - gained,
+        )
     } else {
         let gained = (a * a - acceleration * acceleration) / (2.0 * jerk);
         (
-            Segment::new(-up, (a - acceleration) / jerk),
+            JerkSegment::new(-up, (a - acceleration) / jerk),
             change - gained,
         )
     };
     let last = acceleration * acceleration / (2.0 * jerk);
     [
         first,
-        Segment::new(0.0, (rest - last) / acceleration),
-        Segment::new(-up, acceleration / jerk),
+        JerkSegment::new(0.0, (rest - last) / acceleration),
+        JerkSegment::new(-up, acceleration / jerk),
     ]
 }
 

@@ -4,7 +4,7 @@ use super::process_data::{axes, clocks, cycle};
 use super::{DeviceReport, FileReport, Line, Report, SyncManagerReport, TransferReport, problems};
 use crate::analyze::events::{Event, EventKind, EventScope};
 use crate::analyze::mailbox::{TransferDirection, TransferOutcome};
-use crate::analyze::segment::{Device, Segment};
+use crate::analyze::segment::{Device, RecordedSegment};
 use crate::analyze::values::value;
 use crate::analyze::{Context, PacketCounts};
 use ecaxis_ecat::registers;
@@ -28,7 +28,7 @@ impl Since {
 pub(in crate::analyze) fn report(
     remarks: Vec<String>,
     counted: &PacketCounts,
-    mut segment: Segment,
+    mut segment: RecordedSegment,
 ) -> Report {
     let since = Since(counted.first.unwrap_or(0));
     // In cabling order, if known.
@@ -74,7 +74,7 @@ pub(in crate::analyze) fn report(
     report
 }
 
-fn file(mut remarks: Vec<String>, counted: &PacketCounts, segment: &Segment) -> FileReport {
+fn file(mut remarks: Vec<String>, counted: &PacketCounts, segment: &RecordedSegment) -> FileReport {
     let mut remark = |count: u64, text: &str| {
         if count > 0 {
             remarks.push(format!("{count} {text}"));
@@ -339,7 +339,7 @@ fn together(lines: Vec<Line>) -> Vec<Line> {
 }
 
 fn transfers(
-    segment: &Segment,
+    segment: &RecordedSegment,
     since: &Since,
     place: impl Fn(usize) -> usize,
 ) -> (Vec<TransferReport>, u64) {

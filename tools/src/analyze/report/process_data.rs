@@ -9,7 +9,7 @@ use super::{
 use crate::analyze::axes::Curve;
 use crate::analyze::clocks::{Clocks, Reference};
 use crate::analyze::cycle::{Cycle, Group, Key};
-use crate::analyze::segment::Segment;
+use crate::analyze::segment::RecordedSegment;
 
 /// An interval longer than this multiple of the usual one contains a skipped cycle.
 const GAP: f64 = 1.5;
@@ -104,7 +104,7 @@ pub(super) fn clocks(clocks: &Clocks) -> ClocksReport {
 }
 
 pub(super) fn axes(
-    segment: &Segment,
+    segment: &RecordedSegment,
     order: &[usize],
     devices: &[DeviceReport],
     since: &Since,
