@@ -1,6 +1,6 @@
 //! Counts bad cycles and decides when they stop the machine or a group.
 
-use super::exchange::{CycleResult, Evidence, GroupResult};
+use super::exchange::{CycleResult, DeviceAnswer, GroupResult};
 
 /// AL status that every SubDevice must show while the machine runs.
 pub const OP: u8 = 0x08;
@@ -55,7 +55,7 @@ impl StopCause {
 pub struct BusMonitor {
     lost_frames: u32,
     groups: Vec<GroupCounters>,
-    /// For each device, the cycles in which its own evidence showed it missing.
+    /// For each device, the cycles in which its own answer was missing.
     missing: Vec<u32>,
     /// Cycles in which AL status was wrong and no group's working counter identified the device.
     al: u32,
@@ -98,20 +98,25 @@ impl BusMonitor {
     }
 
     /// Evaluates one cycle. RT: O(groups + devices).
-    pub fn update(&mut self, answer: &CycleResult, shares: &[GroupResult], evidence: &[Evidence]) {
-        for (watch, share) in self.groups.iter_mut().zip(shares) {
-            watch.last = *share;
-            watch.bad = if share.fresh {
+    pub fn update(
+        &mut self,
+        answer: &CycleResult,
+        groups: &[GroupResult],
+        devices: &[DeviceAnswer],
+    ) {
+        for (watch, result) in self.groups.iter_mut().zip(groups) {
+            watch.last = *result;
+            watch.bad = if result.fresh {
                 0
             } else {
                 watch.bad.saturating_add(1)
             };
         }
-        for (missing, evidence) in self.missing.iter_mut().zip(evidence) {
-            *missing = match evidence {
-                Evidence::Fresh => 0,
-                Evidence::Unknown => *missing,
-                Evidence::Missing => missing.saturating_add(1),
+        for (missing, answer) in self.missing.iter_mut().zip(devices) {
+            *missing = match answer {
+                DeviceAnswer::Fresh => 0,
+                DeviceAnswer::Unknown => *missing,
+                DeviceAnswer::Missing => missing.saturating_add(1),
             };
         }
         let Some((status, answering)) = answer.al_status else {
@@ -186,7 +191,7 @@ impl BusMonitor {
 mod tests {
     use super::*;
 
-    const SHARE: GroupResult = GroupResult::new(true, true, (3, 3));
+    const GOOD: GroupResult = GroupResult::new(true, true, (3, 3));
     const BAD: GroupResult = GroupResult::new(true, false, (0, 3));
     const GONE: GroupResult = GroupResult::new(false, false, (0, 3));
 
@@ -205,9 +210,9 @@ mod tests {
     fn bus_monitor_tolerates_fewer_bad_cycles_than_the_limit() {
         let mut guard = BusMonitor::new(3, &[0, 0]);
         for _ in 0..10 {
-            for share in [GONE, GONE, SHARE] {
-                let back = share.answered.then_some((OP, 2));
-                guard.update(&answer(back), &[share], &[]);
+            for result in [GONE, GONE, GOOD] {
+                let back = result.answered.then_some((OP, 2));
+                guard.update(&answer(back), &[result], &[]);
                 assert_eq!((guard.lost(0), guard.left_op()), (None, None));
             }
         }
@@ -229,30 +234,30 @@ mod tests {
         for (al, cycles) in [((0x1c, 2), AL_CYCLES), ((OP, 1), 5)] {
             let mut guard = BusMonitor::new(5, &[0, 0]);
             for _ in 1..cycles {
-                guard.update(&answer(Some(al)), &[SHARE], &[]);
+                guard.update(&answer(Some(al)), &[GOOD], &[]);
                 assert_eq!(guard.left_op(), None);
             }
-            guard.update(&answer(Some(al)), &[SHARE], &[]);
+            guard.update(&answer(Some(al)), &[GOOD], &[]);
             let left = Some(StopCause::LeftOp { al_status: al.0 });
             assert_eq!((guard.lost(0), guard.left_op()), (None, left));
-            guard.update(&good(), &[SHARE], &[]);
+            guard.update(&good(), &[GOOD], &[]);
             assert_eq!(guard.left_op(), None);
         }
     }
 
     #[test]
-    fn device_is_lost_only_by_its_own_evidence() {
+    fn device_is_lost_only_by_its_own_answers() {
         let mut guard = BusMonitor::new(2, &[0, 0, 0]);
-        for evidence in [Evidence::Unknown; 5] {
+        for unknown in [DeviceAnswer::Unknown; 5] {
             guard.update(
                 &good(),
                 &[BAD],
-                &[evidence, Evidence::Missing, Evidence::Fresh],
+                &[unknown, DeviceAnswer::Missing, DeviceAnswer::Fresh],
             );
         }
         let lost = [0, 1, 2].map(|device| guard.device_lost(device));
         assert_eq!(lost, [false, true, false]);
-        guard.update(&good(), &[SHARE], &[Evidence::Fresh; 3]);
+        guard.update(&good(), &[GOOD], &[DeviceAnswer::Fresh; 3]);
         assert!(!guard.device_lost(1));
     }
 
@@ -261,28 +266,18 @@ mod tests {
     #[test]
     fn wrong_al_status_is_attributed_to_the_group_with_a_wrong_counter() {
         let left = |al_status| Some(StopCause::LeftOp { al_status });
-        for (al, shares, groups, machine) in [
-            (
-                (0x1c, 3),
-                [SHARE, BAD, SHARE],
-                [None, left(0x1c), None],
-                None,
-            ),
+        for (al, results, groups, machine) in [
+            ((0x1c, 3), [GOOD, BAD, GOOD], [None, left(0x1c), None], None),
             // More devices left Op than the group has.
-            (
-                (0x1c, 1),
-                [SHARE, SHARE, BAD],
-                [None, None, None],
-                left(0x1c),
-            ),
+            ((0x1c, 1), [GOOD, GOOD, BAD], [None, None, None], left(0x1c)),
             // An absent device counts by its process data.
-            ((OP, 2), [SHARE, SHARE, BAD], [None, None, None], None),
-            ((OP, 1), [SHARE, BAD, BAD], [None, None, None], None),
-            ((OP, 3), [SHARE, BAD, SHARE], [None, None, None], None),
+            ((OP, 2), [GOOD, GOOD, BAD], [None, None, None], None),
+            ((OP, 1), [GOOD, BAD, BAD], [None, None, None], None),
+            ((OP, 3), [GOOD, BAD, GOOD], [None, None, None], None),
         ] {
             let mut guard = BusMonitor::new(10, &[0, 1, 2]);
             for _ in 0..AL_CYCLES {
-                guard.update(&answer(Some(al)), &shares, &[]);
+                guard.update(&answer(Some(al)), &results, &[]);
             }
             let found = [0, 1, 2].map(|group| guard.lost(group));
             assert_eq!((found, guard.left_op()), (groups, machine), "{al:?}");
@@ -293,7 +288,7 @@ mod tests {
     fn a_group_without_its_process_data_is_lost_alone() {
         let mut guard = BusMonitor::new(2, &[1]);
         for _ in 0..2 {
-            guard.update(&answer(Some((OP, 1))), &[SHARE, BAD], &[]);
+            guard.update(&answer(Some((OP, 1))), &[GOOD, BAD], &[]);
         }
         assert_eq!(guard.lost(0), None);
         assert!(matches!(

@@ -9,7 +9,7 @@ use super::bus_monitor::{BusMonitor, StopCause};
 use super::channel::{Event, PhaseStatus, RtEndpoint, Snapshot};
 use super::controller::{self, Controller};
 use super::event_log::LogEntryKind;
-use super::exchange::{CycleResult, Evidence, Exchange, SubDeviceDiagnostics, Window};
+use super::exchange::{CycleResult, DeviceAnswer, Exchange, SubDeviceDiagnostics, Window};
 use super::flight_recorder::{self, FlightRecorder};
 use super::heartbeat;
 use super::image::SignalBits;
@@ -263,8 +263,11 @@ impl Engine {
     }
 
     fn watch_bus(&mut self) {
-        let (shares, evidence) = (self.exchange.shares(), self.exchange.evidence());
-        self.guard.update(&self.answer, shares, evidence);
+        let (groups, devices) = (
+            self.exchange.group_results(),
+            self.exchange.device_answers(),
+        );
+        self.guard.update(&self.answer, groups, devices);
         for group in 0..self.groups.len() {
             if let Some(cause) = self.guard.lost(group) {
                 self.stop(Some(group), cause);
@@ -279,8 +282,8 @@ impl Engine {
         let dt = self.timing.cycle_ns as f64 * 1e-9;
         let image = self.exchange.inputs();
         for slot in &mut self.axes {
-            let evidence = self.exchange.evidence().get(slot.device);
-            let fresh = evidence == Some(&Evidence::Fresh);
+            let answer = self.exchange.device_answers().get(slot.device);
+            let fresh = answer == Some(&DeviceAnswer::Fresh);
             if fresh {
                 slot.heard = Some(self.next);
             }
@@ -363,12 +366,12 @@ impl Engine {
         snapshot.stopping = stopping.map(|stop| stop.cause);
         snapshot.failure = failure;
         snapshot.stop_ended = stop_ended;
-        let groups = self.groups.iter().zip(self.exchange.shares());
-        for (to, (group, share)) in snapshot.groups.iter_mut().zip(groups) {
+        let groups = self.groups.iter().zip(self.exchange.group_results());
+        for (to, (group, result)) in snapshot.groups.iter_mut().zip(groups) {
             *to = GroupStatus {
                 stopped: group.stop().map(|stop| stop.cause),
                 stops: group.stops,
-                fresh: share.fresh,
+                fresh: result.fresh,
                 powered: false,
             };
         }

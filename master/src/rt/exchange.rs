@@ -39,9 +39,9 @@ use frame::{
     frame_tag, new_frames, same_datagram, write_header,
 };
 use frame_set::FrameSet;
-pub use poll_schedule::LONGEST_LOOK;
+pub use poll_schedule::MAX_POLL_DATAGRAM;
 use poll_schedule::{PollSchedule, PollTarget};
-pub use result::{CycleResult, Evidence, ExchangeDevice, GroupResult, Received};
+pub use result::{CycleResult, DeviceAnswer, ExchangeDevice, GroupResult, Received};
 use slots::DatagramSlots;
 
 /// After a wrong working counter each device has its own datagram, until this many cycles in a row
@@ -55,16 +55,16 @@ pub struct Exchange {
     frame_sets: Vec<FrameSet>,
     staged: usize,
     /// The positions of the datagrams: with shared datagrams, and with one for each device.
-    forms: Vec<DatagramSlots>,
+    layouts: Vec<DatagramSlots>,
     /// The layout of each of the last cycles, by the low byte of the cycle's number.
-    form_of: [u8; 256],
+    layout_of_cycle: [u8; 256],
     /// The number of cycles for which each device still has its own datagram.
     separate_cycles: u16,
     /// True while devices are in Op: a wrong counter then means that a device is missing.
     op_expected: bool,
     /// The devices in the order of their data in the image.
     order: Vec<usize>,
-    evidence: Vec<Evidence>,
+    device_answers: Vec<DeviceAnswer>,
     /// For each device, true if a late answer has arrived since the last cycle.
     late: Vec<bool>,
     /// Index of the reference clock among the members.
@@ -74,7 +74,7 @@ pub struct Exchange {
     expected_time: u64,
     cycle_ns: u64,
     bus_status: Arc<BusStatus>,
-    shares: Vec<GroupResult>,
+    group_results: Vec<GroupResult>,
     diagnoses: Vec<SubDeviceDiagnostics>,
     windows: Vec<Window>,
     /// The group of each member.
@@ -107,28 +107,28 @@ impl Exchange {
         if plan.separate.len() > plan.datagrams.len() {
             datagrams.push(&plan.separate);
         }
-        let mut forms = Vec::new();
+        let mut layouts = Vec::new();
         let mut frame_sets = Vec::new();
         for number in 0..mode.frame_sets() {
             let mut frames = Vec::new();
             for datagrams in &datagrams {
-                let mut form = new_frames(frames_of(datagrams));
-                let places = DatagramSlots::fill(&mut form, plan, datagrams, &order, clock);
-                frames.push(form);
+                let mut filled = new_frames(frames_of(datagrams));
+                let slots = DatagramSlots::fill(&mut filled, plan, datagrams, &order, clock);
+                frames.push(filled);
                 if number == 0 {
-                    forms.push(places);
+                    layouts.push(slots);
                 }
             }
             frame_sets.push(FrameSet::new(frames));
         }
         // The first group exists even without members.
         let groups = plan.groups.iter().max().map_or(1, |last| last + 1);
-        let mut shares = vec![GroupResult::default(); groups];
+        let mut group_results = vec![GroupResult::default(); groups];
         for (member, &group) in members.iter().zip(&plan.groups) {
-            shares[group].clocks += u16::from(member.clock);
+            group_results[group].clocks += u16::from(member.clock);
         }
-        for datagram in &forms[0].process_data {
-            shares[datagram.group].wkc.1 += datagram.expected_wkc;
+        for datagram in &layouts[0].process_data {
+            group_results[datagram.group].wkc.1 += datagram.expected_wkc;
         }
         let reference = clock.and_then(|clock| {
             members
@@ -138,18 +138,18 @@ impl Exchange {
         let mut exchange = Self {
             frame_sets,
             staged: 0,
-            forms,
-            form_of: [0; 256],
+            layouts,
+            layout_of_cycle: [0; 256],
             separate_cycles: 0,
             op_expected: false,
             order,
-            evidence: vec![Evidence::Unknown; members.len()],
+            device_answers: vec![DeviceAnswer::Unknown; members.len()],
             late: vec![false; members.len()],
             reference: reference.unwrap_or(0),
             expected_time: 0,
             cycle_ns: clock.map_or(0, |clock| clock.cycle_ns),
             bus_status: Arc::new(BusStatus::new(members.len())),
-            shares,
+            group_results,
             diagnoses: vec![SubDeviceDiagnostics::default(); members.len()],
             windows: vec![Window::default(); members.len()],
             groups: plan.groups.clone(),
@@ -185,15 +185,15 @@ impl Exchange {
 
     /// Returns the result of each group's process data as of the last [`Exchange::evaluate`].
     #[must_use]
-    pub fn shares(&self) -> &[GroupResult] {
-        &self.shares
+    pub fn group_results(&self) -> &[GroupResult] {
+        &self.group_results
     }
 
-    /// Returns the evidence about each device as of the last [`Exchange::evaluate`], in the order
-    /// of the members.
+    /// Returns what the answers show about each device as of the last [`Exchange::evaluate`], in
+    /// the order of the members.
     #[must_use]
-    pub fn evidence(&self) -> &[Evidence] {
-        &self.evidence
+    pub fn device_answers(&self) -> &[DeviceAnswer] {
+        &self.device_answers
     }
 
     /// True if a late answer to an earlier cycle's frame has arrived since the last cycle, and this
@@ -259,12 +259,12 @@ impl Exchange {
     #[must_use]
     pub fn clock_read(&self) -> Option<(usize, i32)> {
         let frame_set = self.frame_sets.get(self.due())?;
-        let PollTarget::At { device, probe } = frame_set.turn?.look else {
+        let PollTarget::Registers { device, block } = frame_set.poll?.target else {
             return None;
         };
         frame_set.answer(0)?;
         let found = self.diagnoses.get(device)?;
-        let read = probe == DiagnosticRegister::ClockDifference && found.answers;
+        let read = block == DiagnosticRegister::ClockDifference && found.answers;
         read.then_some((device, found.clock_difference))
     }
 
@@ -278,38 +278,45 @@ impl Exchange {
         self.cycle = self.cycle.wrapping_add(1);
         self.staged = self.due();
         self.late.fill(false);
-        let separate = self.separate_cycles > 0 && self.forms.len() > 1;
+        let separate = self.separate_cycles > 0 && self.layouts.len() > 1;
         self.separate_cycles = self.separate_cycles.saturating_sub(1);
-        let form = usize::from(separate);
-        self.form_of[(self.cycle & 0xff) as usize] = u8::from(separate);
+        let layout = usize::from(separate);
+        self.layout_of_cycle[(self.cycle & 0xff) as usize] = u8::from(separate);
         if let Some(frame_set) = self.frame_sets.get_mut(self.staged) {
-            frame_set.form = form;
+            frame_set.layout = layout;
         }
         self.refresh_outputs();
         let time = self.expected_time;
-        let (Some(frame_set), Some(places)) =
-            (self.frame_sets.get_mut(self.staged), self.forms.get(form))
-        else {
+        let (Some(frame_set), Some(slots)) = (
+            self.frame_sets.get_mut(self.staged),
+            self.layouts.get(layout),
+        ) else {
             return;
         };
         let first = &mut frame_set.frames_mut()[0].bytes;
-        let turn = self.schedule.next();
-        if let Some(turn) = turn {
+        let poll = self.schedule.next();
+        if let Some(poll) = poll {
             // The diagnostic datagram is the last of its frame, so its length may change within the
             // capacity of the frame.
-            let data = places.probe_at + DATAGRAM_HEADER;
+            let data = slots.diagnostic_at + DATAGRAM_HEADER;
             first.truncate(data);
-            first.resize(data + turn.len, BusStatus::UNSEEN);
-            first.resize(data + turn.len + WKC, 0);
-            write_header(first, places.probe_at, turn.command, turn.address, turn.len);
+            first.resize(data + poll.len, BusStatus::UNSEEN);
+            first.resize(data + poll.len + WKC, 0);
+            write_header(
+                first,
+                slots.diagnostic_at,
+                poll.command,
+                poll.address,
+                poll.len,
+            );
         }
-        if let Some(place) = places.clock {
-            first[place.data()].copy_from_slice(&time.to_le_bytes());
-            clear_wkc(first, place);
+        if let Some(slot) = slots.clock {
+            first[slot.data()].copy_from_slice(&time.to_le_bytes());
+            clear_wkc(first, slot);
         }
-        first[places.al_status.data()].fill(0);
-        clear_wkc(first, places.al_status);
-        frame_set.turn = turn;
+        first[slots.al_status.data()].fill(0);
+        clear_wkc(first, slots.al_status);
+        frame_set.poll = poll;
         frame_set.stage(self.cycle);
         self.expected_time = time.wrapping_add(self.cycle_ns);
     }
@@ -320,17 +327,17 @@ impl Exchange {
         let Some(frame_set) = self.frame_sets.get_mut(self.staged) else {
             return;
         };
-        let Some(places) = self.forms.get(frame_set.form) else {
+        let Some(slots) = self.layouts.get(frame_set.layout) else {
             return;
         };
-        for datagram in &places.process_data {
-            let place = datagram.place;
-            let frame = &mut frame_set.frames_mut()[place.frame].bytes;
+        for datagram in &slots.process_data {
+            let slot = datagram.slot;
+            let frame = &mut frame_set.frames_mut()[slot.frame].bytes;
             if datagram.access != Access::Inputs {
-                let from = datagram.image..datagram.image + place.len;
-                frame[place.data()].copy_from_slice(&self.outputs[from]);
+                let from = datagram.image..datagram.image + slot.len;
+                frame[slot.data()].copy_from_slice(&self.outputs[from]);
             }
-            clear_wkc(frame, place);
+            clear_wkc(frame, slot);
         }
     }
 
@@ -363,13 +370,13 @@ impl Exchange {
         let (Some(&low), Some(&tag)) = (frame.get(FIRST_DATAGRAM + 1), frame.get(10)) else {
             return;
         };
-        let form = usize::from(self.form_of[usize::from(low)]);
-        let (Some(places), Some(frame_set)) = (self.forms.get(form), self.frame_sets.first())
+        let layout = usize::from(self.layout_of_cycle[usize::from(low)]);
+        let (Some(slots), Some(frame_set)) = (self.layouts.get(layout), self.frame_sets.first())
         else {
             return;
         };
         let age = self.cycle.wrapping_sub(u32::from(low)) & 0xff;
-        let sent = frame_set.form_frames(form);
+        let sent = frame_set.layout_frames(layout);
         let number = frame_number(tag, sent.len());
         let same_tag = tag == frame_tag(number, sent.len(), self.cycle.wrapping_sub(age));
         let recent = age > 0 && age <= self.frame_sets.len() as u32 + 1;
@@ -378,18 +385,18 @@ impl Exchange {
         };
         // The diagnostic datagram may have another length; the datagrams before it have not.
         let known = if number == 0 {
-            places.probe_at
+            slots.diagnostic_at
         } else {
             sent.bytes.len()
         };
         if frame.len() < known {
             return;
         }
-        for datagram in &places.process_data {
-            let place = datagram.place;
-            if place.frame == number
-                && same_datagram(&sent.bytes, frame, place)
-                && place.wkc(frame) == datagram.expected_wkc
+        for datagram in &slots.process_data {
+            let slot = datagram.slot;
+            if slot.frame == number
+                && same_datagram(&sent.bytes, frame, slot)
+                && slot.wkc(frame) == datagram.expected_wkc
             {
                 let (first, end) = datagram.devices;
                 for &device in self.order.get(first..end).unwrap_or_default() {
@@ -416,50 +423,50 @@ impl Exchange {
         let Some(frame_set) = self.frame_sets.get(due) else {
             return CycleResult::default();
         };
-        let Some(places) = self.forms.get(frame_set.form) else {
+        let Some(slots) = self.layouts.get(frame_set.layout) else {
             return CycleResult::default();
         };
         let first = frame_set.answer(0);
         let alone = if first.is_some() {
-            Evidence::Fresh
+            DeviceAnswer::Fresh
         } else {
-            Evidence::Missing
+            DeviceAnswer::Missing
         };
-        self.evidence.fill(alone);
+        self.device_answers.fill(alone);
         let mut ambiguous = false;
         let mut all_right = true;
-        for share in &mut self.shares {
-            let alive = share.wkc.1 > 0 || first.is_some();
-            (share.answered, share.fresh, share.wkc.0) = (alive, alive, 0);
+        for group in &mut self.group_results {
+            let alive = group.wkc.1 > 0 || first.is_some();
+            (group.answered, group.fresh, group.wkc.0) = (alive, alive, 0);
         }
-        for datagram in &places.process_data {
-            let Some(share) = self.shares.get_mut(datagram.group) else {
+        for datagram in &slots.process_data {
+            let Some(group) = self.group_results.get_mut(datagram.group) else {
                 continue;
             };
-            let place = datagram.place;
-            let answer = frame_set.answer(place.frame);
-            let wkc = answer.map_or(0, |answer| place.wkc(answer));
+            let slot = datagram.slot;
+            let answer = frame_set.answer(slot.frame);
+            let wkc = answer.map_or(0, |answer| slot.wkc(answer));
             let right = answer.is_some() && wkc == datagram.expected_wkc;
             let (begin, end) = datagram.devices;
-            let evidence = match answer {
-                None => Evidence::Missing,
-                Some(_) if right => Evidence::Fresh,
-                Some(_) if end - begin > 1 => Evidence::Unknown,
-                Some(_) => Evidence::Missing,
+            let device_answer = match answer {
+                None => DeviceAnswer::Missing,
+                Some(_) if right => DeviceAnswer::Fresh,
+                Some(_) if end - begin > 1 => DeviceAnswer::Unknown,
+                Some(_) => DeviceAnswer::Missing,
             };
-            ambiguous |= evidence == Evidence::Unknown;
+            ambiguous |= device_answer == DeviceAnswer::Unknown;
             all_right &= right;
             for &device in self.order.get(begin..end).unwrap_or_default() {
-                if let Some(of) = self.evidence.get_mut(device)
-                    && evidence != Evidence::Fresh
+                if let Some(of) = self.device_answers.get_mut(device)
+                    && device_answer != DeviceAnswer::Fresh
                 {
-                    *of = evidence;
+                    *of = device_answer;
                 }
             }
-            share.answered &= answer.is_some();
-            share.fresh &= right;
-            share.wkc.0 = share.wkc.0.saturating_add(wkc);
-            if let Some(data) = answer.and_then(|answer| answer.get(place.data()))
+            group.answered &= answer.is_some();
+            group.fresh &= right;
+            group.wkc.0 = group.wkc.0.saturating_add(wkc);
+            if let Some(data) = answer.and_then(|answer| answer.get(slot.data()))
                 && right
                 && datagram.access != Access::Outputs
             {
@@ -471,9 +478,9 @@ impl Exchange {
         }
         let mut answer = CycleResult {
             complete: frame_set.complete(),
-            inputs_fresh: self.shares.iter().all(|share| share.fresh),
-            wkc: self.shares.iter().fold((0, 0), |sum, share| {
-                let (seen, expected) = share.wkc;
+            inputs_fresh: self.group_results.iter().all(|group| group.fresh),
+            wkc: self.group_results.iter().fold((0, 0), |sum, group| {
+                let (seen, expected) = group.wkc;
                 (sum.0.saturating_add(seen), sum.1.saturating_add(expected))
             }),
             system_time: None,
@@ -484,24 +491,24 @@ impl Exchange {
             return answer;
         };
         answer.al_status = first
-            .get(places.al_status.data())
-            .and_then(|data| Some((*data.first()?, places.al_status.wkc(first))));
-        if let Some(turn) = frame_set.turn {
-            let place = DatagramSlot {
+            .get(slots.al_status.data())
+            .and_then(|data| Some((*data.first()?, slots.al_status.wkc(first))));
+        if let Some(poll) = frame_set.poll {
+            let slot = DatagramSlot {
                 frame: 0,
-                offset: places.probe_at,
-                len: turn.len,
+                offset: slots.diagnostic_at,
+                len: poll.len,
             };
-            let data = first.get(place.data()).unwrap_or_default();
-            match turn.look {
-                PollTarget::At { device, probe } => {
+            let data = first.get(slot.data()).unwrap_or_default();
+            match poll.target {
+                PollTarget::Registers { device, block } => {
                     if let Some(to) = self.diagnoses.get_mut(device) {
-                        to.answers = place.wkc(first) == 1;
+                        to.answers = slot.wkc(first) == 1;
                         if to.answers {
-                            let first = !to.has_read(probe);
-                            to.take(probe, data);
+                            let first = !to.has_read(block);
+                            to.take(block, data);
                             if let Some(window) = self.windows.get_mut(device) {
-                                window.take(probe, &to.errors, first);
+                                window.take(block, &to.errors, first);
                             }
                         }
                     }
@@ -515,7 +522,7 @@ impl Exchange {
                 }
             }
         }
-        answer.system_time = self.system_time(first, places.clock);
+        answer.system_time = self.system_time(first, slots.clock);
         if let Some(time) = answer.system_time {
             self.bus_status.set_clock(frame_set.sent_at, time);
             // The time of the frame set that is staged next; those in flight lie between.
@@ -528,19 +535,19 @@ impl Exchange {
     /// Returns the time if the reference clock has set it. If clocks are missing, they must all be
     /// in groups with missing devices, and the reference must have answered its last diagnostic
     /// read.
-    fn system_time(&self, first: &[u8], place: Option<DatagramSlot>) -> Option<u64> {
-        let place = place?;
-        let time = u64::from_le_bytes(first.get(place.data())?.try_into().ok()?);
-        let wkc = place.wkc(first);
-        let clocks = |shares: &mut dyn Iterator<Item = &GroupResult>| -> u16 {
-            shares
-                .map(|share| share.clocks)
+    fn system_time(&self, first: &[u8], slot: Option<DatagramSlot>) -> Option<u64> {
+        let slot = slot?;
+        let time = u64::from_le_bytes(first.get(slot.data())?.try_into().ok()?);
+        let wkc = slot.wkc(first);
+        let clocks = |group_results: &mut dyn Iterator<Item = &GroupResult>| -> u16 {
+            group_results
+                .map(|group| group.clocks)
                 .fold(0, u16::saturating_add)
         };
         let seen = self.diagnoses.get(self.reference);
-        let all = wkc == clocks(&mut self.shares.iter());
+        let all = wkc == clocks(&mut self.group_results.iter());
         let others = seen.is_some_and(|seen| seen.answers)
-            && wkc >= clocks(&mut self.shares.iter().filter(|share| share.fresh));
+            && wkc >= clocks(&mut self.group_results.iter().filter(|group| group.fresh));
         (all || others).then_some(time)
     }
 

@@ -32,11 +32,11 @@ fn reflect(exchange: &mut Exchange, number: usize, input: u8) -> Vec<u8> {
     while at + DATAGRAM_HEADER <= frame.len() {
         let len = usize::from(u16::from_le_bytes([frame[at + 6], frame[at + 7] & 7]));
         let data = at + DATAGRAM_HEADER;
-        let form = exchange.frame_sets[exchange.staged].form;
-        let expected = exchange.forms[form]
+        let layout = exchange.frame_sets[exchange.staged].layout;
+        let expected = exchange.layouts[layout]
             .process_data
             .iter()
-            .find(|d| (d.place.frame, d.place.offset) == (number, at));
+            .find(|d| (d.slot.frame, d.slot.offset) == (number, at));
         let wkc = expected.map_or(1, |d| d.expected_wkc);
         if frame[at] != Command::LWR.0 {
             frame[data..data + len].fill(input);
@@ -91,7 +91,7 @@ fn frame_bytes_for_8_32_and_100_axes() {
         let exchange = axes(count);
         let lengths: Vec<_> = exchange.frame_lengths().collect();
         assert_eq!(lengths.len(), 1, "{count} axes in one frame");
-        assert_eq!(exchange.forms[0].probe_at, cyclic);
+        assert_eq!(exchange.layouts[0].diagnostic_at, cyclic);
         assert!(
             lengths[0] <= cyclic + 20,
             "the diagnostic datagram takes at most 20 bytes"
@@ -193,13 +193,13 @@ fn device_without_lrw_exchanges_data_in_two_datagrams() {
     exchange.outputs_mut().fill(0x77);
     exchange.stage();
     let sent = exchange.frame_sets[0].frames()[0].bytes.clone();
-    let commands: Vec<(u8, bool)> = exchange.forms[0]
+    let commands: Vec<(u8, bool)> = exchange.layouts[0]
         .process_data
         .iter()
         .map(|d| {
             (
-                sent[d.place.offset],
-                sent[d.place.data()].iter().all(|b| *b == 0x77),
+                sent[d.slot.offset],
+                sent[d.slot.data()].iter().all(|b| *b == 0x77),
             )
         })
         .collect();
@@ -222,7 +222,7 @@ fn device_without_lrw_exchanges_data_in_two_datagrams() {
 fn wrong_working_counter_keeps_the_last_inputs() {
     let mut exchange = axes(1);
     let mut frame = reflect(&mut exchange, 0, 0x11);
-    let wkc = exchange.forms[0].process_data[0].place.data().end;
+    let wkc = exchange.layouts[0].process_data[0].slot.data().end;
     frame[wkc] = 2;
     assert_eq!(exchange.receive(&frame), Received::Current);
     let answer = exchange.evaluate();
@@ -236,11 +236,11 @@ fn diagnostic_slot_reads_all_registers_of_all_devices() {
     let mut exchange = axes(2);
     let mut seen = Vec::new();
     for _ in 0..2 * DiagnosticRegister::ALL.len() {
-        let turn = exchange.frame_sets[0].turn.expect("there are members");
-        let PollTarget::At { device, probe } = turn.look else {
+        let poll = exchange.frame_sets[0].poll.expect("there are members");
+        let PollTarget::Registers { device, block } = poll.target else {
             panic!("no device has a mailbox");
         };
-        seen.push((device, probe as usize));
+        seen.push((device, block as usize));
         let frame = reflect(&mut exchange, 0, 1);
         exchange.receive(&frame);
         exchange.evaluate();
@@ -318,23 +318,23 @@ proptest! {
 fn each_group_has_its_own_working_counter() {
     let mut exchange = grouped(&[1, 0, 2, 1]);
     assert_eq!(
-        exchange.forms[0].probe_at,
-        axes(4).forms[0].probe_at + 2 * 12
+        exchange.layouts[0].diagnostic_at,
+        axes(4).layouts[0].diagnostic_at + 2 * 12
     );
     let mut frame = reflect(&mut exchange, 0, 0x11);
-    let of_first_group = exchange.forms[0].process_data[1].place.data().end;
+    let of_first_group = exchange.layouts[0].process_data[1].slot.data().end;
     frame[of_first_group] = 4;
     assert_eq!(exchange.receive(&frame), Received::Current);
     let answer = exchange.evaluate();
     assert!(answer.complete && !answer.inputs_fresh);
     assert_eq!(answer.wkc, (10, 12));
-    let shares: Vec<_> = exchange
-        .shares()
+    let group_results: Vec<_> = exchange
+        .group_results()
         .iter()
-        .map(|share| (share.answered, share.fresh, share.wkc))
+        .map(|group| (group.answered, group.fresh, group.wkc))
         .collect();
     assert_eq!(
-        shares,
+        group_results,
         [
             (true, true, (3, 3)),
             (true, false, (4, 6)),
@@ -350,13 +350,13 @@ fn each_group_has_its_own_working_counter() {
 #[test]
 fn system_time_comes_only_from_the_reference_clock() {
     let mut exchange = grouped(&[0, 1]);
-    exchange.shares[1].clocks = 1;
+    exchange.group_results[1].clocks = 1;
     let mut answer = |wkc: u8, fresh: bool| {
         exchange.stage();
         let mut frame = reflect(&mut exchange, 0, 1);
-        let clock = exchange.forms[0].clock.expect("a clock").data().end;
+        let clock = exchange.layouts[0].clock.expect("a clock").data().end;
         frame[clock] = wkc;
-        let second = exchange.forms[0].process_data[1].place.data().end;
+        let second = exchange.layouts[0].process_data[1].slot.data().end;
         frame[second] = if fresh { 3 } else { 0 };
         exchange.receive(&frame);
         exchange.evaluate().system_time.is_some()
@@ -377,7 +377,7 @@ fn lost_frame_affects_only_its_groups() {
     exchange.receive(&frame);
     let answer = exchange.evaluate();
     assert!(!answer.complete && !answer.inputs_fresh);
-    let [rest, second] = exchange.shares() else {
+    let [rest, second] = exchange.group_results() else {
         panic!("two groups")
     };
     assert!(rest.fresh && !second.answered && !second.fresh);
@@ -386,31 +386,42 @@ fn lost_frame_affects_only_its_groups() {
 /// After a wrong shared counter, each device has its own datagram, until all were right for long
 /// enough.
 #[test]
-fn missing_device_does_not_change_the_evidence_of_others() {
+fn missing_device_does_not_change_the_answers_of_others() {
     for mode in [ExchangeMode::SameCycle, ExchangeMode::Pipelined] {
         let mut exchange = exchange(&[axis(0); 3], mode);
         exchange.expect_op(true);
         let missing_second = |exchange: &mut Exchange, input: u8| {
             let mut frame = reflect(exchange, 0, input);
-            let form = exchange.frame_sets[exchange.staged].form;
-            let at = exchange.forms[form].process_data[form].place.data().end;
-            frame[at] = if form == 0 { 6 } else { 0 };
+            let layout = exchange.frame_sets[exchange.staged].layout;
+            let at = exchange.layouts[layout].process_data[layout]
+                .slot
+                .data()
+                .end;
+            frame[at] = if layout == 0 { 6 } else { 0 };
             assert_eq!(exchange.receive(&frame), Received::Current);
             exchange.evaluate();
-            let evidence = exchange.evidence().to_vec();
+            let device_answers = exchange.device_answers().to_vec();
             exchange.stage();
-            evidence
+            device_answers
         };
-        let unknown = [Evidence::Unknown; 3];
+        let unknown = [DeviceAnswer::Unknown; 3];
         let first = missing_second(&mut exchange, 1);
         if mode == ExchangeMode::SameCycle {
             assert_eq!(first, unknown);
         } else {
-            assert_eq!(first, [Evidence::Missing; 3], "nothing was asked before");
+            assert_eq!(
+                first,
+                [DeviceAnswer::Missing; 3],
+                "nothing was asked before"
+            );
             assert_eq!(missing_second(&mut exchange, 1), unknown);
             assert_eq!(missing_second(&mut exchange, 1), unknown);
         }
-        let own = [Evidence::Fresh, Evidence::Missing, Evidence::Fresh];
+        let own = [
+            DeviceAnswer::Fresh,
+            DeviceAnswer::Missing,
+            DeviceAnswer::Fresh,
+        ];
         for _ in 0..300 {
             assert_eq!(missing_second(&mut exchange, 2), own);
         }
@@ -421,11 +432,11 @@ fn missing_device_does_not_change_the_evidence_of_others() {
             assert_eq!(exchange.receive(&frame), Received::Current);
             exchange.evaluate();
             if cycle > 1 {
-                assert_eq!(exchange.evidence(), [Evidence::Fresh; 3]);
+                assert_eq!(exchange.device_answers(), [DeviceAnswer::Fresh; 3]);
             }
             exchange.stage();
         }
-        assert_eq!(exchange.frame_sets[exchange.staged].form, 0);
+        assert_eq!(exchange.frame_sets[exchange.staged].layout, 0);
     }
 }
 
@@ -434,7 +445,7 @@ fn late_answer_proves_delivery_but_an_old_one_does_not() {
     let mut exchange = axes(2);
     let first = reflect(&mut exchange, 0, 1);
     exchange.evaluate();
-    assert_eq!(exchange.evidence(), [Evidence::Missing; 2]);
+    assert_eq!(exchange.device_answers(), [DeviceAnswer::Missing; 2]);
     exchange.stage();
     assert!(!exchange.came_late(0));
     assert_eq!(exchange.receive(&first), Received::Late);
@@ -443,7 +454,7 @@ fn late_answer_proves_delivery_but_an_old_one_does_not() {
     assert!(!exchange.came_late(0), "it is of one cycle");
     // An answer of a device that did not process it, or of another frame.
     let mut without = reflect(&mut exchange, 0, 1);
-    let wkc = exchange.forms[0].process_data[0].place.data().end;
+    let wkc = exchange.layouts[0].process_data[0].slot.data().end;
     without[wkc] = 3;
     exchange.stage();
     assert_eq!(exchange.receive(&without), Received::Late);

@@ -6,7 +6,7 @@ use ecaxis_master::config::{
     self, Action, Bus, DeviceConfig, Exchange, Machine, Nic, Step, duration,
 };
 use ecaxis_master::link::SocketKind;
-use ecaxis_master::rt::exchange::LONGEST_LOOK;
+use ecaxis_master::rt::exchange::MAX_POLL_DATAGRAM;
 use ecaxis_master::rt::image::{self, Access, ImagePlan};
 use ecaxis_master::rt::spin::Spin;
 use ecaxis_master::text::pluralize;
@@ -214,7 +214,7 @@ const FORWARDING_NS: usize = 1_000;
 /// Returns the maximum size of each frame of a cycle on the wire in bytes, with the interframe gap.
 fn frame_bytes(plan: &ImagePlan, clock: bool) -> Vec<usize> {
     let mut frames = vec![0; plan.frames()];
-    frames[0] = AL_STATUS + LONGEST_LOOK + if clock { CLOCK } else { 0 };
+    frames[0] = AL_STATUS + MAX_POLL_DATAGRAM + if clock { CLOCK } else { 0 };
     for datagram in &plan.datagrams {
         frames[datagram.frame] += DATAGRAM + datagram.len;
     }

@@ -15,7 +15,7 @@ fn frame_bytes_match_a_manual_count() {
         let frames = frame_bytes(&plan, true);
         assert_eq!(
             frames.iter().sum::<usize>(),
-            bytes + AL_STATUS + LONGEST_LOOK,
+            bytes + AL_STATUS + MAX_POLL_DATAGRAM,
             "{axes} axes"
         );
         assert_eq!(frames.len(), 1);

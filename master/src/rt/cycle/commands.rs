@@ -203,7 +203,11 @@ impl Engine {
             return;
         }
         for index in 0..self.groups.len() {
-            let there = self.exchange.shares().get(index).is_some_and(|s| s.fresh)
+            let there = self
+                .exchange
+                .group_results()
+                .get(index)
+                .is_some_and(|s| s.fresh)
                 && self.guard.lost(index).is_none();
             let idle = |slot: &RtAxis| {
                 let status = slot.axis.status();

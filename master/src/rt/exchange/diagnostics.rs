@@ -58,8 +58,8 @@ pub struct ErrorCounters {
 
 impl ErrorCounters {
     /// Copies the counters of one register block.
-    fn take(&mut self, probe: DiagnosticRegister, from: &Self) {
-        match probe {
+    fn take(&mut self, block: DiagnosticRegister, from: &Self) {
+        match block {
             DiagnosticRegister::RxErrors => {
                 self.invalid_frames = from.invalid_frames;
                 self.rx_errors = from.rx_errors;
@@ -138,9 +138,9 @@ impl Window {
     #[must_use]
     pub fn increments(&self, latest: &ErrorCounters) -> ErrorCounters {
         let mut end = *latest;
-        for probe in DiagnosticRegister::ALL {
-            if self.ended[probe as usize] {
-                end.take(probe, &self.at_stop);
+        for block in DiagnosticRegister::ALL {
+            if self.ended[block as usize] {
+                end.take(block, &self.at_stop);
             }
         }
         end.since(&self.begins[0])
@@ -154,14 +154,14 @@ impl Window {
     }
 
     /// Takes the values of one register block. RT.
-    pub(super) fn take(&mut self, probe: DiagnosticRegister, now: &ErrorCounters, first: bool) {
+    pub(super) fn take(&mut self, block: DiagnosticRegister, now: &ErrorCounters, first: bool) {
         if first {
             for to in &mut self.begins {
-                to.take(probe, now);
+                to.take(block, now);
             }
         }
-        if self.stopped && !std::mem::replace(&mut self.ended[probe as usize], true) {
-            self.at_stop.take(probe, now);
+        if self.stopped && !std::mem::replace(&mut self.ended[block as usize], true) {
+            self.at_stop.take(block, now);
         }
     }
 
@@ -188,8 +188,8 @@ impl SubDeviceDiagnostics {
 
     /// True once this register block was read, so that its values are not defaults.
     #[must_use]
-    pub fn has_read(&self, probe: DiagnosticRegister) -> bool {
-        self.begun.get(probe as usize) == Some(&true)
+    pub fn has_read(&self, block: DiagnosticRegister) -> bool {
+        self.begun.get(block as usize) == Some(&true)
     }
 
     /// Returns the increments up to `now`, counters that were read later by other means.
@@ -202,10 +202,10 @@ impl SubDeviceDiagnostics {
     #[must_use]
     pub fn latest(&self, now: Option<&ErrorCounters>) -> ErrorCounters {
         let mut latest = self.errors;
-        for probe in DiagnosticRegister::ALL {
-            if let Some(now) = now.filter(|_| self.has_read(probe)) {
+        for block in DiagnosticRegister::ALL {
+            if let Some(now) = now.filter(|_| self.has_read(block)) {
                 let mut part = latest;
-                part.take(probe, now);
+                part.take(block, now);
                 latest = latest.max(&part);
             }
         }
@@ -213,8 +213,8 @@ impl SubDeviceDiagnostics {
     }
 
     /// Processes an answer. RT.
-    pub(super) fn take(&mut self, probe: DiagnosticRegister, data: &[u8]) {
-        match (probe, data) {
+    pub(super) fn take(&mut self, block: DiagnosticRegister, data: &[u8]) {
+        match (block, data) {
             (DiagnosticRegister::AlStatus, &[status, _, _, _, low, high]) => {
                 self.al_status = status;
                 self.al_code = u16::from_le_bytes([low, high]);
@@ -235,9 +235,9 @@ impl SubDeviceDiagnostics {
             }
             _ => return,
         }
-        let n = probe as usize;
+        let n = block as usize;
         if !std::mem::replace(&mut self.begun[n], true) {
-            self.start.take(probe, &self.errors);
+            self.start.take(block, &self.errors);
         }
     }
 }
@@ -338,8 +338,8 @@ mod tests {
 
     #[test]
     fn diagnostic_registers_are_in_declaration_order() {
-        for probe in DiagnosticRegister::ALL {
-            assert_eq!(DiagnosticRegister::ALL[probe as usize], probe);
+        for block in DiagnosticRegister::ALL {
+            assert_eq!(DiagnosticRegister::ALL[block as usize], block);
         }
     }
 }

@@ -81,14 +81,14 @@ pub(super) fn push(
     address: u32,
     len: usize,
 ) -> DatagramSlot {
-    let place = DatagramSlot {
+    let slot = DatagramSlot {
         frame: number,
         offset: frame.bytes.len(),
         len,
     };
-    frame.bytes.resize(place.end(), 0);
-    write_header(&mut frame.bytes, place.offset, command, address, len);
-    place
+    frame.bytes.resize(slot.end(), 0);
+    write_header(&mut frame.bytes, slot.offset, command, address, len);
+    slot
 }
 
 pub(super) fn write_header(
@@ -105,13 +105,13 @@ pub(super) fn write_header(
         len: u16::try_from(len).unwrap_or(0),
         more: false,
     };
-    if let Some(place) = frame.get_mut(offset..offset + DATAGRAM_HEADER) {
-        place.copy_from_slice(&header.emit());
+    if let Some(slot) = frame.get_mut(offset..offset + DATAGRAM_HEADER) {
+        slot.copy_from_slice(&header.emit());
     }
 }
 
-pub(super) fn clear_wkc(frame: &mut [u8], place: DatagramSlot) {
-    if let Some(wkc) = frame.get_mut(place.data().end..place.end()) {
+pub(super) fn clear_wkc(frame: &mut [u8], slot: DatagramSlot) {
+    if let Some(wkc) = frame.get_mut(slot.data().end..slot.end()) {
         wkc.fill(0);
     }
 }
@@ -153,14 +153,14 @@ pub(super) fn number(frame: &mut [u8], tag: u8, cycle: u32) {
 }
 
 /// True if an answer contains the datagram that was sent in this position, regardless of the cycle.
-pub(super) fn same_datagram(sent: &[u8], answer: &[u8], place: DatagramSlot) -> bool {
+pub(super) fn same_datagram(sent: &[u8], answer: &[u8], slot: DatagramSlot) -> bool {
     let header = |frame: &[u8]| {
-        let header = frame.get(place.offset..place.offset + 8)?;
+        let header = frame.get(slot.offset..slot.offset + 8)?;
         let mut header: [u8; 8] = header.try_into().ok()?;
         (header[1], header[7]) = (0, header[7] & 0x07);
         Some(header)
     };
-    answer.len() >= place.end() && header(sent).is_some() && header(sent) == header(answer)
+    answer.len() >= slot.end() && header(sent).is_some() && header(sent) == header(answer)
 }
 
 /// True if an answer contains all sent datagrams in their positions. SubDevices change only

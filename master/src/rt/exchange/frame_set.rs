@@ -8,9 +8,9 @@ use crate::link::{Link, LinkError};
 #[derive(Debug)]
 pub(super) struct FrameSet {
     /// The frames of each layout.
-    forms: Vec<Vec<Frame>>,
+    layouts: Vec<Vec<Frame>>,
     /// The layout in use.
-    pub form: usize,
+    pub layout: usize,
     /// The number of its cycle; the low byte is the index of every datagram.
     cycle: u32,
     /// The delay after the planned release; `None` until sent.
@@ -18,32 +18,32 @@ pub(super) struct FrameSet {
     /// The session clock's time when it was sent.
     pub sent_at: Nanos,
     /// The diagnostic read that it carries.
-    pub turn: Option<PollDatagram>,
+    pub poll: Option<PollDatagram>,
 }
 
 impl FrameSet {
-    pub fn new(forms: Vec<Vec<Frame>>) -> Self {
+    pub fn new(layouts: Vec<Vec<Frame>>) -> Self {
         Self {
-            forms,
-            form: 0,
+            layouts,
+            layout: 0,
             cycle: 0,
             sent_late: None,
             sent_at: 0,
-            turn: None,
+            poll: None,
         }
     }
 
-    pub fn form_frames(&self, form: usize) -> &[Frame] {
-        self.forms.get(form).map_or(&[], Vec::as_slice)
+    pub fn layout_frames(&self, layout: usize) -> &[Frame] {
+        self.layouts.get(layout).map_or(&[], Vec::as_slice)
     }
 
     pub fn frames(&self) -> &[Frame] {
-        self.form_frames(self.form)
+        self.layout_frames(self.layout)
     }
 
     pub fn frames_mut(&mut self) -> &mut [Frame] {
-        self.forms
-            .get_mut(self.form)
+        self.layouts
+            .get_mut(self.layout)
             .map_or(&mut [], Vec::as_mut_slice)
     }
 

@@ -9,17 +9,17 @@ use ecaxis_ecat::datagram::Command;
 use ecaxis_ecat::registers;
 
 /// Data bytes of the longest read.
-const LONGEST: usize = 8;
+const MAX_POLL_DATA: usize = 8;
 /// Bytes of the longest datagram in the diagnostic slot.
-pub const LONGEST_LOOK: usize = DATAGRAM_HEADER + LONGEST + WKC;
+pub const MAX_POLL_DATAGRAM: usize = DATAGRAM_HEADER + MAX_POLL_DATA + WKC;
 
 /// The target of one read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum PollTarget {
     /// A register block of one member.
-    At {
+    Registers {
         device: usize,
-        probe: DiagnosticRegister,
+        block: DiagnosticRegister,
     },
     /// The status of mailboxes, a byte each, starting at this index of
     /// [`PollSchedule::mailbox_devices`].
@@ -29,7 +29,7 @@ pub(super) enum PollTarget {
 /// One read of the diagnostic slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct PollDatagram {
-    pub look: PollTarget,
+    pub target: PollTarget,
     pub command: Command,
     pub address: u32,
     pub len: usize,
@@ -54,13 +54,13 @@ impl PollSchedule {
     pub fn new(members: &[ExchangeDevice], mapped: Option<&MailboxPlan>) -> Self {
         let registers =
             |station: u16, register: u16| u32::from(register) << 16 | u32::from(station);
-        let diagnosis = DiagnosticRegister::ALL.iter().flat_map(|&probe| {
-            let (register, len) = probe.register_and_len();
+        let diagnosis = DiagnosticRegister::ALL.iter().flat_map(|&block| {
+            let (register, len) = block.register_and_len();
             members
                 .iter()
                 .enumerate()
                 .map(move |(device, member)| PollDatagram {
-                    look: PollTarget::At { device, probe },
+                    target: PollTarget::Registers { device, block },
                     command: Command::FPRD,
                     address: registers(member.station, register),
                     len,
@@ -68,14 +68,14 @@ impl PollSchedule {
         });
         let mut mailbox_devices = mapped.map_or_else(Vec::new, |plan| plan.devices.clone());
         let mut mailboxes: Vec<PollDatagram> = mailbox_devices
-            .chunks(LONGEST)
+            .chunks(MAX_POLL_DATA)
             .scan(0, |at, window| {
                 let first = *at;
                 *at += window.len();
                 Some((first, window.len()))
             })
             .map(|(first, len)| PollDatagram {
-                look: PollTarget::Mailboxes { first },
+                target: PollTarget::Mailboxes { first },
                 command: Command::LRD,
                 address: mapped.map_or(0, |plan| plan.address(first)),
                 len,
@@ -86,7 +86,7 @@ impl PollSchedule {
                 && !mapped.is_some_and(|plan| plan.devices.contains(&device))
             {
                 mailboxes.push(PollDatagram {
-                    look: PollTarget::Mailboxes {
+                    target: PollTarget::Mailboxes {
                         first: mailbox_devices.len(),
                     },
                     command: Command::FPRD,
@@ -112,18 +112,18 @@ impl PollSchedule {
     pub fn next(&mut self) -> Option<PollDatagram> {
         let mailbox = self.mailbox_is_next && !self.mailboxes.is_empty();
         self.mailbox_is_next = !mailbox;
-        let (turns, next) = if mailbox {
+        let (polls, next) = if mailbox {
             (&self.mailboxes, &mut self.next.1)
         } else {
             (&self.diagnosis, &mut self.next.0)
         };
-        let turn = turns.get(*next).copied();
-        *next = if *next + 1 < turns.len() {
+        let poll = polls.get(*next).copied();
+        *next = if *next + 1 < polls.len() {
             *next + 1
         } else {
             0
         };
-        turn
+        poll
     }
 }
 
@@ -147,18 +147,18 @@ mod tests {
     fn poll_schedule_reads_mailboxes_every_other_cycle() {
         let members = members(&[Some(1), None, Some(3)]);
         let mut schedule = PollSchedule::new(&members, None);
-        let looks: Vec<PollDatagram> = std::iter::from_fn(|| schedule.next()).take(64).collect();
-        let mut probes = Vec::new();
+        let polls: Vec<PollDatagram> = std::iter::from_fn(|| schedule.next()).take(64).collect();
+        let mut blocks = Vec::new();
         let mut mailboxes = Vec::new();
-        for (n, turn) in looks.iter().enumerate() {
-            match turn.look {
-                PollTarget::At { device, probe } => {
+        for (n, poll) in polls.iter().enumerate() {
+            match poll.target {
+                PollTarget::Registers { device, block } => {
                     assert_eq!(n % 2, 0);
-                    assert_eq!(turn.address & 0xffff, 1001 + device as u32);
-                    probes.push((probe, device));
+                    assert_eq!(poll.address & 0xffff, 1001 + device as u32);
+                    blocks.push((block, device));
                 }
                 PollTarget::Mailboxes { first } => {
-                    mailboxes.push((schedule.mailbox_devices[first], turn.address, turn.len));
+                    mailboxes.push((schedule.mailbox_devices[first], poll.address, poll.len));
                 }
             }
         }
@@ -166,13 +166,13 @@ mod tests {
         let second = (2, 0x081d_03eb, 1);
         assert_eq!(mailboxes[..4], [first, second, first, second]);
         assert_eq!(
-            probes[..4].iter().map(|p| p.1).collect::<Vec<_>>(),
+            blocks[..4].iter().map(|p| p.1).collect::<Vec<_>>(),
             [0, 1, 2, 0]
         );
         // The schedule has visited all members and starts again.
-        assert_eq!(probes[0], probes[15]);
-        for probe in DiagnosticRegister::ALL {
-            assert_eq!(probes[..15].iter().filter(|p| p.0 == probe).count(), 3);
+        assert_eq!(blocks[0], blocks[15]);
+        for block in DiagnosticRegister::ALL {
+            assert_eq!(blocks[..15].iter().filter(|p| p.0 == block).count(), 3);
         }
     }
 
@@ -184,16 +184,16 @@ mod tests {
             devices: (0..12).filter(|n| *n != 4).collect(),
         };
         let mut schedule = PollSchedule::new(&members, Some(&plan));
-        let looks = std::iter::from_fn(|| schedule.next())
+        let polls = std::iter::from_fn(|| schedule.next())
             .take(8)
             .collect::<Vec<_>>();
-        let mailboxes: Vec<_> = looks
+        let mailboxes: Vec<_> = polls
             .iter()
-            .filter_map(|turn| match turn.look {
+            .filter_map(|poll| match poll.target {
                 PollTarget::Mailboxes { first } => {
-                    Some((first, turn.command, turn.address, turn.len))
+                    Some((first, poll.command, poll.address, poll.len))
                 }
-                PollTarget::At { .. } => None,
+                PollTarget::Registers { .. } => None,
             })
             .collect();
         let expected = [
@@ -211,7 +211,7 @@ mod tests {
         for members in [members(&[None]), members(&[Some(1); 20])] {
             let mut schedule = PollSchedule::new(&members, None);
             for _ in 0..200 {
-                assert!(schedule.next().expect("a turn").len <= LONGEST);
+                assert!(schedule.next().expect("a poll").len <= MAX_POLL_DATA);
             }
         }
         assert_eq!(PollSchedule::new(&[], None).next(), None);

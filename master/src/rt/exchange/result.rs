@@ -41,7 +41,7 @@ impl GroupResult {
 
 /// What the answers of a cycle show about one device.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Evidence {
+pub enum DeviceAnswer {
     /// Its working counter, own or shared, was right: it processed its outputs, and its inputs are
     /// from this cycle.
     Fresh,

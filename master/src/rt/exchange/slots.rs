@@ -3,14 +3,14 @@
 use super::super::image::{Access, DatagramPlan, ImagePlan};
 use super::super::phase::ClockPlan;
 use super::frame::{DatagramSlot, Frame, push};
-use super::poll_schedule::LONGEST_LOOK;
+use super::poll_schedule::MAX_POLL_DATAGRAM;
 use crate::link::MAX_FRAME;
 use ecaxis_ecat::datagram::Command;
 use ecaxis_ecat::registers;
 
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ProcessDatagram {
-    pub(super) place: DatagramSlot,
+    pub(super) slot: DatagramSlot,
     pub(super) access: Access,
     pub(super) group: usize,
     /// Offset in the image.
@@ -27,7 +27,7 @@ pub(super) struct DatagramSlots {
     pub(super) clock: Option<DatagramSlot>,
     pub(super) process_data: Vec<ProcessDatagram>,
     pub(super) al_status: DatagramSlot,
-    pub(super) probe_at: usize,
+    pub(super) diagnostic_at: usize,
 }
 
 impl DatagramSlots {
@@ -57,7 +57,7 @@ impl DatagramSlots {
             };
             let (logical, len) = (datagram.logical, datagram.len);
             ProcessDatagram {
-                place: push(&mut frames[frame], frame, command, logical, len),
+                slot: push(&mut frames[frame], frame, command, logical, len),
                 access: datagram.access,
                 group: datagram.group,
                 image: datagram.offset,
@@ -73,13 +73,13 @@ impl DatagramSlots {
             u32::from(registers::AL_STATUS) << 16,
             2,
         );
-        let probe_at = frames[0].bytes.len();
-        debug_assert!(probe_at + LONGEST_LOOK <= MAX_FRAME);
+        let diagnostic_at = frames[0].bytes.len();
+        debug_assert!(diagnostic_at + MAX_POLL_DATAGRAM <= MAX_FRAME);
         Self {
             clock,
             process_data,
             al_status,
-            probe_at,
+            diagnostic_at,
         }
     }
 }
