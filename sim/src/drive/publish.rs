@@ -11,7 +11,9 @@ impl Drive {
         let state = self.power.state();
         let mut word = state.bits();
         let mut set = |on: bool, bit: u16| word |= if on { bit } else { 0 };
-        set(self.power.powered() || state == State::SwitchedOn, 1 << 4);
+        // Voltage enabled: most drives report the supply, a maxon drive its power stage.
+        let power_stage = self.power.powered() || state == State::SwitchedOn;
+        set(power_stage || !self.objects.is_maxon, 1 << 4);
         set(self.warning, 1 << 7);
         set(self.in_op, 1 << 9);
         set(limited || self.at_limit_switch(), bit::INTERNAL_LIMIT);

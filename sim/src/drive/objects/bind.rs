@@ -18,6 +18,13 @@ pub(super) const RO: Access = Access {
 pub(super) struct Binder<'a>(pub &'a mut ObjectStore);
 
 impl Binder<'_> {
+    /// True if the dictionary is that of a maxon drive. One without a vendor counts as maxon's.
+    pub(super) fn is_maxon(&self) -> bool {
+        const MAXON: i64 = 0xfb;
+        let vendor = self.0.slot(0x1018, 1).map(|slot| self.0.get(slot));
+        self.0.slot(0x30b0, 0).is_some() || vendor.is_none_or(|vendor| vendor == MAXON)
+    }
+
     pub(super) fn bind(
         &mut self,
         index: u16,

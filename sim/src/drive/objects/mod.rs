@@ -51,6 +51,8 @@ const MANUFACTURER_SPECIFIC: RangeInclusive<u16> = 0x2000..=0x5fff;
 
 #[derive(Debug, Clone)]
 pub(super) struct Objects {
+    /// The drive's own rules differ from those of most drives.
+    pub is_maxon: bool,
     pub error_register: EntryHandle,
     pub error_code: EntryHandle,
     /// 0x1003:0 and its entries, if the ESI has them.
@@ -128,6 +130,7 @@ impl Objects {
         b.with_default(0x60a8, 0, "SI unit position", 32, COUNTS);
         let parameters = ParameterSlots::bind(&mut b, plant);
         Self {
+            is_maxon: b.is_maxon(),
             error_register: b.bind(0x1001, 0, "Error register", 8, RO),
             error_code: b.bind(0x603f, 0, "Error code", 16, RO),
             history,

@@ -48,18 +48,15 @@ impl Limit {
 
 /// Returns the counts of 0x6076 per N·m. The unit comes from the dictionary (ETG.1004: newton metre
 /// is 0x56, the highest byte a power of ten). Without one, the unit is µNm for a maxon drive and
-/// mNm otherwise. A dictionary without a vendor counts as maxon's.
+/// mNm otherwise.
 fn counts_per_newton_metre(b: &Binder<'_>, rated_torque: EntryHandle) -> f64 {
     const NEWTON_METRE: u32 = 0x56;
-    const MAXON: i64 = 0xfb;
     let unit = b.0.item(rated_torque).map_or(0, |item| item.unit);
     if unit & 0x00ff_ffff == NEWTON_METRE << 16 {
         let [.., power] = unit.to_le_bytes();
         return 10f64.powi(-i32::from(i8::from_le_bytes([power])));
     }
-    let vendor = b.0.slot(0x1018, 1).map(|slot| b.0.get(slot));
-    let maxon = b.0.slot(0x30b0, 0).is_some() || vendor.is_none_or(|vendor| vendor == MAXON);
-    if maxon { 1e6 } else { 1e3 }
+    if b.is_maxon() { 1e6 } else { 1e3 }
 }
 
 impl TorqueSlots {
