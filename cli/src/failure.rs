@@ -1,6 +1,6 @@
 //! Failures for the user: exit code, message and hints.
 
-use ecaxis_master::session::RunError;
+use ecaxis_master::report::Cause;
 
 /// Exit code: the machine or the bus failed.
 pub(crate) const FAILED: u8 = 1;
@@ -31,7 +31,7 @@ impl Failure {
 
     /// The failure of work that a signal ended.
     pub fn interrupted() -> Self {
-        Self::new(INTERRUPTED, RunError::Interrupted.to_string())
+        Self::new(INTERRUPTED, Cause::Interrupted.to_string())
     }
 
     pub fn hint(mut self, hint: impl Into<String>) -> Self {

@@ -18,7 +18,7 @@ use ecaxis_master::mailbox::DeviceMailbox;
 use ecaxis_master::recording::Direction;
 use ecaxis_master::rt::controller::{Controller, CycleContext};
 use ecaxis_master::rt::cycle::{Engine, EngineReport};
-use ecaxis_master::session::{Options, Prepared, Progress, RunBuilder, RunError};
+use ecaxis_master::session::{Cause, Error, Options, Prepared, Progress, RunBuilder};
 use ecaxis_test_support::{axes, faults, load, machine, virtual_time};
 
 thread_local! {
@@ -119,7 +119,7 @@ fn recording_in_the_cycle_allocates_nothing() {
     assert_eq!(counted, 0);
 }
 
-type Ended = Option<Result<(), RunError>>;
+type Ended = Option<Result<(), Error>>;
 
 /// Runs the cycle with its supervisor. Returns the allocations of the cycles, the bytes still
 /// allocated, and the supervisor's result.
@@ -217,11 +217,9 @@ fn a_hundred_thousand_cycles_allocate_nothing() {
     );
     assert!(
         matches!(
-            result,
-            Some(Err(RunError::DriveFault {
-                code: Some(0x8611),
-                ..
-            }))
+            &result,
+            Some(Err(Error { cause, .. }))
+                if matches!(**cause, Cause::DriveFault { code: Some(0x8611), .. })
         ),
         "{result:?}"
     );

@@ -7,7 +7,7 @@ use ecaxis_axis::{Command, CommandError};
 use ecaxis_master::clock::{self, Clock};
 use ecaxis_master::config::{AxisRef, InputRef, Machine, OutputRef};
 use ecaxis_master::rt::controller::{Controller, CycleContext};
-use ecaxis_master::session::{Options, Outcome, RunError, run_with};
+use ecaxis_master::session::{Cause, Options, Outcome, run_with};
 use ecaxis_test_support::{Heard, faults, load, virtual_time};
 
 fn control(machine: Machine, controller: impl Controller + 'static) -> Outcome {
@@ -277,7 +277,7 @@ fn a_controller_panic_stops_the_machine_within_its_limits() {
         }),
     );
     let error = outcome.result.expect_err("it panicked");
-    assert!(matches!(error, RunError::Controller), "{error:?}");
+    assert!(matches!(*error.cause, Cause::Controller), "{error:?}");
     let x = &outcome.summary.expect("the cycle has run").axes[0];
     // 0.1 s at 2500 mm/s², and the same time to rest: twice 12.5 mm.
     assert!((20.0..30.0).contains(&x.final_position), "{x:?}");

@@ -7,9 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use ecaxis_master::bringup::Step;
 use ecaxis_master::config::Machine;
 use ecaxis_master::mailbox::{MailboxError, Mailboxes, SdoError};
-use ecaxis_master::session::{
-    self, EmergencyReport, Observer, Options, Outcome, Progress, RunError,
-};
+use ecaxis_master::session::{self, Cause, EmergencyReport, Observer, Options, Outcome, Progress};
 use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::{Heard, axes, faults, machine, run, virtual_time};
 
@@ -119,7 +117,8 @@ fn emergencies_have_the_time_of_their_arrival() {
 fn a_fault_report_contains_the_emergency_of_the_drive() {
     let script = "[[fault]]\nkind = \"drive-fault\"\nat = \"1.5s\"\ndevice = 1\ncode = 0x7320\n";
     let (outcome, _) = run(machine(&axes(2)), faults(script));
-    let Err(RunError::DriveFault { code, report, .. }) = &outcome.result else {
+    let error = outcome.result.as_ref().expect_err("it failed");
+    let Cause::DriveFault { code, report, .. } = &*error.cause else {
         panic!("{:?}", outcome.result)
     };
     assert_eq!(*code, Some(0x7320));
@@ -147,7 +146,8 @@ fn the_diagnosis_history_of_a_faulty_device_is_read() {
         .collect();
     script += "[[fault]]\nkind = \"drive-fault\"\nat = \"1.5s\"\ndevice = 1\ncode = 0x7320\n";
     let (outcome, _) = run(machine, faults(&script));
-    let Err(RunError::DriveFault { report, .. }) = &outcome.result else {
+    let error = outcome.result.as_ref().expect_err("it failed");
+    let Cause::DriveFault { report, .. } = &*error.cause else {
         panic!("{:?}", outcome.result)
     };
     // The device keeps eight messages: the two newest are at the start, the third is at the end.

@@ -1,7 +1,7 @@
 //! The program's steps on the simulated bus: power, inputs and outputs, repetition, and error
 //! messages of failed steps.
 
-use ecaxis_master::session::{Progress, RunError};
+use ecaxis_master::session::{Error, Progress};
 use ecaxis_test_support::recordings::process_images;
 use ecaxis_test_support::{Heard, faults, load, machine, root, run, run_well, virtual_time};
 
@@ -54,7 +54,7 @@ fn steps(heard: &Heard) -> Vec<String> {
 fn program(
     text: &str,
 ) -> (
-    Result<(), RunError>,
+    Result<(), Error>,
     Vec<String>,
     ecaxis_master::session::Summary,
 ) {

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use ecaxis_master::session::{self, Observer, Options, Progress, RunError, Summary};
+use ecaxis_master::session::{self, Error, Observer, Options, Progress, Summary};
 use ecaxis_test_support::host::retry_if_host_stalled;
 use ecaxis_test_support::{axes, machine};
 
@@ -21,7 +21,7 @@ impl<F: FnMut(&Progress) -> bool> Observer for Interrupter<F> {
     }
 }
 
-fn interrupted(when: impl FnMut(&Progress) -> bool) -> (Option<Summary>, Result<(), RunError>) {
+fn interrupted(when: impl FnMut(&Progress) -> bool) -> (Option<Summary>, Result<(), Error>) {
     let stop = Arc::new(AtomicBool::new(false));
     let mut observer = Interrupter {
         stop: Arc::clone(&stop),
@@ -56,7 +56,8 @@ fn an_interruption_in_motion_brings_the_axes_to_rest() {
 fn an_interruption_during_bring_up_ends_it() {
     retry_if_host_stalled(|| {
         let (summary, result) = interrupted(|progress| matches!(progress, Progress::Step(_)));
-        assert!(matches!(result, Err(RunError::Interrupted)), "{result:?}");
+        let interrupted = result.as_ref().is_err_and(Error::is_interruption);
+        assert!(interrupted, "{result:?}");
         assert!(summary.is_none());
     });
 }

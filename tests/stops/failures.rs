@@ -13,7 +13,7 @@ use ecaxis_master::clock::Nanos;
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
 use ecaxis_master::rt::cycle::Engine;
-use ecaxis_master::session::{Options, RunBuilder, RunError, simulated_bus};
+use ecaxis_master::session::{Cause, Options, RunBuilder, simulated_bus};
 use ecaxis_test_support::recordings::{FPWR, Frame, LRD, LRW, frames};
 use ecaxis_test_support::{faults, machine, recorded, run, run_badly, run_well, virtual_time};
 
@@ -564,7 +564,8 @@ fn a_panic_in_the_cycle_brings_the_axes_to_rest() {
             }
         }
         let (_, result) = result.expect("it ended");
-        assert!(matches!(result, Err(RunError::Panicked(_))), "{result:?}");
+        let error = result.expect_err("it panicked");
+        assert!(matches!(*error.cause, Cause::Panicked(_)), "{error:?}");
         let seen = seen.lock().expect("one thread");
         comes_to_rest(&seen, 20.0);
         let words = seen.iter().any(|cycle| cycle.controlword == 0x0002);

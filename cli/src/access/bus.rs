@@ -8,7 +8,7 @@ use ecaxis_master::acyclic::{self, DatagramClient};
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{Machine, Nic};
 use ecaxis_master::link::{self, Link, SocketKind};
-use ecaxis_master::session::{self, Options, RunError};
+use ecaxis_master::session::{self, Cause, Error, Options};
 
 use crate::access::signals;
 use crate::hints::{self, Failure};
@@ -103,7 +103,7 @@ impl Bus {
         done.map_err(|error| hints::run(&error, &nic))
     }
 
-    fn open(self, heard: &AtomicU64) -> Result<Box<dyn Link>, RunError> {
+    fn open(self, heard: &AtomicU64) -> Result<Box<dyn Link>, Error> {
         let Self { on, options, alone } = self;
         let link: Box<dyn Link> = match on {
             BusKind::Sim(machine) => {
@@ -117,7 +117,7 @@ impl Bus {
                     true => link::open_exclusive(&nic, back_end)?,
                     false => link::open(&nic, back_end)?,
                 };
-                let frames = link::sniff_foreign_frames(link.as_mut()).map_err(RunError::Link)?;
+                let frames = link::sniff_foreign_frames(link.as_mut()).map_err(Cause::Link)?;
                 heard.store(frames, Ordering::Relaxed);
                 // Another ecaxis may drive a machine on this interface.
                 Box::new(link::source_address::PrivateMacLink::new(

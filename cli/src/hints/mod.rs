@@ -12,7 +12,7 @@ use ecaxis_master::acyclic::StateError;
 use ecaxis_master::bringup::BringUpError;
 use ecaxis_master::config::{ConfigError, LimitConflict, Nic, UnitProblem};
 use ecaxis_master::mailbox::{NamedObject, SdoError};
-use ecaxis_master::session::RunError;
+use ecaxis_master::report::{Cause, Error};
 use ecaxis_sim::ServeError;
 
 pub(crate) use crate::failure::{FAILED, Failure, INTERRUPTED, WRONG};
@@ -43,90 +43,92 @@ pub(crate) fn no_ethercat(failure: Failure, one_interface: bool) -> Failure {
 }
 
 /// Maps the error of a run to a failure. Hints depend on whether the bus is real.
-pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
+pub(crate) fn run(error: &Error, nic: &Nic) -> Failure {
     let failure = Failure::new(FAILED, message(error));
-    let hint = match error {
-        RunError::Open(open) => return interface(failure, open),
-        RunError::BringUp(bring_up) => return self::bring_up(failure, bring_up, nic),
-        RunError::State(state) => self::state(state),
-        RunError::Record(_) => "name a file that can be written, on a disk with room".to_owned(),
-        RunError::Replay(_) => {
+    let hint = match &*error.cause {
+        Cause::Open(open) => return interface(failure, open),
+        Cause::BringUp(bring_up) => return self::bring_up(failure, bring_up, nic),
+        Cause::State(state) => self::state(state),
+        Cause::Record(_) => "name a file that can be written, on a disk with room".to_owned(),
+        Cause::Replay(_) => {
             // The recording is a user input.
             return Failure { code: WRONG, ..failure }
                 .hint("a replay needs a complete recording of a run of this machine file, made with `ecaxis run --record`");
         }
-        RunError::NotMapped { source, .. } => format!(
+        Cause::NotMapped(object) => format!(
             "add \"{}\" to the device's `pdo` lists, or omit them to use the ESI's",
-            address(source.index, source.sub),
+            address(object.index, object.sub),
         ),
-        RunError::NoProcessData { .. } => {
+        Cause::NoProcessData { .. } => {
             "`ecaxis explain` shows the expected layout; a device without an FMMU left answers no process data".to_owned()
         }
-        RunError::PhaseNotLocked { .. } => {
+        Cause::PhaseNotLocked { .. } => {
             "wake-ups are too irregular: run with real-time priority (`ecaxis run` warns if it has none), or a longer `cycle`".to_owned()
         }
-        RunError::NotEnabled { state, code, mode_confirmed, .. } => not_enabled(*state, *code, *mode_confirmed),
-        RunError::WrongMode { .. } => {
+        Cause::NotEnabled { state, code, mode_confirmed, .. } => not_enabled(*state, *code, *mode_confirmed),
+        Cause::WrongMode { .. } => {
             "the drive refused the mode: check that its firmware supports it and that no parameter forbids it".to_owned()
         }
-        RunError::Trip { trip: Trip::FollowingError { .. }, limits, .. } if !limits.is_empty() => {
+        Cause::Trip { trip: Trip::FollowingError { .. }, limits, .. } if !limits.is_empty() => {
             allows_less(limits)
         }
-        RunError::DriveFault { code: Some(FOLLOWING_ERROR), report, .. } if !report.limits.is_empty() => {
+        Cause::DriveFault { code: Some(FOLLOWING_ERROR), report, .. } if !report.limits.is_empty() => {
             allows_less(&report.limits)
         }
-        RunError::DriveFault { code: Some(code), .. } => describe(*code).hint.to_owned(),
-        RunError::DriveFault { code: None, .. } => "read 0x603F and the error history 0x1003 of the drive".to_owned(),
-        RunError::Trip { trip, .. } => self::trip(trip).to_owned(),
-        RunError::BusLost { answered: false, .. } => {
+        Cause::DriveFault { code: Some(code), .. } => describe(*code).hint.to_owned(),
+        Cause::DriveFault { code: None, .. } => "read 0x603F and the error history 0x1003 of the drive".to_owned(),
+        Cause::Trip { trip, .. } => self::trip(trip).to_owned(),
+        Cause::BusLost { answered: false, .. } => {
             "check cables and power; `lost_frames` sets how many bad cycles are tolerated".to_owned()
         }
-        RunError::BusLost { answered: true, wkc, .. } => fault_report::working_counter(*wkc).to_owned(),
-        RunError::LeftOp { code, .. } => al_status(*code).to_owned(),
-        RunError::Gone { .. } => "check the device's power and the cable to it".to_owned(),
-        RunError::LeftOpBriefly { .. } => "look for loose connectors and supply dips".to_owned(),
-        RunError::NotReached { .. } => {
+        Cause::BusLost { answered: true, wkc, .. } => fault_report::working_counter(*wkc).to_owned(),
+        Cause::LeftOp { code, .. } => al_status(*code).to_owned(),
+        Cause::Gone => "check the device's power and the cable to it".to_owned(),
+        Cause::LeftOpBriefly { .. } => "look for loose connectors and supply dips".to_owned(),
+        Cause::NotReached { .. } => {
             "check load and tuning, or give the axis a wider `target_window`".to_owned()
         }
-        RunError::ProbeNotArmed { input, .. } => format!(
+        Cause::ProbeNotArmed { input, .. } => format!(
             "check that the drive has a digital input configured as touch probe {input} (0x60B8 and 0x60B9 in its manual)"
         ),
-        RunError::NotProbed { input, edge, .. } => format!(
+        Cause::NotProbed { input, edge, .. } => format!(
             "check the sensor, its wiring, and that the drive's digital input is configured as touch probe {input}; an input that is {} when the search begins shows no such edge; search farther with `to` or `by`, or for the other `edge`",
             if *edge == "rising" { "already on" } else { "off" }
         ),
-        RunError::StepTimeout { .. } => "check the drive's state and fault; the step waits for `bus.enable_timeout`, or for the longest stop time of an axis".to_owned(),
-        RunError::NotSwitched { .. } => "check 0x6502 (supported drive modes) and the mode's requirements in the drive's manual".to_owned(),
-        RunError::NotHomed { error, .. } => not_homed(*error).to_owned(),
-        RunError::WaitTimeout { .. } => "check the sensor and its wiring, or give the step a longer `timeout`".to_owned(),
-        RunError::TooLarge { .. } => "map fewer objects with `pdo.rx` and `pdo.tx`".to_owned(),
-        RunError::ClockNotSettled { .. } => "frames reach the clocks too irregularly, or the device has a faulty clock: run with real-time priority, or with `dc = \"off\"`".to_owned(),
-        RunError::NotDisabled { .. } => "the drive ignores its Controlword: switch its power off by hand, then check its fault".to_owned(),
-        RunError::Refused { by_axis, device, .. } => refused(by_axis.as_deref(), &device.name),
-        RunError::Axis { .. } => "check the step and the axis' limits in the machine file".to_owned(),
-        RunError::EmergencyStop { .. } => "release it, then run again; `[stop] emergency` in the machine file says what it is".to_owned(),
-        RunError::FollowLost { cause: Some(cause), .. } => {
+        Cause::StepTimeout { .. } => "check the drive's state and fault; the step waits for `bus.enable_timeout`, or for the longest stop time of an axis".to_owned(),
+        Cause::NotSwitched { .. } => "check 0x6502 (supported drive modes) and the mode's requirements in the drive's manual".to_owned(),
+        Cause::NotHomed { error, .. } => not_homed(*error).to_owned(),
+        Cause::WaitTimeout { .. } => "check the sensor and its wiring, or give the step a longer `timeout`".to_owned(),
+        Cause::TooLarge(_) => "map fewer objects with `pdo.rx` and `pdo.tx`".to_owned(),
+        Cause::ClockNotSettled { .. } => "frames reach the clocks too irregularly, or the device has a faulty clock: run with real-time priority, or with `dc = \"off\"`".to_owned(),
+        Cause::NotDisabled { .. } => "the drive ignores its Controlword: switch its power off by hand, then check its fault".to_owned(),
+        Cause::Refused { by_axis, .. } => {
+            refused(by_axis.as_deref(), error.device().map_or("", |device| &device.name))
+        }
+        Cause::Axis(_) => "check the step and the axis' limits in the machine file".to_owned(),
+        Cause::EmergencyStop { .. } => "release it, then run again; `[stop] emergency` in the machine file says what it is".to_owned(),
+        Cause::FollowLost { cause: Some(cause), .. } => {
             return Failure { hints: run(cause, nic).hints, ..failure };
         }
-        RunError::FollowLost { cause: None, .. } => "keep the followed axis under power and within what the follower's limits and range allow".to_owned(),
-        RunError::EnableRefused { .. } => "`reset` the axis first, or look at what stopped it".to_owned(),
-        RunError::GroupStopped { cause, .. } => {
+        Cause::FollowLost { cause: None, .. } => "keep the followed axis under power and within what the follower's limits and range allow".to_owned(),
+        Cause::EnableRefused { .. } => "`reset` the axis first, or look at what stopped it".to_owned(),
+        Cause::GroupStopped { cause, .. } => {
             let cause = run(cause, nic).hints.into_iter();
             let back = "once the cause is known, restart the group with the steps `reset` and `enable`";
             return cause.fold(failure, Failure::hint).hint(back);
         }
-        RunError::Unsupervised => "the computer is overloaded: reserve a CPU for the cycle (`cpu` in [bus]) and run `ecaxis doctor`".to_owned(),
-        RunError::Controller => "its message is on stderr; the axes were stopped".to_owned(),
-        RunError::Panicked(_) => "this is a defect of ecaxis: please report it with the machine file and, if you can, `--record`".to_owned(),
-        RunError::Interrupted => return Failure { code: INTERRUPTED, ..failure },
-        RunError::Sim(_) | RunError::Thread(_) | RunError::Link(_) => return failure,
+        Cause::Unsupervised => "the computer is overloaded: reserve a CPU for the cycle (`cpu` in [bus]) and run `ecaxis doctor`".to_owned(),
+        Cause::Controller => "its message is on stderr; the axes were stopped".to_owned(),
+        Cause::Panicked(_) => "this is a defect of ecaxis: please report it with the machine file and, if you can, `--record`".to_owned(),
+        Cause::Interrupted => return Failure { code: INTERRUPTED, ..failure },
+        Cause::Sim(_) | Cause::Thread(_) | Cause::Link(_) => return failure,
     };
     failure.hint(hint)
 }
 
 /// Returns the hint for a replayed run whose recording is of another bus.
-pub(crate) fn replayed(error: &RunError, devices: usize) -> Option<String> {
-    let RunError::BringUp(error) = error else {
+pub(crate) fn replayed(error: &Error, devices: usize) -> Option<String> {
+    let Cause::BringUp(error) = &*error.cause else {
         return None;
     };
     let shown = match error.as_ref() {
@@ -144,9 +146,9 @@ pub(crate) fn replayed(error: &RunError, devices: usize) -> Option<String> {
 }
 
 /// Returns the error text with the device and object address once. The source error repeats both.
-fn message(error: &RunError) -> String {
+fn message(error: &Error) -> String {
     let text = error.to_string();
-    let RunError::BringUp(error) = error else {
+    let Cause::BringUp(error) = &*error.cause else {
         return text;
     };
     let (device, source, named) = match error.as_ref() {

@@ -11,7 +11,7 @@ fn device() -> DeviceRef {
     }
 }
 
-fn hints_of(error: &RunError) -> (u8, String) {
+fn hints_of(error: &Error) -> (u8, String) {
     let failure = run(error, &Nic::Interface("eth9".into()));
     (failure.code, failure.hints.join("\n"))
 }
@@ -25,7 +25,7 @@ fn every_failure_has_a_hint() {
         code,
     };
     let start_up = |code, origin: &str| {
-        RunError::BringUp(Box::new(BringUpError::StartUp {
+        Error::from(Cause::BringUp(Box::new(BringUpError::StartUp {
             device: device(),
             index: 0x60c2,
             sub: 1,
@@ -33,9 +33,9 @@ fn every_failure_has_a_hint() {
             value: "1".into(),
             origin: origin.into(),
             source: sdo(code),
-        }))
+        })))
     };
-    let bring_up = |error| RunError::BringUp(Box::new(error));
+    let bring_up = |error| Error::from(Cause::BringUp(Box::new(error)));
     let refused = |code| {
         bring_up(BringUpError::from(StateError::Refused {
             device: device(),
@@ -44,13 +44,15 @@ fn every_failure_has_a_hint() {
             code,
         }))
     };
-    let not_enabled = |state, code| RunError::NotEnabled {
-        device: device(),
-        state,
-        statusword: 0,
-        mode_confirmed: true,
-        code,
-        timeout_ms: 5000,
+    let not_enabled = |state, code| {
+        Cause::NotEnabled {
+            state,
+            statusword: 0,
+            mode_confirmed: true,
+            code,
+            timeout_ms: 5000,
+        }
+        .at(device())
     };
     let missing = BringUpError::Missing {
         expected: 2,
@@ -97,25 +99,26 @@ fn every_failure_has_a_hint() {
             "rated_torque = 0.1",
         ),
         (
-            RunError::Open(OpenError::NoSuchInterface { nic: "x".into() }),
+            OpenError::NoSuchInterface { nic: "x".into() }.into(),
             WRONG,
             "this computer has",
         ),
         (
-            RunError::Open(OpenError::NotPermitted { nic: "x".into() }),
+            OpenError::NotPermitted { nic: "x".into() }.into(),
             FAILED,
             "sudo setcap cap_net_raw",
         ),
         (
-            RunError::Open(OpenError::Down { nic: "x".into() }),
+            OpenError::Down { nic: "x".into() }.into(),
             FAILED,
             "ip link set x up",
         ),
         (
-            RunError::Open(OpenError::Unfit {
+            OpenError::Unfit {
                 nic: "lo".into(),
                 what: "is the loopback",
-            }),
+            }
+            .into(),
             WRONG,
             "this computer has",
         ),
@@ -148,34 +151,35 @@ fn every_failure_has_a_hint() {
             describe(0x8611).hint,
         ),
         (
-            RunError::DriveFault {
-                device: device(),
+            Cause::DriveFault {
                 code: Some(0x2310),
                 statusword: 8,
                 report: Box::default(),
-            },
+            }
+            .at(device()),
             FAILED,
             describe(0x2310).hint,
         ),
         (
-            RunError::Trip {
-                device: device(),
+            Cause::Trip {
                 trip: Trip::FollowingError {
                     error: 2.0,
                     limit: 1.0,
                 },
                 limits: Vec::new(),
-            },
+            }
+            .at(device()),
             FAILED,
             "following_error",
         ),
         (
-            RunError::BusLost {
+            Cause::BusLost {
                 group: None,
                 cycles: 3,
                 wkc: (0, 6),
                 answered: false,
-            },
+            }
+            .into(),
             FAILED,
             "cables",
         ),
@@ -224,7 +228,7 @@ fn message_names_an_address_once() {
         ),
         (timeout, "(from mode csp): no answer came within 1s"),
     ] {
-        let error = RunError::BringUp(Box::new(BringUpError::StartUp {
+        let error = Error::from(Cause::BringUp(Box::new(BringUpError::StartUp {
             device: device(),
             index: 0x6060,
             sub: 0,
@@ -232,17 +236,17 @@ fn message_names_an_address_once() {
             value: "0x08".into(),
             origin: "mode csp".into(),
             source,
-        }));
+        })));
         let text = message(&error);
         assert!(text.contains(end), "{text}");
         assert_eq!(text.matches("0x1001").count(), 1, "{text}");
         assert_eq!(text.matches("0x6060").count(), 1, "{text}");
     }
-    let error = RunError::BringUp(Box::new(BringUpError::Sdo {
+    let error = Error::from(Cause::BringUp(Box::new(BringUpError::Sdo {
         device: device(),
         step: "reading the PDO mapping back",
         source: abort,
-    }));
+    })));
     let text = message(&error);
     assert_eq!(text.matches("0x1001").count(), 1, "{text}");
     assert!(text.contains("back: 0x6060"), "{text}");

@@ -17,7 +17,7 @@ use crate::clock::Clock;
 use crate::config::{self, Locator};
 use crate::link::sim::SimLink;
 use crate::mailbox::{DatagramError, MailboxTransport};
-use crate::report::RunError;
+use crate::report::Error;
 use crate::session::run_on_link;
 use crate::session::simulated_bus;
 
@@ -282,7 +282,7 @@ fn run_on_link_returns_interrupted_when_stopped() {
         let done = run_on_link(&mut link, Clock::Virtual, &stop, async |wire| {
             enumerate(&wire).await
         });
-        assert!(matches!(done, Err(RunError::Interrupted)));
+        assert!(done.is_err_and(|error| error.is_interruption()));
     })
     .join()
     .expect("no panic");
@@ -295,7 +295,7 @@ fn stopped<T: Send + 'static>(
     work: impl AsyncFnOnce(DatagramClient, EnumeratedDevice, DeviceRef, &AtomicBool) -> T
     + Send
     + 'static,
-) -> (Result<T, RunError>, (String, u8), Vec<u8>) {
+) -> (Result<T, Error>, (String, u8), Vec<u8>) {
     let there = std::thread::Builder::new().stack_size(16 * 1024 * 1024);
     let done = there.spawn(move || {
         Clock::Virtual.enter();

@@ -2,10 +2,10 @@
 
 use super::diagnose::{SYNC_CODES, WATCHDOG};
 use super::evidence::{Evidence, Lateness};
-use crate::acyclic::{AlState, ServiceError, StateError};
+use crate::acyclic::{AlState, DeviceRef, ServiceError, StateError};
 use crate::bringup::BringUpError;
 use crate::mailbox::SdoError;
-use crate::report::RunError;
+use crate::report::{Cause, Error};
 
 /// The class of causes that an error can have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -19,13 +19,13 @@ pub(super) enum Class {
 }
 
 impl Class {
-    pub(super) fn of(error: &RunError, evidence: &Evidence) -> Self {
-        match error {
-            RunError::BusLost { .. }
-            | RunError::Gone { .. }
-            | RunError::LeftOpBriefly { .. }
-            | RunError::NoProcessData { .. } => Self::Bus,
-            RunError::DriveFault {
+    pub(super) fn of(error: &Error, evidence: &Evidence) -> Self {
+        match &*error.cause {
+            Cause::BusLost { .. }
+            | Cause::Gone
+            | Cause::LeftOpBriefly { .. }
+            | Cause::NoProcessData { .. } => Self::Bus,
+            Cause::DriveFault {
                 code: Some(code), ..
             } => match code {
                 0x7500..=0x75ff | 0x8100..=0x81ff | 0x8250 | 0x8280..=0x82ff => {
@@ -34,14 +34,13 @@ impl Class {
                 0x8700..=0x87ff => Self::Timing,
                 _ => Self::Device,
             },
-            RunError::LeftOp {
-                device,
+            Cause::LeftOp {
                 state,
                 code: WATCHDOG,
-            } if *state != AlState::Op => Self::of_watchdog(&device.name, evidence),
-            RunError::LeftOp { state, code, .. } => Self::of_state(*state, *code, evidence),
-            RunError::State(error) => Self::of_change(error, evidence),
-            RunError::BringUp(error) => match error.as_ref() {
+            } if *state != AlState::Op => Self::of_watchdog(error.device(), evidence),
+            Cause::LeftOp { state, code } => Self::of_state(*state, *code, evidence),
+            Cause::State(error) => Self::of_change(error, evidence),
+            Cause::BringUp(error) => match error.as_ref() {
                 BringUpError::Service(ServiceError::State(error)) => {
                     Self::of_change(error, evidence)
                 }
@@ -59,12 +58,12 @@ impl Class {
                 }
                 _ => Self::Device,
             },
-            RunError::FollowLost { reason, .. }
+            Cause::FollowLost { reason, .. }
                 if reason == crate::rt::setpoint_generator::HELD_UP =>
             {
                 Self::Bus
             }
-            RunError::PhaseNotLocked { .. } | RunError::ClockNotSettled { .. } => Self::Timing,
+            Cause::PhaseNotLocked { .. } | Cause::ClockNotSettled { .. } => Self::Timing,
             _ => Self::Device,
         }
     }
@@ -83,8 +82,9 @@ impl Class {
 
     /// Returns the class of a watchdog error. A watchdog expires only if process data was missing
     /// for about its time.
-    fn of_watchdog(device: &str, evidence: &Evidence) -> Self {
-        let look = evidence.named(device).and_then(|found| found.look.watchdog);
+    fn of_watchdog(device: Option<&DeviceRef>, evidence: &Evidence) -> Self {
+        let found = device.and_then(|device| evidence.named(&device.name));
+        let look = found.and_then(|found| found.look.watchdog);
         let enough = look.map_or(0, |watchdog| watchdog.time_ns / 2);
         let without = evidence.without_data().max(evidence.lateness().longest);
         if without > 0 && without >= enough {

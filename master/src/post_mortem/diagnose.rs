@@ -14,7 +14,7 @@ use super::snapshot::SyncSnapshot;
 use crate::acyclic::{AlState, DeviceRef, ServiceError, StateError};
 use crate::bringup::BringUpError;
 use crate::mailbox::SdoError;
-use crate::report::RunError;
+use crate::report::{self, Error};
 use ecaxis_ecat::al_status_code::al_status_text;
 
 /// AL status codes that follow from a lost synchronization (ETG.1020).
@@ -42,9 +42,9 @@ impl Seen {
 /// Returns the diagnosis of an error. A pure function: the same error and evidence give the same
 /// answer.
 #[must_use]
-pub fn diagnose(error: &RunError, evidence: &Evidence) -> Diagnosis {
-    if let Some(cause) = error.cause() {
-        return diagnose(cause, evidence);
+pub fn diagnose(error: &Error, evidence: &Evidence) -> Diagnosis {
+    if let Some(origin) = error.origin() {
+        return diagnose(origin, evidence);
     }
     let class = Class::of(error, evidence);
     let on_the_bus = class == Class::Bus;
@@ -75,9 +75,9 @@ pub fn diagnose(error: &RunError, evidence: &Evidence) -> Diagnosis {
             cause
         }
         None => device_cause(error, evidence).unwrap_or_else(|| Cause::Unexplained {
-            text: match error {
-                RunError::BringUp(error) => error.to_string(),
-                error => error.to_string(),
+            text: match &*error.cause {
+                report::Cause::BringUp(error) => error.to_string(),
+                _ => error.to_string(),
             },
         }),
     };
@@ -89,8 +89,19 @@ pub fn diagnose(error: &RunError, evidence: &Evidence) -> Diagnosis {
     }
 }
 
+/// `true` if no frame came back.
+fn is_silent(error: &Error) -> bool {
+    matches!(
+        *error.cause,
+        report::Cause::BusLost {
+            answered: false,
+            ..
+        }
+    )
+}
+
 /// Finds skipped cycles, or wake-ups so late that a device must have noticed.
-fn overload(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
+fn overload(error: &Error, evidence: &Evidence, class: Class) -> Option<Seen> {
     // The default number of lost cycles that the bus monitor tolerates.
     const MISSED: u64 = 3;
     let late = |found: &Lateness| found.missed >= MISSED || found.longest > evidence.cycle_ns;
@@ -114,7 +125,7 @@ fn overload(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen>
     })
 }
 
-fn other_main_device(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
+fn other_main_device(error: &Error, evidence: &Evidence, class: Class) -> Option<Seen> {
     let frames = evidence.other_frames();
     if frames == 0 {
         return None;
@@ -135,13 +146,7 @@ fn other_main_device(error: &RunError, evidence: &Evidence, class: Class) -> Opt
         .iter()
         .find(sent)
         .filter(|_| class == Class::Bus && !evidence.all_in_op());
-    let silent = matches!(
-        error,
-        RunError::BusLost {
-            answered: false,
-            ..
-        }
-    );
+    let silent = is_silent(error);
     Some(Seen::when(
         class == Class::Bus && (sent.is_some() || !silent),
         Cause::OtherMainDevice {
@@ -171,7 +176,7 @@ fn restarted(evidence: &Evidence, class: Class) -> Option<Seen> {
     (!all).then(|| Seen::when(class == Class::Bus && !evidence.all_in_op(), cause()))
 }
 
-fn damaged_frames(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
+fn damaged_frames(error: &Error, evidence: &Evidence, class: Class) -> Option<Seen> {
     // Without a cycle, the counters may hold old errors.
     let some = if evidence.stop.is_none() { 8 } else { 1 };
     let devices = evidence.devices.iter().enumerate();
@@ -183,8 +188,8 @@ fn damaged_frames(error: &RunError, evidence: &Evidence, class: Class) -> Option
         ports.max_by_key(|(count, index, port)| (*count, std::cmp::Reverse((*index, *port))))?;
     let device = evidence.devices.get(index)?;
     // A single error may be a disturbance. A bad cable damages one frame per lost cycle.
-    let enough = match error {
-        RunError::BusLost { .. } => u64::from(count) >= evidence.lost_at_stop(),
+    let enough = match &*error.cause {
+        report::Cause::BusLost { .. } => u64::from(count) >= evidence.lost_at_stop(),
         _ => count > 1,
     };
     let cause = || Cause::DamagedFrames {
@@ -198,13 +203,13 @@ fn damaged_frames(error: &RunError, evidence: &Evidence, class: Class) -> Option
 }
 
 /// Finds devices that do not process frames although the frames return.
-fn out_of_reach(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
+fn out_of_reach(error: &Error, evidence: &Evidence, class: Class) -> Option<Seen> {
     let missing = |device: &DeviceEvidence| device.look.absent || device.look.came_back;
     let mut devices = evidence.devices.iter().enumerate();
     let (index, device) = devices.find(|(_, device)| missing(device))?;
     // Before station addresses are assigned, devices behind a missing one move up by one position.
-    let known = match error {
-        RunError::BringUp(error) => match error.as_ref() {
+    let known = match &*error.cause {
+        report::Cause::BringUp(error) => match error.as_ref() {
             BringUpError::Missing { missing, .. } => missing.first() == Some(&device.place()),
             _ => true,
         },
@@ -229,14 +234,8 @@ fn out_of_reach(error: &RunError, evidence: &Evidence, class: Class) -> Option<S
 }
 
 /// Finds a dead bus: no frame to any device returned.
-fn no_response(error: &RunError, evidence: &Evidence) -> Option<Seen> {
-    let silent = matches!(
-        error,
-        RunError::BusLost {
-            answered: false,
-            ..
-        } | RunError::Gone { .. }
-    );
+fn no_response(error: &Error, evidence: &Evidence) -> Option<Seen> {
+    let silent = is_silent(error) || matches!(*error.cause, report::Cause::Gone);
     let unknown = |device: &DeviceEvidence| !device.look.answers && !device.look.absent;
     let first = evidence.devices.first()?;
     let cause = || Cause::NoResponse {
@@ -246,14 +245,8 @@ fn no_response(error: &RunError, evidence: &Evidence) -> Option<Seen> {
 }
 
 /// Finds frames that return a cycle late: most of those missing at the stop arrived afterwards.
-fn late_frames(error: &RunError, evidence: &Evidence) -> Option<Seen> {
-    let silent = matches!(
-        error,
-        RunError::BusLost {
-            answered: false,
-            ..
-        } | RunError::NoProcessData { .. }
-    );
+fn late_frames(error: &Error, evidence: &Evidence) -> Option<Seen> {
+    let silent = is_silent(error) || matches!(*error.cause, report::Cause::NoProcessData { .. });
     let late = evidence.late_at_stop();
     (late > 0).then(|| {
         Seen::when(
@@ -267,11 +260,11 @@ fn late_frames(error: &RunError, evidence: &Evidence) -> Option<Seen> {
 }
 
 /// Finds a temporary outage: all devices answered when asked after the stop.
-fn silence(error: &RunError, evidence: &Evidence) -> Option<Seen> {
-    let silent = match error {
-        RunError::BusLost { answered, .. } => !answered,
+fn silence(error: &Error, evidence: &Evidence) -> Option<Seen> {
+    let silent = match &*error.cause {
+        report::Cause::BusLost { answered, .. } => !answered,
         // The AL status code says that the device noticed the outage.
-        RunError::LeftOp { code, .. } => SYNC_CODES.contains(code),
+        report::Cause::LeftOp { code, .. } => SYNC_CODES.contains(code),
         _ => false,
     };
     let silence_ns = evidence.silence();
@@ -291,7 +284,7 @@ fn interface(evidence: &Evidence, class: Class) -> Option<Seen> {
     (refused >= SOME).then(|| Seen::when(class == Class::Bus, Cause::Interface { refused }))
 }
 
-fn loose_link(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
+fn loose_link(error: &Error, evidence: &Evidence, class: Class) -> Option<Seen> {
     let devices = evidence.devices.iter().enumerate();
     let mut ports = devices.flat_map(|(index, device)| {
         let counters = device.recent.lost_links.into_iter().zip(0u8..);
@@ -299,13 +292,7 @@ fn loose_link(error: &RunError, evidence: &Evidence, class: Class) -> Option<See
     });
     let (count, index, port) = ports.find(|(count, ..)| *count > 0)?;
     // A lost link behind the first device shortens the path of the frames, but they still return.
-    let silent = matches!(
-        error,
-        RunError::BusLost {
-            answered: false,
-            ..
-        }
-    );
+    let silent = is_silent(error);
     let first_cable = (index, port) == (0, 0);
     Some(Seen::when(
         class == Class::Bus && (first_cable || !silent || evidence.lost_at_stop() <= 2),
@@ -334,24 +321,25 @@ fn downstream(evidence: &Evidence, index: usize) -> impl Iterator<Item = &Device
     evidence.devices.iter().filter(hangs)
 }
 
-fn device_cause(error: &RunError, evidence: &Evidence) -> Option<Cause> {
-    match error {
-        RunError::LeftOp {
-            device,
-            state,
-            code,
-        } => Some(left_op(device, *state, *code, evidence)),
-        RunError::State(StateError::Refused { device, code, .. }) => {
+fn device_cause(error: &Error, evidence: &Evidence) -> Option<Cause> {
+    let device = error.device();
+    match &*error.cause {
+        report::Cause::LeftOp { state, code } => Some(left_op(device?, *state, *code, evidence)),
+        report::Cause::State(StateError::Refused { device, code, .. }) => {
             sync(device, *code, true, evidence)
         }
-        RunError::State(StateError::Timeout {
+        report::Cause::State(StateError::Timeout {
             device,
             wanted: AlState::Op,
             actual: AlState::SafeOp,
             ..
         }) => late_sync(device, evidence),
-        RunError::BusLost { .. } | RunError::LeftOpBriefly { .. } if evidence.all_in_op() => None,
-        RunError::BusLost { .. } | RunError::LeftOpBriefly { .. } => {
+        report::Cause::BusLost { .. } | report::Cause::LeftOpBriefly { .. }
+            if evidence.all_in_op() =>
+        {
+            None
+        }
+        report::Cause::BusLost { .. } | report::Cause::LeftOpBriefly { .. } => {
             let bad = |device: &&DeviceEvidence| {
                 let look = &device.look;
                 look.al_status.is_some_and(|status| status != OP)
@@ -363,17 +351,15 @@ fn device_cause(error: &RunError, evidence: &Evidence) -> Option<Cause> {
             let cause = code != WATCHDOG || evidence.silence() == 0;
             cause.then(|| left_op(&device.at, state, code, evidence))
         }
-        RunError::Trip {
-            device,
+        report::Cause::Trip {
             trip: Trip::FollowingError { .. },
             ..
-        } => interpolation(device, error, evidence),
-        RunError::DriveFault {
-            device,
-            code: Some(code),
-            ..
-        } if FOLLOWING_ERROR.contains(code) => interpolation(device, error, evidence),
-        RunError::NotEnabled { device, .. } => {
+        } => interpolation(device?, error, evidence),
+        report::Cause::DriveFault {
+            code: Some(code), ..
+        } if FOLLOWING_ERROR.contains(code) => interpolation(device?, error, evidence),
+        report::Cause::NotEnabled { .. } => {
+            let device = device?;
             let watchdog = evidence.named(&device.name)?.look.watchdog?;
             let expired = watchdog.time_ns > 0 && watchdog.expired > 0 && !watchdog.in_time;
             expired.then(|| Cause::OutputsNotTaken {
@@ -381,7 +367,7 @@ fn device_cause(error: &RunError, evidence: &Evidence) -> Option<Cause> {
                 watchdog_ns: watchdog.time_ns,
             })
         }
-        RunError::BringUp(error) => bring_up(error, evidence),
+        report::Cause::BringUp(error) => bring_up(error, evidence),
         _ => None,
     }
 }
@@ -435,7 +421,7 @@ fn late_sync(device: &DeviceRef, evidence: &Evidence) -> Option<Cause> {
     })
 }
 
-fn interpolation(device: &DeviceRef, error: &RunError, evidence: &Evidence) -> Option<Cause> {
+fn interpolation(device: &DeviceRef, error: &Error, evidence: &Evidence) -> Option<Cause> {
     let drive_ns = evidence.named(&device.name)?.look.interpolation_ns?;
     (drive_ns != evidence.cycle_ns).then(|| Cause::Interpolation {
         device: place(device),
@@ -487,27 +473,25 @@ fn bring_up(error: &BringUpError, evidence: &Evidence) -> Option<Cause> {
 }
 
 /// Returns the error's text without its address.
-fn short(error: &RunError) -> String {
-    match error {
-        RunError::LeftOp {
-            device,
-            state,
-            code,
-        } => format!(
-            "`{}` left Op for {state}, AL status code 0x{code:04x} ({})",
-            device.name,
+fn short(error: &Error) -> String {
+    let name = error.device().map_or("", |device| &device.name);
+    match &*error.cause {
+        report::Cause::LeftOp { state, code } => format!(
+            "`{name}` left Op for {state}, AL status code 0x{code:04x} ({})",
             al_status_text(*code)
         ),
-        RunError::Trip { device, trip, .. } => format!("`{}`: {trip}", device.name),
-        RunError::BusLost {
+        report::Cause::Trip { trip, .. } => format!("`{name}`: {trip}"),
+        report::Cause::BusLost {
             answered: true,
             cycles,
             ..
         } => {
             format!("{cycles} cycles in a row without all of the process data")
         }
-        RunError::BusLost { cycles, .. } => format!("{cycles} cycles in a row without an answer"),
-        other => other.to_string(),
+        report::Cause::BusLost { cycles, .. } => {
+            format!("{cycles} cycles in a row without an answer")
+        }
+        _ => error.to_string(),
     }
 }
 

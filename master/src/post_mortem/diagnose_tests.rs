@@ -85,21 +85,22 @@ fn with(change: impl FnOnce(&mut Evidence)) -> Evidence {
     evidence
 }
 
-fn lost(answered: bool) -> RunError {
-    RunError::BusLost {
+fn lost(answered: bool) -> Error {
+    report::Cause::BusLost {
         group: None,
         cycles: 3,
         wkc: (6, 9),
         answered,
     }
+    .into()
 }
 
-fn left_op(position: u16, code: u16) -> RunError {
-    RunError::LeftOp {
-        device: at(position),
+fn left_op(position: u16, code: u16) -> Error {
+    report::Cause::LeftOp {
         state: AlState::SafeOp,
         code,
     }
+    .at(at(position))
 }
 
 fn absent(evidence: &mut Evidence, from: usize) {
@@ -126,14 +127,14 @@ fn diagnose_names_device_and_cause() {
             .notes
             .insert(0, note(990, LogEntryKind::Overrun(120)));
     };
-    let rows: Vec<(RunError, Evidence, &str)> = vec![
+    let rows: Vec<(Error, Evidence, &str)> = vec![
         (
             lost(true),
             with(|e| absent(e, 1)),
             "`a1` (position 1) is out of reach, with 1 behind it: port 1 of `a0` has no link; the cable is broken, or the device has no power",
         ),
         (
-            RunError::Gone { device: at(2) },
+            report::Cause::Gone.at(at(2)),
             with(|e| absent(e, 2)),
             "`a2` (position 2) is out of reach: port 1 of `a1` has no link; the cable is broken, or the device has no power",
         ),
@@ -146,7 +147,7 @@ fn diagnose_names_device_and_cause() {
             "`a2` (position 2) is out of reach: port 1 of `a1` has a link, but no device behind it answers",
         ),
         (
-            RunError::Gone { device: at(1) },
+            report::Cause::Gone.at(at(1)),
             with(|e| {
                 absent(e, 1);
                 for device in &mut e.devices[1..] {
@@ -215,12 +216,12 @@ fn diagnose_names_device_and_cause() {
         ),
         // The drive's own fault, however late the computer is.
         (
-            RunError::DriveFault {
-                device: at(1),
+            report::Cause::DriveFault {
                 code: Some(0x3220),
                 statusword: 0x0218,
                 report: Box::default(),
-            },
+            }
+            .at(at(1)),
             with(overrun),
             "`a1` (position 1, station 0x1001): drive fault (Statusword 0x0218), error code (0x603F) 0x3220: DC link undervoltage",
         ),
@@ -248,23 +249,24 @@ fn diagnose_names_device_and_cause() {
             "`a2` (position 2) left Op, AL status code 0x002c (fatal synchronization error: SYNC0 or SYNC1 stopped): its SYNC0 was due 2.35 ms ago",
         ),
         (
-            RunError::State(StateError::Refused {
+            report::Cause::State(StateError::Refused {
                 device: at(2),
                 wanted: AlState::Op,
                 actual: AlState::SafeOp,
                 code: 0x002d,
-            }),
+            })
+            .into(),
             with(|e| {
                 e.devices[2].look.sync = Some(SyncSnapshot::default());
             }),
             "`a2` (position 2) refused Op, AL status code 0x002d (no synchronization: SYNC0 or SYNC1 was never seen): its SYNC0 is not switched on",
         ),
         (
-            RunError::LeftOp {
-                device: at(0),
+            report::Cause::LeftOp {
                 state: AlState::Init,
                 code: 0,
-            },
+            }
+            .at(at(0)),
             with(|e| {
                 e.notes
                     .insert(0, note(999, LogEntryKind::OtherMainDevice(12)));
@@ -273,47 +275,47 @@ fn diagnose_names_device_and_cause() {
             "another MainDevice is on this wire: 12 EtherCAT frames that are not ours; `a0` (position 0) was sent to Init",
         ),
         (
-            RunError::LeftOp {
-                device: at(0),
+            report::Cause::LeftOp {
                 state: AlState::PreOp,
                 code: 0,
-            },
+            }
+            .at(at(0)),
             good(),
             "`a0` (position 0) is in PreOp without an error: another program requested it, or the device restarted",
         ),
         (
-            RunError::Trip {
-                device: at(1),
+            report::Cause::Trip {
                 trip: Trip::FollowingError {
                     error: 2.0,
                     limit: 1.0,
                 },
                 limits: Vec::new(),
-            },
+            }
+            .at(at(1)),
             with(|e| e.devices[1].look.interpolation_ns = Some(20 * MS)),
             "`a1` (position 1): the drive counts on a cycle of 20 ms (0x60C2), it is 1 ms; then: `a1`: following error 2.0000 exceeds 1.0000",
         ),
         (
-            RunError::Trip {
-                device: at(1),
+            report::Cause::Trip {
                 trip: Trip::FollowingError {
                     error: 2.0,
                     limit: 1.0,
                 },
                 limits: Vec::new(),
-            },
+            }
+            .at(at(1)),
             with(|e| e.devices[1].look.interpolation_ns = Some(MS)),
             "`a1` (position 1, station 0x1001): following error 2.0000 exceeds 1.0000",
         ),
         (
-            RunError::NotEnabled {
-                device: at(1),
+            report::Cause::NotEnabled {
                 state: ecaxis_axis::State::SwitchOnDisabled,
                 statusword: 0x0240,
                 mode_confirmed: true,
                 code: None,
                 timeout_ms: 5000,
-            },
+            }
+            .at(at(1)),
             with(|e| {
                 e.devices[1].look.watchdog = Some(WatchdogSnapshot {
                     time_ns: 100 * MS,
@@ -424,12 +426,11 @@ fn stopped_find_returns_the_stop_of_an_error() {
 
 #[test]
 fn diagnose_returns_the_cause_of_a_stopped_group() {
-    let error = RunError::GroupStopped {
-        device: at(1),
-        step: None,
+    let error = report::Cause::GroupStopped {
         group: "g".into(),
-        cause: std::sync::Arc::new(RunError::Gone { device: at(2) }),
-    };
+        cause: std::sync::Arc::new(report::Cause::Gone.at(at(2))),
+    }
+    .at(at(1));
     let evidence = with(|e| absent(e, 2));
     let found = diagnose(&error, &evidence);
     assert!(matches!(found.cause, Cause::OutOfReach { .. }), "{found:?}");
@@ -438,12 +439,12 @@ fn diagnose_returns_the_cause_of_a_stopped_group() {
 
 #[test]
 fn diagnose_keeps_other_observations() {
-    let error = RunError::DriveFault {
-        device: at(1),
+    let error = report::Cause::DriveFault {
         code: Some(0x3220),
         statusword: 0x0218,
         report: Box::default(),
-    };
+    }
+    .at(at(1));
     let evidence = with(|e| {
         e.devices[2].recent.invalid_frames[0] = 7;
         e.notes

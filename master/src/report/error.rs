@@ -1,4 +1,4 @@
-//! Errors of a run: what failed, where, with which code. Hints for the user come from the command
+//! Errors of the master: step, place and cause. Hints for the user come from the command
 //! line.
 
 use std::fmt;
@@ -17,9 +17,44 @@ use crate::text::{pluralize, rounded};
 use super::{DiagnosisMessage, EmergencyReport, StepRef};
 use ecaxis_ecat::al_status_code::al_status_text;
 
-/// A failure of the machine or the bus.
+/// An error of the master: the step and the place at which it occurred, and its cause.
 #[derive(Debug, thiserror::Error)]
-pub enum RunError {
+#[error("{}{}{cause}", Prefix(step), Prefix(at))]
+pub struct Error {
+    /// The step of the program.
+    pub step: Option<StepRef>,
+    pub at: Option<Place>,
+    pub cause: Box<Cause>,
+}
+
+/// The place of an error.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Place {
+    Device(DeviceRef),
+    /// A device or signal of the machine file, before the bus is known.
+    Name(String),
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Device(device) => device.fmt(f),
+            Self::Name(name) => write!(f, "`{name}`"),
+        }
+    }
+}
+
+struct Prefix<'a, T>(&'a Option<T>);
+
+impl<T: fmt::Display> fmt::Display for Prefix<'_, T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.as_ref().map_or(Ok(()), |part| write!(f, "{part}: "))
+    }
+}
+
+/// Why something failed.
+#[derive(Debug, thiserror::Error)]
+pub enum Cause {
     #[error(transparent)]
     Open(#[from] OpenError),
     #[error("the simulated bus: {0}")]
@@ -34,15 +69,12 @@ pub enum RunError {
     Link(LinkError),
     #[error("bring-up: {0}")]
     BringUp(#[from] Box<BringUpError>),
-    #[error("`{name}`: {source}")]
-    TooLarge { name: String, source: TooLarge },
-    #[error("`{name}`: {source}")]
-    NotMapped { name: String, source: NotMapped },
-    #[error("`{name}`: {source}")]
-    Axis {
-        name: String,
-        source: ecaxis_axis::ConfigError,
-    },
+    #[error(transparent)]
+    TooLarge(TooLarge),
+    #[error(transparent)]
+    NotMapped(NotMapped),
+    #[error(transparent)]
+    Axis(ecaxis_axis::ConfigError),
     #[error("no process data comes back in SafeOp: {}", al_note(*al_status))]
     NoProcessData { al_status: Option<(u8, u16)> },
     #[error("the release of frames does not lock to SYNC0: phase error {error_ns} ns")]
@@ -50,12 +82,11 @@ pub enum RunError {
     #[error(transparent)]
     State(StateError),
     #[error(
-        "{device}: does not reach Operation enabled within {timeout_ms} ms: stays in {state} \
+        "does not reach Operation enabled within {timeout_ms} ms: stays in {state} \
          (Statusword 0x{statusword:04x}){}{}",
         mode_note(*mode_confirmed), code_note(*code)
     )]
     NotEnabled {
-        device: DeviceRef,
         state: State,
         statusword: u16,
         mode_confirmed: bool,
@@ -63,24 +94,18 @@ pub enum RunError {
         timeout_ms: u64,
     },
     #[error(
-        "{device}: modes of operation display (0x6061) is {}, expected {}",
+        "modes of operation display (0x6061) is {}, expected {}",
         Mode::from_code(*display), Mode::from_code(*expected)
     )]
-    WrongMode {
-        device: DeviceRef,
-        expected: i8,
-        display: i8,
-    },
-    #[error("{device}: drive fault (Statusword 0x{statusword:04x}){}{report}", code_note(*code))]
+    WrongMode { expected: i8, display: i8 },
+    #[error("drive fault (Statusword 0x{statusword:04x}){}{report}", code_note(*code))]
     DriveFault {
-        device: DeviceRef,
         code: Option<u16>,
         statusword: u16,
         report: Box<DriveReport>,
     },
-    #[error("{device}: {trip}")]
+    #[error("{trip}")]
     Trip {
-        device: DeviceRef,
         trip: Trip,
         /// The drive's own limits that the machine file exceeds.
         limits: Vec<LimitConflict>,
@@ -97,118 +122,84 @@ pub enum RunError {
         answered: bool,
     },
     #[error(
-        "{device}: left Op for {state}, AL status code 0x{code:04x} ({})",
+        "left Op for {state}, AL status code 0x{code:04x} ({})",
         al_status_text(*code)
     )]
-    LeftOp {
-        device: DeviceRef,
-        state: AlState,
-        code: u16,
-    },
-    #[error("{device}: no longer answers")]
-    Gone { device: DeviceRef },
+    LeftOp { state: AlState, code: u16 },
+    #[error("no longer answers")]
+    Gone,
     #[error("a SubDevice left Op (AL status 0x{al_status:02x}) and was back when it was asked")]
     LeftOpBriefly { al_status: u8 },
-    #[error("{step}: {device}: command refused: {reason}")]
+    #[error("command refused: {reason}")]
     Refused {
-        device: DeviceRef,
-        step: StepRef,
         reason: String,
         /// The axis's error if the axis refused the command.
         by_axis: Option<Box<CommandError>>,
     },
     #[error(
-        "{step}: {device}: the target of {} {unit} is not reached, the axis is at {actual:.4} {unit}",
+        "the target of {} {unit} is not reached, the axis is at {actual:.4} {unit}",
         rounded(*target)
     )]
     NotReached {
-        device: DeviceRef,
-        step: StepRef,
         /// The target; like `actual` in `unit`.
         target: f64,
         actual: f64,
         unit: String,
     },
+    #[error("touch probe {input} is not armed within {timeout_ms} ms (0x60B8, 0x60B9)")]
+    ProbeNotArmed { input: u8, timeout_ms: u64 },
     #[error(
-        "{step}: {device}: touch probe {input} is not armed within {timeout_ms} ms (0x60B8, 0x60B9)"
-    )]
-    ProbeNotArmed {
-        device: DeviceRef,
-        step: StepRef,
-        input: u8,
-        timeout_ms: u64,
-    },
-    #[error(
-        "{step}: {device}: no {edge} edge came at the input of touch probe {input} on the way to {} {unit}",
+        "no {edge} edge came at the input of touch probe {input} on the way to {} {unit}",
         rounded(*target)
     )]
     NotProbed {
-        device: DeviceRef,
-        step: StepRef,
         input: u8,
         edge: &'static str,
         target: f64,
         unit: String,
     },
-    #[error(
-        "{step}: {device}: `{what}` is not done after {timeout_ms} ms: the drive is in {state}"
-    )]
+    #[error("`{what}` is not done after {timeout_ms} ms: the drive is in {state}")]
     StepTimeout {
-        device: DeviceRef,
-        step: StepRef,
         what: String,
         state: State,
         timeout_ms: u64,
     },
-    #[error("{step}: {device}: modes of operation display (0x6061) does not become {mode}")]
-    NotSwitched {
-        device: DeviceRef,
-        step: StepRef,
-        mode: Mode,
-    },
-    #[error("{step}: {device}: {error}, by {}", by(*method))]
+    #[error("modes of operation display (0x6061) does not become {mode}")]
+    NotSwitched { mode: Mode },
+    #[error("{error}, by {}", by(*method))]
     NotHomed {
-        device: DeviceRef,
-        step: StepRef,
         /// The homing method (0x6098).
         method: i8,
         error: ecaxis_axis::homing::HomingError,
     },
-    #[error("{step}: {condition} did not come within {timeout_ms} ms: it is {value}")]
+    #[error("{condition} did not come within {timeout_ms} ms: it is {value}")]
     WaitTimeout {
-        step: StepRef,
         condition: String,
         value: f64,
         timeout_ms: u64,
     },
-    #[error("{device}: the clock does not settle: {difference_ns} ns from the reference")]
-    ClockNotSettled {
-        device: DeviceRef,
-        difference_ns: i32,
-    },
-    #[error("{device}: could not be brought to rest and disabled: stays in {state}")]
-    NotDisabled { device: DeviceRef, state: State },
+    #[error("the clock does not settle: {difference_ns} ns from the reference")]
+    ClockNotSettled { difference_ns: i32 },
+    #[error("could not be brought to rest and disabled: stays in {state}")]
+    NotDisabled { state: State },
     #[error("emergency stop: {condition}")]
     EmergencyStop { condition: String },
     #[error(
-        "{device}: follows no longer: {reason}{}",
+        "follows no longer: {reason}{}",
         cause.as_ref().map_or_else(String::new, |cause| format!(": {cause}"))
     )]
     FollowLost {
-        device: DeviceRef,
         reason: String,
         /// The error that stopped the group of the axis it followed.
-        cause: Option<Arc<RunError>>,
+        cause: Option<Arc<Error>>,
     },
-    #[error("{device}: is not enabled: {reason}")]
-    EnableRefused { device: DeviceRef, reason: String },
-    #[error("{}{device}: stopped with its group `{group}`: {cause}", at(step.as_ref()))]
+    #[error("is not enabled: {reason}")]
+    EnableRefused { reason: String },
+    #[error("stopped with its group `{group}`: {cause}")]
     GroupStopped {
-        device: DeviceRef,
-        step: Option<StepRef>,
         group: String,
         /// The error that stopped the group.
-        cause: Arc<RunError>,
+        cause: Arc<Error>,
     },
     #[error("the controller panicked")]
     Controller,
@@ -222,17 +213,75 @@ pub enum RunError {
     Panicked(String),
 }
 
-impl RunError {
-    /// Returns the error that caused this one.
+impl Cause {
+    /// Returns the error with this cause at a device.
     #[must_use]
-    pub fn cause(&self) -> Option<&Self> {
-        self.shared_cause().map(Arc::as_ref)
+    pub fn at(self, device: DeviceRef) -> Error {
+        Error {
+            at: Some(Place::Device(device)),
+            ..self.into()
+        }
     }
 
-    pub(crate) fn shared_cause(&self) -> Option<&Arc<Self>> {
-        match self {
-            Self::GroupStopped { cause, .. } => Some(cause),
-            Self::FollowLost { cause, .. } => cause.as_ref(),
+    /// Returns the error with this cause at a device or signal of the machine file.
+    pub(crate) fn at_name(self, name: &str) -> Error {
+        Error {
+            at: Some(Place::Name(name.to_owned())),
+            ..self.into()
+        }
+    }
+}
+
+impl From<Cause> for Error {
+    fn from(cause: Cause) -> Self {
+        Self {
+            step: None,
+            at: None,
+            cause: Box::new(cause),
+        }
+    }
+}
+
+impl From<OpenError> for Error {
+    fn from(error: OpenError) -> Self {
+        Cause::Open(error).into()
+    }
+}
+
+impl Error {
+    /// Adds the step of the program.
+    pub(crate) fn in_step(self, step: impl Into<StepRef>) -> Self {
+        Self {
+            step: Some(step.into()),
+            ..self
+        }
+    }
+
+    /// Returns the device of the error.
+    #[must_use]
+    pub fn device(&self) -> Option<&DeviceRef> {
+        match self.at.as_ref()? {
+            Place::Device(device) => Some(device),
+            Place::Name(_) => None,
+        }
+    }
+
+    /// `true` if a signal ended the work.
+    #[must_use]
+    pub fn is_interruption(&self) -> bool {
+        matches!(*self.cause, Cause::Interrupted)
+    }
+
+    /// Returns the error that caused this one.
+    #[must_use]
+    pub fn origin(&self) -> Option<&Self> {
+        self.shared_origin().map(Arc::as_ref)
+    }
+
+    pub(crate) fn shared_origin(&self) -> Option<&Arc<Self>> {
+        match &*self.cause {
+            Cause::GroupStopped { cause, .. } => Some(cause),
+            Cause::FollowLost { cause, .. } => cause.as_ref(),
             _ => None,
         }
     }
@@ -240,28 +289,28 @@ impl RunError {
     /// `true` if the machine had not reached Op yet.
     pub(crate) fn is_on_the_way_to_op(&self) -> bool {
         matches!(
-            self,
-            Self::State(_)
-                | Self::NoProcessData { .. }
-                | Self::PhaseNotLocked { .. }
-                | Self::ClockNotSettled { .. }
+            *self.cause,
+            Cause::State(_)
+                | Cause::NoProcessData { .. }
+                | Cause::PhaseNotLocked { .. }
+                | Cause::ClockNotSettled { .. }
         )
     }
 
     /// `true` if the cycle stopped the machine because of this error.
     pub(crate) fn is_of_cycle(&self) -> bool {
         matches!(
-            self,
-            Self::BusLost { .. }
-                | Self::LeftOp { .. }
-                | Self::LeftOpBriefly { .. }
-                | Self::Gone { .. }
-                | Self::DriveFault { .. }
-                | Self::Trip { .. }
-                | Self::FollowLost { .. }
-                | Self::EmergencyStop { .. }
-                | Self::Controller
-                | Self::NotDisabled { .. }
+            *self.cause,
+            Cause::BusLost { .. }
+                | Cause::LeftOp { .. }
+                | Cause::LeftOpBriefly { .. }
+                | Cause::Gone
+                | Cause::DriveFault { .. }
+                | Cause::Trip { .. }
+                | Cause::FollowLost { .. }
+                | Cause::EmergencyStop { .. }
+                | Cause::Controller
+                | Cause::NotDisabled { .. }
         )
     }
 }
@@ -318,10 +367,6 @@ fn code_note(code: Option<u16>) -> String {
         ),
         None => String::new(),
     }
-}
-
-fn at(step: Option<&StepRef>) -> String {
-    step.map_or_else(String::new, |step| format!("{step}: "))
 }
 
 fn lost(group: Option<&str>) -> String {

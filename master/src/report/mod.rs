@@ -1,6 +1,6 @@
 //! What a run reports: errors, progress, events and the summary, as plain data. No I/O.
 //!
-//! - [`RunError`]: the errors of a run;
+//! - [`Error`]: step, place and [`Cause`] of a failure;
 //! - [`Progress`], [`Status`]: what an [`Observer`] receives during a run;
 //! - [`EventLine`], [`EmergencyLine`], [`DiagnosisMessage`]: what the cycle and the devices
 //!   reported;
@@ -16,7 +16,7 @@ pub(crate) mod summary;
 pub use diagnosis_message::{DiagnosisKind, DiagnosisMessage};
 pub use emergencies::{EmergencyLine, EmergencyLog, EmergencyReport};
 pub(crate) use error::panic_text;
-pub use error::{DriveReport, RunError};
+pub use error::{Cause, DriveReport, Error, Place};
 pub use events::EventLine;
 pub use progress::{AxisLine, Observer, ProbeCapture, Progress, Status, StepRef};
 pub use summary::{AxisSummary, DeviceErrors, GroupStop, Summary, ThreadSummary};

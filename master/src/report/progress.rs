@@ -6,7 +6,7 @@ use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{Mode, State};
 use serde::Serialize;
 
-use super::{EmergencyReport, RunError};
+use super::{EmergencyReport, Error};
 use crate::bringup::Step;
 use crate::clock::Nanos;
 use crate::config::{Machine, TorqueUnit};
@@ -71,7 +71,7 @@ pub enum Progress {
     /// A group of axes has begun to stop. The machine continues without it.
     GroupStopped {
         group: String,
-        cause: Arc<RunError>,
+        cause: Arc<Error>,
     },
     /// A stopped group has been reset and can be enabled again.
     GroupReleased {

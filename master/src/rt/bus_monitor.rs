@@ -43,6 +43,18 @@ pub enum StopCause {
 }
 
 impl StopCause {
+    /// Returns the axis that caused the stop.
+    #[must_use]
+    pub fn axis(&self) -> Option<usize> {
+        match *self {
+            Self::DriveFault { axis }
+            | Self::Trip { axis, .. }
+            | Self::FollowLost { axis }
+            | Self::Powered { axis } => Some(axis),
+            _ => None,
+        }
+    }
+
     /// True unless the stop was requested.
     #[must_use]
     pub fn is_failure(&self) -> bool {

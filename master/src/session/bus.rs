@@ -11,20 +11,20 @@ use crate::clock::Clock;
 use crate::link::Link;
 use crate::link::pdu_loop::{drive_pdu_loop, main_device};
 use crate::mailbox::MailboxTransport;
-use crate::report::{RunError, panic_text};
+use crate::report::{Cause, Error, panic_text};
 
 /// Runs `work` on a dedicated link and thread until it completes or is cancelled
 /// ([`crate::cancel::CancelToken`]). Blocks.
 ///
 /// # Errors
-/// [`RunError::Interrupted`] if `stop` ended the work outside a shielded section; errors that open
+/// [`Cause::Interrupted`] if `stop` ended the work outside a shielded section; errors that open
 /// or use the link.
 pub fn with_bus<T, W>(
-    open: impl FnOnce() -> Result<Box<dyn Link>, RunError> + Send + 'static,
+    open: impl FnOnce() -> Result<Box<dyn Link>, Error> + Send + 'static,
     clock: Clock,
     stop: Arc<AtomicBool>,
     work: W,
-) -> Result<T, RunError>
+) -> Result<T, Error>
 where
     T: Send + 'static,
     W: AsyncFnOnce(DatagramClient) -> T + Send + 'static,
@@ -38,13 +38,13 @@ where
             let done = run_on_link(link.as_mut(), clock, &stop, work);
             let recorded = link
                 .finish()
-                .map_err(|error| RunError::Record(error.to_string()));
+                .map_err(|error| Cause::Record(error.to_string()).into());
             done.and_then(|done| recorded.map(|_| done))
         })
-        .map_err(|error| RunError::Thread(error.to_string()))?;
+        .map_err(|error| Cause::Thread(error.to_string()))?;
     owner
         .join()
-        .unwrap_or_else(|panic| Err(RunError::Panicked(panic_text(&*panic))))
+        .unwrap_or_else(|panic| Err(Cause::Panicked(panic_text(&*panic)).into()))
 }
 
 /// Runs `work` on a link, on the calling thread and its clock ([`Clock::enter`]).
@@ -56,7 +56,7 @@ pub fn run_on_link<T>(
     clock: Clock,
     stop: &AtomicBool,
     work: impl AsyncFnOnce(DatagramClient) -> T,
-) -> Result<T, RunError> {
+) -> Result<T, Error> {
     let (main_device, mut port) = main_device(0);
     let run = AssertUnwindSafe(|| {
         let wire = DatagramClient::new(main_device);
@@ -71,8 +71,8 @@ pub fn run_on_link<T>(
     });
     match catch_unwind(run) {
         Ok(Ok(Some(done))) => Ok(done),
-        Ok(Ok(None)) => Err(RunError::Interrupted),
-        Ok(Err(error)) => Err(RunError::Link(error)),
-        Err(panic) => Err(RunError::Panicked(panic_text(&*panic))),
+        Ok(Ok(None)) => Err(Cause::Interrupted.into()),
+        Ok(Err(error)) => Err(Cause::Link(error).into()),
+        Err(panic) => Err(Cause::Panicked(panic_text(&*panic)).into()),
     }
 }

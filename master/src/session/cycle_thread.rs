@@ -6,7 +6,7 @@ use std::sync::mpsc::Sender;
 use std::task::{Context, Poll, Waker};
 use std::thread;
 
-use super::{Progress, RunError, panic_text};
+use super::{Cause, Error, Progress, panic_text};
 use crate::clock::{self, Nanos};
 use crate::config;
 use crate::rt::cycle::{Engine, EngineConfig, EngineReport};
@@ -18,7 +18,7 @@ use crate::sys::rt_thread::{self, CpuWakeGuard, RtSetupError, RtThrottlingRisk};
 /// Result of a run: the engine and the link after the last cycle.
 pub(super) struct CycleRun {
     pub remains: EngineReport,
-    pub result: (ProgramOutcome, Result<(), RunError>),
+    pub result: (ProgramOutcome, Result<(), Error>),
     /// CPU usage of the real-time thread and the elapsed time; `None` in virtual time.
     pub used: Option<(ThreadUsage, Nanos)>,
 }
@@ -48,19 +48,19 @@ pub(super) fn in_virtual_time(parts: EngineConfig, supervisor: Supervisor) -> Cy
 /// a second thread.
 ///
 /// # Errors
-/// [`RunError::Thread`] if the supervisor's thread cannot be started.
+/// [`Cause::Thread`] if the supervisor's thread cannot be started.
 pub(super) fn in_real_time(
     parts: EngineConfig,
     supervisor: Supervisor,
     config: &config::Bus,
     reported: &Sender<Progress>,
-) -> Result<CycleRun, RunError> {
+) -> Result<CycleRun, Error> {
     // The supervisor's thread starts first: a thread inherits scheduling class and CPU of its
     // parent.
     let during = thread::Builder::new()
         .name("ecaxis-mailbox".to_owned())
         .spawn(move || executor::block_on(supervisor.run()))
-        .map_err(|error| RunError::Thread(error.to_string()))?;
+        .map_err(|error| Cause::Thread(error.to_string()))?;
     let (_held, mut denied) = CpuWakeGuard::take(config.cpu.filter(|_| config.awake));
     denied.extend(rt_thread::become_realtime(config.priority, config.cpu));
     let fifo = !denied
@@ -90,11 +90,11 @@ pub(super) fn in_real_time(
         Ok(Ok(result)) => result,
         Ok(Err(error)) => (
             ProgramOutcome::default(),
-            Err(RunError::Thread(error.to_string())),
+            Err(Cause::Thread(error.to_string()).into()),
         ),
         Err(panic) => (
             ProgramOutcome::default(),
-            Err(RunError::Panicked(panic_text(&*panic))),
+            Err(Cause::Panicked(panic_text(&*panic)).into()),
         ),
     };
     Ok(CycleRun {
@@ -104,9 +104,9 @@ pub(super) fn in_real_time(
     })
 }
 
-fn supervisor_ended_early() -> (ProgramOutcome, Result<(), RunError>) {
+fn supervisor_ended_early() -> (ProgramOutcome, Result<(), Error>) {
     (
         ProgramOutcome::default(),
-        Err(RunError::Panicked("the supervisor ended early".to_owned())),
+        Err(Cause::Panicked("the supervisor ended early".to_owned()).into()),
     )
 }

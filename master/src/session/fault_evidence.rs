@@ -3,7 +3,7 @@
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use super::events::EventLine;
-use super::{Options, RunError};
+use super::{Cause, Error, Options};
 use crate::acyclic::DeviceRef;
 use crate::acyclic::topology::{self, ParentPort};
 use crate::bringup::{Bus, name_at};
@@ -66,10 +66,10 @@ pub(super) struct RunEvidence<'a> {
 pub(super) fn of_bring_up(
     machine: &Machine,
     options: &Options,
-    error: &RunError,
+    error: &Error,
     seen: BringUpEvidence,
 ) -> Option<Box<FaultReport>> {
-    if !seen.on_the_bus || matches!(error, RunError::Interrupted) {
+    if !seen.on_the_bus || error.is_interruption() {
         return None;
     }
     let parents = parents(seen.looks.iter().map(|look| look.dl_status.unwrap_or(0)));
@@ -114,10 +114,10 @@ fn parents(dl_status: impl Iterator<Item = u16>) -> Vec<Option<(usize, u8)>> {
 pub(super) fn of_run(
     machine: &Machine,
     options: &Options,
-    error: &RunError,
+    error: &Error,
     left: RunEvidence<'_>,
 ) -> Option<Box<FaultReport>> {
-    if matches!(error, RunError::Interrupted | RunError::Record(_)) {
+    if matches!(*error.cause, Cause::Interrupted | Cause::Record(_)) {
         return None;
     }
     let group = left.witnessed.group;
@@ -141,7 +141,7 @@ pub(super) fn of_run(
         }
     });
     let notes: Vec<_> = left.stats.journal.entries().copied().collect();
-    let cause = error.cause().unwrap_or(error);
+    let cause = error.origin().unwrap_or(error);
     // Before Op, every event since the start may be the cause, so no stop limits the search.
     let stop =
         Stopped::find(&notes, group, cause.is_of_cycle()).filter(|_| !cause.is_on_the_way_to_op());
@@ -189,7 +189,7 @@ pub(super) fn of_run(
 fn build_report(
     machine: &Machine,
     options: &Options,
-    error: &RunError,
+    error: &Error,
     evidence: &Evidence,
 ) -> Box<FaultReport> {
     let diagnosis = diagnose(error, evidence);

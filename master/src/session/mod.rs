@@ -32,9 +32,9 @@ mod signals;
 
 use crate::report::summary::{self, SummaryInputs};
 pub use crate::report::{
-    AxisLine, AxisSummary, DeviceErrors, DiagnosisKind, DiagnosisMessage, DriveReport,
-    EmergencyLine, EmergencyLog, EmergencyReport, EventLine, GroupStop, Observer, ProbeCapture,
-    Progress, RunError, Status, StepRef, Summary, ThreadSummary,
+    AxisLine, AxisSummary, Cause, DeviceErrors, DiagnosisKind, DiagnosisMessage, DriveReport,
+    EmergencyLine, EmergencyLog, EmergencyReport, Error, EventLine, GroupStop, Observer,
+    ProbeCapture, Progress, Status, StepRef, Summary, ThreadSummary,
 };
 use crate::report::{events, panic_text};
 pub use bus::{run_on_link, with_bus};
@@ -95,15 +95,15 @@ impl Default for Options {
 #[derive(Debug)]
 pub struct Outcome {
     pub summary: Option<Summary>,
-    pub result: Result<(), RunError>,
+    pub result: Result<(), Error>,
     /// The statistics behind the summary.
     pub stats: Option<Box<Stats>>,
     /// The fault report of a bus failure, or of a group that stopped and was not reset.
     pub story: Option<Box<FaultReport>>,
 }
 
-impl From<RunError> for Outcome {
-    fn from(error: RunError) -> Self {
+impl From<Error> for Outcome {
+    fn from(error: Error) -> Self {
         Self {
             summary: None,
             result: Err(error),
@@ -202,7 +202,7 @@ fn start(
         });
     let owner = match owner {
         Ok(owner) => owner,
-        Err(error) => return RunError::Thread(error.to_string()).into(),
+        Err(error) => return Error::from(Cause::Thread(error.to_string())).into(),
     };
     let observed = catch_unwind(AssertUnwindSafe(|| {
         for progress in reported {
@@ -215,7 +215,7 @@ fn start(
     }
     let outcome = owner
         .join()
-        .unwrap_or_else(|panic| RunError::Panicked(panic_text(&*panic)).into());
+        .unwrap_or_else(|panic| Error::from(Cause::Panicked(panic_text(&*panic))).into());
     observed.map_or_else(|panic| resume_unwind(panic), |()| outcome)
 }
 
@@ -314,7 +314,10 @@ fn run_on_link_thread(
     }
     let (record, result) = match link.finish() {
         Ok(record) => (record, result),
-        Err(error) => (None, result.and(Err(RunError::Record(error.to_string())))),
+        Err(error) => (
+            None,
+            result.and(Err(Cause::Record(error.to_string()).into())),
+        ),
     };
     let thread = used.map(|(used, wall_ns)| ThreadSummary::new(used, wall_ns, spin_ns, &stats));
     let events = events::lines(&stats.journal, started, machine);

@@ -12,7 +12,7 @@ use ecaxis_sim::{
     Topology,
 };
 
-use super::{Options, RunError};
+use super::{Cause, Error, Options};
 use crate::clock::{self, Clock};
 use crate::config::sim::{self, bus_order};
 use crate::config::{DeviceConfig, Locator, Machine, Nic};
@@ -25,16 +25,16 @@ use crate::recording;
 /// Opens the link of the machine. Blocks.
 ///
 /// # Errors
-/// [`RunError::Open`], also if another MainDevice is active; [`RunError::Sim`],
-/// [`RunError::Record`], [`RunError::Link`].
+/// [`Cause::Open`], also if another MainDevice is active; [`Cause::Sim`],
+/// [`Cause::Record`], [`Cause::Link`].
 pub fn link(
     machine: &Machine,
     options: &Options,
     mut report: impl FnMut(NicWarning),
-) -> Result<Box<dyn Link>, RunError> {
+) -> Result<Box<dyn Link>, Error> {
     let link: Box<dyn Link> = match (&options.replay, &machine.bus.nic) {
         (Some(path), _) => {
-            let failed = |error| RunError::Replay(format!("{}: {error}", path.display()));
+            let failed = |error| Cause::Replay(format!("{}: {error}", path.display()));
             let reader = recording::open(path).map_err(failed)?;
             Box::new(Replay::new(reader).map_err(failed)?)
         }
@@ -47,7 +47,7 @@ pub fn link(
         (None, Nic::Interface(nic)) => {
             let (mut link, concerns) = link::open_exclusive(nic, machine.bus.link)?;
             // The first frame would set another MainDevice's drives to Init.
-            let frames = link::sniff_foreign_frames(link.as_mut()).map_err(RunError::Link)?;
+            let frames = link::sniff_foreign_frames(link.as_mut()).map_err(Cause::Link)?;
             if frames > 0 {
                 let nic = nic.clone();
                 return Err(OpenError::Driven { nic, frames }.into());
@@ -62,8 +62,8 @@ pub fn link(
 /// Adds the recording that `options` request to a link.
 ///
 /// # Errors
-/// [`RunError::Record`].
-pub fn recorded(link: Box<dyn Link>, options: &Options) -> Result<Box<dyn Link>, RunError> {
+/// [`Cause::Record`].
+pub fn recorded(link: Box<dyn Link>, options: &Options) -> Result<Box<dyn Link>, Error> {
     let Some(path) = &options.record else {
         return Ok(link);
     };
@@ -76,7 +76,7 @@ pub fn recorded(link: Box<dyn Link>, options: &Options) -> Result<Box<dyn Link>,
         ),
     };
     let recorder = Recorder::create(path, mode, options.record_limit)
-        .map_err(|error| RunError::Record(format!("{}: {error}", path.display())))?;
+        .map_err(|error| Cause::Record(format!("{}: {error}", path.display())))?;
     Ok(Box::new(CapturingLink::new(link, recorder, epoch)))
 }
 
@@ -95,7 +95,7 @@ pub fn simulated_bus(
     seed: u64,
     faults: Option<&FaultScript>,
     ring: Option<SecondPort>,
-) -> Result<Segment, RunError> {
+) -> Result<Segment, Error> {
     let mut topology = topology(machine)?;
     let mut devices = Vec::with_capacity(machine.devices.len());
     for device in bus_order(&machine.devices) {
@@ -103,7 +103,7 @@ pub fn simulated_bus(
     }
     if let Some(second) = ring {
         let closed = topology.closed(&media(&devices), second);
-        topology = closed.map_err(|error| RunError::Sim(error.to_string()))?;
+        topology = closed.map_err(|error| Cause::Sim(error.to_string()))?;
     }
     let options = SegmentOptions {
         seed,
@@ -119,13 +119,13 @@ pub fn simulated_bus(
 /// Returns the cabling of the simulated bus.
 ///
 /// # Errors
-/// [`RunError::Sim`] if a device finds no free port.
-pub fn topology(machine: &Machine) -> Result<Topology, RunError> {
+/// [`Cause::Sim`] if a device finds no free port.
+pub fn topology(machine: &Machine) -> Result<Topology, Error> {
     sim::topology(&machine.devices).map_err(|errors| {
         let reported = errors
             .iter()
             .map(|error| sim::topology_message(error, &machine.devices).0);
-        RunError::Sim(reported.collect::<Vec<_>>().join("; "))
+        Cause::Sim(reported.collect::<Vec<_>>().join("; ")).into()
     })
 }
 
@@ -174,7 +174,7 @@ fn with_configured_modules(device: &DeviceConfig) -> Cow<'_, Device> {
     Cow::Owned(hardware)
 }
 
-fn sim_device(device: &DeviceConfig, position: usize, seed: u64) -> Result<SimDevice, RunError> {
+fn sim_device(device: &DeviceConfig, position: usize, seed: u64) -> Result<SimDevice, Error> {
     let place = u32::try_from(position).unwrap_or(0);
     let mut options = DeviceOptions {
         serial: device.serial.unwrap_or(1000 + place),
@@ -209,5 +209,5 @@ fn sim_device(device: &DeviceConfig, position: usize, seed: u64) -> Result<SimDe
         options.sii = Some(sii::emit(&device.device, &device.esi.modules, &own));
     }
     SimDevice::from_esi(&hardware, &device.esi.modules, options)
-        .map_err(|error| RunError::Sim(format!("`{}`: {error}", device.name)))
+        .map_err(|error| Cause::Sim(format!("`{}`: {error}", device.name)).into())
 }

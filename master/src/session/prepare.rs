@@ -11,7 +11,7 @@ use ecaxis_ecat::registers;
 use ethercrab::{Command as Datagram, MainDevice};
 
 use super::fault_evidence::BringUpEvidence;
-use super::{EmergencyLog, Options, Progress, RunError, open, panic_text};
+use super::{Cause, EmergencyLog, Error, Options, Progress, open, panic_text};
 use crate::bringup::{Bus, Step, bring_up};
 use crate::cancel::run_until_set;
 use crate::clock::{self, Clock, Nanos};
@@ -57,7 +57,7 @@ pub struct RunBuilder<'a> {
 impl RunBuilder<'_> {
     /// Opens the link and brings the bus to SafeOp, on the calling thread and its clock
     /// ([`Clock::enter`]).
-    pub fn prepare(self) -> Result<Prepared, RunError> {
+    pub fn prepare(self) -> Result<Prepared, Error> {
         self.prepare_with_evidence(&mut BringUpEvidence::default())
     }
 
@@ -65,7 +65,7 @@ impl RunBuilder<'_> {
     pub(super) fn prepare_with_evidence(
         self,
         seen: &mut BringUpEvidence,
-    ) -> Result<Prepared, RunError> {
+    ) -> Result<Prepared, Error> {
         // Errors that need no bus are found before the link opens.
         plan(self.machine)?;
         let link = open::link(self.machine, self.options, |concern| {
@@ -75,7 +75,7 @@ impl RunBuilder<'_> {
     }
 
     /// Like [`RunBuilder::prepare`], on the given link instead of the file's `nic`.
-    pub fn prepare_on(self, link: Box<dyn Link>) -> Result<Prepared, RunError> {
+    pub fn prepare_on(self, link: Box<dyn Link>) -> Result<Prepared, Error> {
         self.prepare_with(link, &mut BringUpEvidence::default())
     }
 
@@ -83,7 +83,7 @@ impl RunBuilder<'_> {
         self,
         mut link: Box<dyn Link>,
         seen: &mut BringUpEvidence,
-    ) -> Result<Prepared, RunError> {
+    ) -> Result<Prepared, Error> {
         let Self {
             machine,
             options,
@@ -181,8 +181,8 @@ impl RunBuilder<'_> {
                 seen.on_the_bus = true;
                 // A panic may have left the link in any state.
                 if !matches!(
-                    error,
-                    RunError::Interrupted | RunError::Panicked(_) | RunError::Link(_)
+                    *error.cause,
+                    Cause::Interrupted | Cause::Panicked(_) | Cause::Link(_)
                 ) {
                     seen.looks = vec![DeviceSnapshot::default(); machine.devices.len()];
                     let wire = DatagramClient::new(main_device);
@@ -239,11 +239,11 @@ fn apply_drive_units(machine: &Machine, bus: &Bus) -> Arc<Machine> {
 type CyclePlan = (ImagePlan, Vec<RtAxis>, Vec<usize>, Signals);
 
 /// Returns the process image and the axes with their offsets in it.
-fn plan(machine: &Machine) -> Result<CyclePlan, RunError> {
-    let name = |index: usize| machine.devices[index].name.clone();
-    let image = image::of(machine).map_err(|source| RunError::TooLarge {
-        name: name(source.device),
-        source,
+fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
+    let name = |index: usize| machine.devices[index].name.as_str();
+    let image = image::of(machine).map_err(|error| {
+        let device = error.device;
+        Cause::TooLarge(error).at_name(name(device))
     })?;
     let mut slots = Vec::new();
     let mut axes = Vec::new();
@@ -251,20 +251,13 @@ fn plan(machine: &Machine) -> Result<CyclePlan, RunError> {
         let (Some(setup), Some(region)) = (&device.axis, region) else {
             continue;
         };
-        let bits = AxisBits::new(&device.selection.layout, region).map_err(|source| {
-            RunError::NotMapped {
-                name: name(index),
-                source,
-            }
-        })?;
+        let bits = AxisBits::new(&device.selection.layout, region)
+            .map_err(|error| Cause::NotMapped(error).at_name(name(index)))?;
         let mut config = setup.config;
         // A feedback value belongs to the set-point of an earlier cycle.
         config.answers_late = machine.bus.exchange.frame_sets() - 1;
         config.dead_time_s += f64::from(config.answers_late) * machine.bus.cycle_ns as f64 * 1e-9;
-        let axis = Axis::new(config).map_err(|source| RunError::Axis {
-            name: name(index),
-            source,
-        })?;
+        let axis = Axis::new(config).map_err(|error| Cause::Axis(error).at_name(name(index)))?;
         slots.push(RtAxis::new(axis, bits, index, image.groups[index]));
         axes.push(index);
     }
@@ -281,12 +274,9 @@ fn plan(machine: &Machine) -> Result<CyclePlan, RunError> {
     };
     let all = |signals: &[Signal], output: bool| {
         let each = signals.iter().map(|signal| {
-            bits(signal, output).ok_or_else(|| RunError::NotMapped {
-                name: signal.name.clone(),
-                source: NotMapped {
-                    index: signal.field.index,
-                    sub: signal.field.sub,
-                },
+            bits(signal, output).ok_or_else(|| {
+                let (index, sub) = (signal.field.index, signal.field.sub);
+                Cause::NotMapped(NotMapped { index, sub }).at_name(&signal.name)
             })
         });
         each.collect::<Result<Vec<_>, _>>()
@@ -319,9 +309,9 @@ fn preset_outputs(machine: &Machine, bus: &Bus, exchange: &mut Exchange) {
 }
 
 /// Returns the end of the recording as the error if a replay has run out of frames.
-pub(super) fn prefer_replay_end(error: RunError, link: &dyn Link, before: &str) -> RunError {
+pub(super) fn prefer_replay_end(error: Error, link: &dyn Link, before: &str) -> Error {
     match link.exhausted_reason() {
-        Some(why) => RunError::Replay(format!("{why} before {before}")),
+        Some(why) => Cause::Replay(format!("{why} before {before}")).into(),
         None => error,
     }
 }
@@ -341,7 +331,7 @@ fn bring_up_catching_panics(
     carried: BringUpIo<'_>,
     progress: &Sender<Progress>,
     log: &EmergencyLog,
-) -> Result<Bus, RunError> {
+) -> Result<Bus, Error> {
     let mut report = |step| {
         let _ = progress.send(match step {
             Step::Warning(text) => Progress::Warning(text),
@@ -361,10 +351,10 @@ fn bring_up_catching_panics(
     });
     match std::panic::catch_unwind(run) {
         Ok(Ok(Some(Ok(bus)))) => Ok(bus),
-        Ok(Ok(Some(Err(error)))) => Err(RunError::BringUp(Box::new(error))),
-        Ok(Ok(None)) => Err(RunError::Interrupted),
-        Ok(Err(error)) => Err(RunError::Link(error)),
-        Err(panic) => Err(RunError::Panicked(panic_text(&*panic))),
+        Ok(Ok(Some(Err(error)))) => Err(Cause::BringUp(Box::new(error)).into()),
+        Ok(Ok(None)) => Err(Cause::Interrupted.into()),
+        Ok(Err(error)) => Err(Cause::Link(error).into()),
+        Err(panic) => Err(Cause::Panicked(panic_text(&*panic)).into()),
     }
 }
 

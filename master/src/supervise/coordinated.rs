@@ -11,7 +11,7 @@ use super::Supervisor;
 use super::program::{Settling, TargetKind};
 use crate::clock::{self, Nanos};
 use crate::config::Step;
-use crate::report::RunError;
+use crate::report::Error;
 use crate::rt::channel::RtCommand;
 use crate::rt::setpoint_generator::{GeneratorRequest, GeneratorState, commanded};
 
@@ -49,7 +49,7 @@ impl Supervisor {
         relative: bool,
         targets: &[(usize, f64)],
         part: [f64; 2],
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let places = self.targets(targets);
         let axes: Vec<usize> = places.iter().map(|&(axis, _)| axis).collect();
         self.settle(&axes, start).await?;
@@ -87,7 +87,7 @@ impl Supervisor {
         relative: bool,
         targets: &[(usize, f64)],
         part: [f64; 2],
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let axes = self.places(
             &targets
                 .iter()
@@ -143,7 +143,7 @@ impl Supervisor {
         devices: [usize; 2],
         actual: bool,
         config: GearConfig,
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let feed = match *self.places(&devices) {
             [axis, master] => Some((
                 axis,
@@ -166,7 +166,7 @@ impl Supervisor {
         start: Nanos,
         device: usize,
         wave: Wave,
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let axes = self.places(&[device]);
         self.settle(&axes, start).await?;
         let snapshot = self.poll_and_query().await?;
@@ -190,7 +190,7 @@ impl Supervisor {
         start: Nanos,
         [device, table]: [usize; 2],
         [speed, ramp]: [f64; 2],
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let axes = self.places(&[device]);
         let [first, _] = self.machine.tables[table].table.ends();
         let there: Vec<_> = axes.iter().map(|&axis| (axis, first)).collect();
@@ -226,7 +226,7 @@ impl Supervisor {
         start: Nanos,
         feeds: &[(usize, GeneratorRequest)],
         until: GeneratorState,
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let orders = feeds
             .iter()
             .map(|&(axis, start)| RtCommand::Feed { axis, start });

@@ -11,7 +11,7 @@ use crate::clock::{self, Nanos};
 use crate::config::LimitConflict;
 use crate::post_mortem::snapshot::{self, Depth};
 use crate::post_mortem::{DeviceSnapshot, Witnessed};
-use crate::report::{DriveReport, Progress, RunError};
+use crate::report::{Cause, DriveReport, Error, Progress};
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::{RtCommand, Snapshot};
 use crate::rt::setpoint_generator::GeneratorState;
@@ -32,20 +32,20 @@ impl Supervisor {
         cause: StopCause,
         group: Option<usize>,
         snapshot: &Snapshot,
-    ) -> RunError {
-        match cause {
+    ) -> Error {
+        let axis = cause.axis();
+        let cause = match cause {
             // Not reached for requested stops: callers pass only failures.
-            StopCause::Requested => RunError::Interrupted,
+            StopCause::Requested => Cause::Interrupted,
             StopCause::EmergencyStop => {
                 let value = |input: usize| snapshot.inputs.get(input).copied().unwrap_or(f64::NAN);
                 let all = &self.machine.stop.emergency;
                 let pressed = all.iter().find(|c| c.holds(value(c.input))).or(all.first());
-                RunError::EmergencyStop {
+                Cause::EmergencyStop {
                     condition: pressed.map_or(String::new(), |c| self.machine.condition(c)),
                 }
             }
-            StopCause::FollowLost { axis } => RunError::FollowLost {
-                device: self.device_of(axis),
+            StopCause::FollowLost { axis } => Cause::FollowLost {
                 cause: self.cause_of_others(axis, group, snapshot).await,
                 reason: match snapshot.feeds.get(axis) {
                     Some(GeneratorState::Refused(reason)) => reason.to_string(),
@@ -53,11 +53,10 @@ impl Supervisor {
                     _ => "of another command".to_owned(),
                 },
             },
-            StopCause::Controller => RunError::Controller,
-            StopCause::Panicked => RunError::Panicked("the cycle".to_owned()),
-            StopCause::Unsupervised => RunError::Unsupervised,
-            StopCause::Powered { axis } => RunError::NotDisabled {
-                device: self.device_of(axis),
+            StopCause::Controller => Cause::Controller,
+            StopCause::Panicked => Cause::Panicked("the cycle".to_owned()),
+            StopCause::Unsupervised => Cause::Unsupervised,
+            StopCause::Powered { axis } => Cause::NotDisabled {
                 state: snapshot
                     .axes
                     .get(axis)
@@ -69,8 +68,7 @@ impl Supervisor {
                 if let Some(code) = code {
                     self.order(RtCommand::ErrorCode { axis, code }).await;
                 }
-                RunError::DriveFault {
-                    device: self.device_of(axis),
+                Cause::DriveFault {
                     code,
                     statusword: snapshot
                         .axes
@@ -80,8 +78,7 @@ impl Supervisor {
                     report: self.drive_report(axis, since).await,
                 }
             }
-            StopCause::Trip { axis, trip } => RunError::Trip {
-                device: self.device_of(axis),
+            StopCause::Trip { axis, trip } => Cause::Trip {
                 trip,
                 limits: self.exceeded_limits(axis),
             },
@@ -93,7 +90,7 @@ impl Supervisor {
                 if answered && let Some(missing) = self.find_missing(group).await {
                     return missing;
                 }
-                RunError::BusLost {
+                Cause::BusLost {
                     group: group.map(|group| self.group_name(group)),
                     cycles,
                     wkc: last_wkc,
@@ -101,15 +98,19 @@ impl Supervisor {
                 }
             }
             StopCause::LeftOp { al_status } => match self.find_missing(group).await {
-                Some(missing) => missing,
-                None => RunError::LeftOpBriefly { al_status },
+                Some(missing) => return missing,
+                None => Cause::LeftOpBriefly { al_status },
             },
+        };
+        match axis {
+            Some(axis) => cause.at(self.device_of(axis)),
+            None => cause.into(),
         }
     }
 
     /// Returns the first SubDevice of a group, or of all, that does not answer or is not in Op.
     /// Skips groups already stopped.
-    async fn find_missing(&mut self, group: Option<usize>) -> Option<RunError> {
+    async fn find_missing(&mut self, group: Option<usize>) -> Option<Error> {
         for (index, device) in self.bus.addresses().into_iter().enumerate() {
             let own = self.machine.group_of(index);
             if group.is_some_and(|group| group != own) || self.is_stopped(own) {
@@ -118,13 +119,9 @@ impl Supervisor {
             match al::read_status(&self.wire, device.station).await {
                 Ok(Some((status, code))) if status != 8 => {
                     let state = al::AlState::from_status(status);
-                    return Some(RunError::LeftOp {
-                        device,
-                        state,
-                        code,
-                    });
+                    return Some(Cause::LeftOp { state, code }.at(device));
                 }
-                Ok(None) => return Some(RunError::Gone { device }),
+                Ok(None) => return Some(Cause::Gone.at(device)),
                 _ => {}
             }
         }
@@ -137,7 +134,7 @@ impl Supervisor {
         axis: usize,
         group: Option<usize>,
         snapshot: &Snapshot,
-    ) -> Option<Arc<RunError>> {
+    ) -> Option<Arc<Error>> {
         // The other group may have stopped in the same cycle, so its stop is reported first. Boxed
         // because of the recursion.
         if group.is_none() {
@@ -154,16 +151,16 @@ impl Supervisor {
         axis: usize,
         status: AxisStatus,
         timeout: Nanos,
-    ) -> RunError {
+    ) -> Error {
         let code = self.error_code(axis).await.filter(|code| *code != 0);
-        RunError::NotEnabled {
-            device: self.device_of(axis),
+        Cause::NotEnabled {
             state: status.state,
             statusword: status.statusword,
             mode_confirmed: status.mode_confirmed,
             code,
             timeout_ms: timeout / 1_000_000,
         }
+        .at(self.device_of(axis))
     }
 
     /// Reports a fault from before this run; enabling clears it.
@@ -200,8 +197,8 @@ impl Supervisor {
     }
 
     /// Stores the state of the bus at a failure. Reads it now if no group's stop has stored it.
-    pub(super) async fn witness(&mut self, error: &RunError) {
-        let group = error.shared_cause().and_then(|cause| {
+    pub(super) async fn witness(&mut self, error: &Error) {
+        let group = error.shared_origin().and_then(|cause| {
             let mut stops = self.stopped.iter();
             stops.find(|stop| Arc::ptr_eq(&stop.cause, cause))
         });
@@ -271,7 +268,7 @@ impl Supervisor {
 
     /// Checks the mode of each axis over CoE if 0x6061 is not in its process data. Otherwise the
     /// cycle checks it.
-    pub(super) async fn confirm_modes(&mut self, axes: &[usize]) -> Result<(), RunError> {
+    pub(super) async fn confirm_modes(&mut self, axes: &[usize]) -> Result<(), Error> {
         for &axis in axes {
             let device = &self.machine.devices[self.axes[axis]];
             let Some(setup) = &device.axis else { continue };
@@ -290,11 +287,11 @@ impl Supervisor {
                 .as_deref()
                 && i8::from_le_bytes([display]) != expected
             {
-                return Err(RunError::WrongMode {
-                    device: self.device_of(axis),
+                return Err(Cause::WrongMode {
                     expected,
                     display: i8::from_le_bytes([display]),
-                });
+                }
+                .at(self.device_of(axis)));
             }
         }
         Ok(())

@@ -7,7 +7,7 @@ use super::Supervisor;
 use crate::config::{Action, Step};
 use crate::post_mortem::Witnessed;
 use crate::post_mortem::snapshot::Depth;
-use crate::report::{GroupStop, Progress, RunError};
+use crate::report::{Cause, Error, GroupStop, Progress};
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::Snapshot;
 use crate::rt::reaction_group::GroupStatus;
@@ -19,7 +19,7 @@ pub struct StoppedGroup {
     pub group: usize,
     /// The number of the stop within its group, from 1.
     pub number: u32,
-    pub cause: Arc<RunError>,
+    pub cause: Arc<Error>,
     pub witnessed: Witnessed,
     pub released: bool,
 }
@@ -103,7 +103,7 @@ impl Supervisor {
         &self,
         step: Option<&Step>,
         axes: &[usize],
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let stopped = axes.iter().find_map(|&axis| {
             let stop = self.stop_of(self.group_of(axis))?;
             Some((axis, stop))
@@ -111,11 +111,14 @@ impl Supervisor {
         let Some((axis, stop)) = stopped else {
             return Ok(());
         };
-        Err(RunError::GroupStopped {
-            device: self.device_of(axis),
-            step: step.map(Into::into),
+        let error = Cause::GroupStopped {
             group: self.group_name(stop.group),
             cause: Arc::clone(&stop.cause),
+        }
+        .at(self.device_of(axis));
+        Err(match step {
+            Some(step) => error.in_step(step),
+            None => error,
         })
     }
 }

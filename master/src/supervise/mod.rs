@@ -23,7 +23,7 @@ use crate::mailbox::Mailboxes;
 use crate::mailbox::worker::{MailboxWorker, run_with_workers};
 use crate::post_mortem::{Witnessed, snapshot};
 use crate::report::events::clock_off;
-use crate::report::{EmergencyLog, GroupStop, ProbeCapture, Progress, RunError, Status};
+use crate::report::{Cause, EmergencyLog, Error, GroupStop, ProbeCapture, Progress, Status};
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::{Event, HostEndpoint, ORDERS_A_CYCLE, RtCommand, Snapshot};
 use crate::rt::exchange::DiagnosticRegister;
@@ -106,12 +106,12 @@ pub struct ProgramOutcome {
     /// The state of the bus at the failure.
     pub witnessed: Option<Witnessed>,
     /// The error of a group that was not reset, and the state of the bus at that stop.
-    pub left: Option<(Arc<RunError>, Witnessed)>,
+    pub left: Option<(Arc<Error>, Witnessed)>,
 }
 
 impl Supervisor {
     /// Runs everything outside the cycle. The cycle ends when this future ends.
-    pub async fn run(mut self) -> (ProgramOutcome, Result<(), RunError>) {
+    pub async fn run(mut self) -> (ProgramOutcome, Result<(), Error>) {
         let workers = std::mem::take(&mut self.workers);
         let heartbeat = self.outer.heartbeat.clone();
         let mut work = pin!(run_with_workers(workers, self.run_inner()));
@@ -122,7 +122,7 @@ impl Supervisor {
         .await
     }
 
-    async fn run_inner(mut self) -> (ProgramOutcome, Result<(), RunError>) {
+    async fn run_inner(mut self) -> (ProgramOutcome, Result<(), Error>) {
         let mut ended = ProgramOutcome::default();
         let stop = Arc::clone(&self.stop);
         let worked = run_until_set(&stop, self.run_to_end(&mut ended)).await;
@@ -146,13 +146,13 @@ impl Supervisor {
         (ended, result)
     }
 
-    async fn run_to_end(&mut self, ended: &mut ProgramOutcome) -> Result<(), RunError> {
+    async fn run_to_end(&mut self, ended: &mut ProgramOutcome) -> Result<(), Error> {
         self.await_phase().await?;
         let devices = self.bus.addresses();
         let timeout = Duration::from_nanos(self.machine.bus.op_timeout_ns);
         al::change_state(&self.wire, &devices, AlState::Op, timeout)
             .await
-            .map_err(RunError::State)?;
+            .map_err(Cause::State)?;
         self.report(Progress::Step(crate::bringup::Step::State(AlState::Op)));
         self.order(RtCommand::Guard).await;
         if !self.enable {
@@ -173,7 +173,7 @@ impl Supervisor {
 
     /// Waits until frames are in phase with SYNC0 and all clocks are synchronized. A device may
     /// leave SafeOp only then.
-    async fn await_phase(&mut self) -> Result<(), RunError> {
+    async fn await_phase(&mut self) -> Result<(), Error> {
         let start = clock::now();
         // Reading every clock takes long on a large bus with a long cycle.
         let looks = self.bus.devices.len() * DiagnosticRegister::ALL.len() * 2;
@@ -192,21 +192,18 @@ impl Supervisor {
                 return Ok(());
             }
             if clock::now().saturating_sub(start) > timeout {
-                return Err(match (snapshot.phase, unsettled) {
-                    _ if !snapshot.inputs_fresh => RunError::NoProcessData {
-                        al_status: snapshot.al_status,
-                    },
-                    (Some(phase), None) => RunError::PhaseNotLocked {
+                let cause = match (snapshot.phase, unsettled) {
+                    (_, Some((device, difference_ns))) if snapshot.inputs_fresh => {
+                        return Err(Cause::ClockNotSettled { difference_ns }.at(device));
+                    }
+                    (Some(phase), None) if snapshot.inputs_fresh => Cause::PhaseNotLocked {
                         error_ns: phase.error_ns,
                     },
-                    (_, Some((device, difference_ns))) => RunError::ClockNotSettled {
-                        device,
-                        difference_ns,
-                    },
-                    (None, None) => RunError::NoProcessData {
+                    _ => Cause::NoProcessData {
                         al_status: snapshot.al_status,
                     },
-                });
+                };
+                return Err(cause.into());
             }
         }
     }
@@ -229,7 +226,7 @@ impl Supervisor {
             .map(|(device, found)| (device.at.clone(), found.clock_difference))
     }
 
-    async fn enable_axes(&mut self, step: Option<&Step>, axes: &[usize]) -> Result<(), RunError> {
+    async fn enable_axes(&mut self, step: Option<&Step>, axes: &[usize]) -> Result<(), Error> {
         let snapshot = self.poll_and_query().await?;
         let mut orders = Vec::with_capacity(2 * axes.len());
         self.ensure_not_stopped(step, axes)?;
@@ -249,10 +246,10 @@ impl Supervisor {
             let snapshot = self.poll_and_query().await?;
             self.ensure_not_stopped(step, axes)?;
             if let Some((axis, reason)) = self.refused.pop_front() {
-                return Err(RunError::EnableRefused {
-                    device: self.device_of(axis),
+                return Err(Cause::EnableRefused {
                     reason: reason.to_string(),
-                });
+                }
+                .at(self.device_of(axis)));
             }
             let status = |axis: usize| snapshot.axes.get(axis).copied();
             let late = axes
@@ -295,7 +292,7 @@ impl Supervisor {
 
     /// Waits for the next snapshot and reports stopped groups, for which it reads their devices.
     /// Fails if the cycle has stopped the machine.
-    async fn poll_and_query(&mut self) -> Result<Snapshot, RunError> {
+    async fn poll_and_query(&mut self) -> Result<Snapshot, Error> {
         let snapshot = self.poll_snapshot().await?;
         self.report_stopped_groups(&snapshot).await;
         Ok(snapshot)
@@ -303,10 +300,10 @@ impl Supervisor {
 
     /// Waits for the next snapshot without any device access. Fails if the cycle has stopped the
     /// machine.
-    async fn poll_snapshot(&mut self) -> Result<Snapshot, RunError> {
+    async fn poll_snapshot(&mut self) -> Result<Snapshot, Error> {
         clock::delay(TICK).await;
         if self.outer.orders.is_abandoned() {
-            return Err(RunError::Thread("the cycle has ended by itself".to_owned()));
+            return Err(Cause::Thread("the cycle has ended by itself".to_owned()).into());
         }
         let snapshot = self.outer.snapshots.read().clone();
         self.pass_events_on();
@@ -372,7 +369,7 @@ impl Supervisor {
 
     /// Stops the axes, removes power and sets the segment back to Init, as far as it answers.
     /// `failed`: the run already has an error.
-    async fn shut_down(&mut self, failed: bool) -> Result<(), RunError> {
+    async fn shut_down(&mut self, failed: bool) -> Result<(), Error> {
         self.report(Progress::Stopping);
         self.order(RtCommand::Stop).await;
         let result = self.wait_for_standstill(failed).await;
@@ -401,7 +398,7 @@ impl Supervisor {
                     let silent = matches!(error, StateError::Wire { .. });
                     self.report(Progress::Warning(error.to_string()));
                     if lowered.is_ok() {
-                        lowered = Err(RunError::State(error));
+                        lowered = Err(Cause::State(error).into());
                     }
                     if silent {
                         break;
@@ -425,7 +422,7 @@ impl Supervisor {
     }
 
     /// Waits until nothing more can stop any axis. Each axis ends its stop in bounded time.
-    async fn wait_for_standstill(&mut self, failed: bool) -> Result<(), RunError> {
+    async fn wait_for_standstill(&mut self, failed: bool) -> Result<(), Error> {
         loop {
             clock::delay(TICK).await;
             let snapshot = self.outer.snapshots.read();
@@ -454,10 +451,10 @@ impl Supervisor {
             status.state.has_power() && !self.is_stopped(self.group_of(*axis))
         });
         match powered {
-            Some((axis, status)) => Err(RunError::NotDisabled {
-                device: self.device_of(axis),
+            Some((axis, status)) => Err(Cause::NotDisabled {
                 state: status.state,
-            }),
+            }
+            .at(self.device_of(axis))),
             None => Ok(()),
         }
     }

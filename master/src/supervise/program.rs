@@ -19,7 +19,7 @@ use super::groups::needed;
 use super::{ProgramOutcome, Supervisor};
 use crate::clock::{self, Nanos};
 use crate::config::{Action, AxisSetup, Step};
-use crate::report::{Progress, RunError, StepRef};
+use crate::report::{Cause, Error, Progress, StepRef};
 use crate::rt::channel::{RtCommand, Snapshot};
 
 mod moves;
@@ -63,7 +63,7 @@ impl From<&Step> for StepRef {
 }
 
 impl Supervisor {
-    pub(super) async fn run_program(&mut self, ended: &mut ProgramOutcome) -> Result<(), RunError> {
+    pub(super) async fn run_program(&mut self, ended: &mut ProgramOutcome) -> Result<(), Error> {
         let start = clock::now();
         let steps = self.machine.steps.clone();
         if steps.is_empty() {
@@ -91,7 +91,7 @@ impl Supervisor {
     pub(super) async fn follow_controller(
         &mut self,
         ended: &mut ProgramOutcome,
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let start = clock::now();
         let all: Vec<usize> = (0..self.axes.len()).collect();
         self.enable_axes(None, &all).await?;
@@ -110,7 +110,7 @@ impl Supervisor {
     }
 
     /// Waits until the time limit. The user can stop the run earlier.
-    pub(super) async fn hold(&mut self, start: Nanos) -> Result<(), RunError> {
+    pub(super) async fn hold(&mut self, start: Nanos) -> Result<(), Error> {
         while !self.over(start) {
             self.poll_and_query().await?;
         }
@@ -123,7 +123,7 @@ impl Supervisor {
         steps: &'s [Step],
         run: u32,
         start: Nanos,
-    ) -> Pin<Box<dyn Future<Output = Result<(), RunError>> + Send + 's>> {
+    ) -> Pin<Box<dyn Future<Output = Result<(), Error>> + Send + 's>> {
         Box::pin(async move {
             for step in steps {
                 if self.over(start) {
@@ -153,7 +153,7 @@ impl Supervisor {
         })
     }
 
-    async fn run_step(&mut self, step: &Step, run: u32, start: Nanos) -> Result<(), RunError> {
+    async fn run_step(&mut self, step: &Step, run: u32, start: Nanos) -> Result<(), Error> {
         self.ensure_not_stopped(Some(step), &self.places(&needed(&step.action)))?;
         match &step.action {
             Action::Enable { axes } => {
@@ -353,7 +353,7 @@ impl Supervisor {
     }
 
     /// Waits until the cycle has taken every command.
-    async fn taken(&mut self, start: Nanos) -> Result<(), RunError> {
+    async fn taken(&mut self, start: Nanos) -> Result<(), Error> {
         while self.poll_and_query().await?.orders_taken < self.orders_given && !self.over(start) {}
         Ok(())
     }
@@ -364,8 +364,8 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        mut look: impl FnMut(&Self, &Snapshot) -> Result<bool, RunError>,
-    ) -> Result<(), RunError> {
+        mut look: impl FnMut(&Self, &Snapshot) -> Result<bool, Error>,
+    ) -> Result<(), Error> {
         let needed = self.places(&needed(&step.action));
         loop {
             let snapshot = self.poll_and_query().await?;
@@ -379,12 +379,12 @@ impl Supervisor {
                 continue;
             }
             if let Some((axis, reason)) = self.refused.pop_front() {
-                return Err(RunError::Refused {
-                    device: self.device_of(axis),
-                    step: step.into(),
+                return Err(Cause::Refused {
                     reason: reason.to_string(),
                     by_axis: Some(Box::new(reason)),
-                });
+                }
+                .at(self.device_of(axis))
+                .in_step(step));
             }
             if look(self, &snapshot)? {
                 return Ok(());
@@ -392,12 +392,12 @@ impl Supervisor {
         }
     }
 
-    pub(super) fn refusal(&self, step: &Step, axis: usize, reason: &dyn Display) -> RunError {
-        RunError::Refused {
-            device: self.device_of(axis),
-            step: step.into(),
+    pub(super) fn refusal(&self, step: &Step, axis: usize, reason: &dyn Display) -> Error {
+        Cause::Refused {
             reason: reason.to_string(),
             by_axis: None,
         }
+        .at(self.device_of(axis))
+        .in_step(step)
     }
 }

@@ -7,7 +7,7 @@ use super::measure::Measured;
 use super::plan::Plan;
 use ecaxis_master::config::Machine;
 use ecaxis_master::rt::spin::Spin;
-use ecaxis_master::session::{self, Observer, Options, Outcome, RunError};
+use ecaxis_master::session::{self, Error, Observer, Options, Outcome};
 
 /// Runs the machine for the plan's time. Without `enable` it stays in Op without power. Returns
 /// `None` if it was interrupted before the first cycle.
@@ -21,7 +21,7 @@ pub fn run(
     spin: Spin,
     stop: &Arc<AtomicBool>,
     observer: &mut dyn Observer,
-) -> Result<Option<Measured>, RunError> {
+) -> Result<Option<Measured>, Error> {
     let mut machine = machine.clone();
     machine.bus.spin = spin;
     machine.bus.cpu = Some(plan.cpu);
@@ -40,8 +40,8 @@ pub fn run(
     } = outcome;
     match result {
         Ok(()) => {}
-        Err(RunError::Interrupted) if stats.is_none() => return Ok(None),
-        Err(RunError::Interrupted) => {}
+        Err(error) if error.is_interruption() && stats.is_none() => return Ok(None),
+        Err(error) if error.is_interruption() => {}
         Err(error) => return Err(error),
     }
     let (Some(stats), Some(summary)) = (stats, summary) else {

@@ -22,7 +22,7 @@ use ecaxis_master::config::duration::show as duration;
 use ecaxis_master::link::{self, Link, OpenError, SocketKind};
 use ecaxis_master::rt::spin::Spin;
 use ecaxis_master::rt::stats::LatencyHistogram;
-use ecaxis_master::session::{Observer, RunError};
+use ecaxis_master::session::{Error, Observer};
 use ecaxis_master::sys::idle_spinner::IdleSpinner;
 use ecaxis_master::sys::process::ThreadUsage;
 use ecaxis_master::sys::rt_thread::CpuWakeGuard;
@@ -41,7 +41,7 @@ pub enum BenchError {
     #[error("{0}")]
     Rig(#[from] RigError),
     #[error("the machine: {0}")]
-    Run(Box<RunError>),
+    Run(Box<Error>),
     #[error("{0}")]
     Cyclictest(io::Error),
     #[error("{0}")]

@@ -22,7 +22,7 @@ use std::time::{Duration, Instant};
 
 use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config::{Machine, Nic};
-use ecaxis_master::session::{self, Observer, Options, Outcome, Progress, RunError};
+use ecaxis_master::session::{self, Cause, Error, Observer, Options, Outcome, Progress};
 use ecaxis_master::supervise::jog::{
     HOLD_TO_RUN_TIMEOUT, Operator, OperatorInput, Presence, Request, View,
 };
@@ -132,7 +132,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let written = print(&document);
     match ended {
         // Leaving with a key is not an interruption; closing the terminal is.
-        Ok(()) | Err(RunError::Interrupted) if left => written,
+        Ok(()) if left => written,
+        Err(error) if left && error.is_interruption() => written,
         Ok(()) => Err(Failure::interrupted()),
         Err(error) => Err(hints::run(&error, &nic)),
     }
@@ -217,7 +218,7 @@ fn on(
             .name("terminal".to_owned())
             .spawn_scoped(scope, move || terminal.serve());
         if let Err(error) = terminal {
-            return RunError::Thread(error.to_string()).into();
+            return Error::from(Cause::Thread(error.to_string())).into();
         }
         let outcome = session::run_with_operator(
             machine,

@@ -7,7 +7,7 @@ use ecaxis_axis::Command;
 use super::controller::{Activity, Commands, JogContext, JogController};
 use super::{JogEvent, Operator, Presence, View};
 use crate::clock;
-use crate::report::RunError;
+use crate::report::Error;
 use crate::rt::channel::RtCommand;
 use crate::rt::reaction_group::GroupStatus;
 use crate::supervise::Supervisor;
@@ -21,7 +21,7 @@ impl Supervisor {
     pub(in crate::supervise) async fn run_operator(
         &mut self,
         operator: &mut dyn Operator,
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let timeout = self.machine.bus.enable_timeout_ns + self.longest_stop();
         let all: Vec<usize> = (0..self.axes.len()).collect();
         let timeout = timeout + self.longest_release(&all);

@@ -6,7 +6,7 @@ use ecaxis_axis::{AxisStatus, Command, Mode};
 use super::{Settling, Supervisor, TargetKind};
 use crate::clock::Nanos;
 use crate::config::Step;
-use crate::report::RunError;
+use crate::report::{Cause, Error};
 use crate::rt::channel::Snapshot;
 
 impl Supervisor {
@@ -19,7 +19,7 @@ impl Supervisor {
         relative: bool,
         targets: &[(usize, f64)],
         [speed, ramp]: [f64; 2],
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let targets = self.destinations(relative, targets).await?;
         self.move_and_wait(step, start, TargetKind::Position, &targets, |position| {
             Command::MoveTo {
@@ -36,7 +36,7 @@ impl Supervisor {
         &mut self,
         relative: bool,
         targets: &[(usize, f64)],
-    ) -> Result<Vec<(usize, f64)>, RunError> {
+    ) -> Result<Vec<(usize, f64)>, Error> {
         let targets = self.targets(targets);
         let turning = targets.iter().any(|&(axis, _)| self.modulo(axis));
         let origin = if relative || turning {
@@ -66,7 +66,7 @@ impl Supervisor {
         step: &Step,
         start: Nanos,
         targets: &[(usize, Mode)],
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let targets = targets.iter().filter_map(|&(device, mode)| {
             Some((self.axes.iter().position(|&d| d == device)?, mode))
         });
@@ -93,7 +93,7 @@ impl Supervisor {
         aim: TargetKind,
         targets: &[(usize, f64)],
         command: impl Fn(f64) -> Command,
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         self.command(
             targets
                 .iter()
@@ -128,15 +128,15 @@ impl Supervisor {
         aim: TargetKind,
         target: f64,
         last: &AxisStatus,
-    ) -> RunError {
+    ) -> Error {
         let (target, actual, unit) = self.to_display_unit(axis, aim, target, last);
-        RunError::NotReached {
-            device: self.device_of(axis),
-            step: step.into(),
+        Cause::NotReached {
             target,
             actual,
             unit,
         }
+        .at(self.device_of(axis))
+        .in_step(step)
     }
 
     /// Converts a target and the reported value to the file's unit; positions of a modulo axis lie

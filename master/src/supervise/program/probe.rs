@@ -10,7 +10,7 @@ use ecaxis_axis::{Command, Edge, Probe, ProbeStatus, Source};
 use super::{Settling, Supervisor, TargetKind};
 use crate::clock::{self, Nanos};
 use crate::config::Step;
-use crate::report::{ProbeCapture, Progress, RunError};
+use crate::report::{Cause, Error, ProbeCapture, Progress};
 use crate::rt::channel::Snapshot;
 
 /// The timeout in ns until 0x60B9 shows that the drive watches the input.
@@ -38,7 +38,7 @@ impl Supervisor {
         start: Nanos,
         run: u32,
         search: ProbeMove,
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let ProbeMove {
             device,
             probe,
@@ -111,7 +111,7 @@ impl Supervisor {
         start: Nanos,
         axis: usize,
         search: &ProbeMove,
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let arm = Command::ArmProbe {
             probe: search.probe,
             edge: search.edge,
@@ -127,32 +127,32 @@ impl Supervisor {
                 return Ok(true);
             }
             if clock::now().saturating_sub(begun) > ARM_TIMEOUT {
-                return Err(RunError::ProbeNotArmed {
-                    device: this.device_of(axis),
-                    step: step.into(),
+                return Err(Cause::ProbeNotArmed {
                     input: search.probe.number(),
                     timeout_ms: ARM_TIMEOUT / 1_000_000,
-                });
+                }
+                .at(this.device_of(axis))
+                .in_step(step));
             }
             Ok(false)
         })
         .await
     }
 
-    fn not_probed(&self, step: &Step, axis: usize, target: f64, search: &ProbeMove) -> RunError {
+    fn not_probed(&self, step: &Step, axis: usize, target: f64, search: &ProbeMove) -> Error {
         let setup = self.setup(axis);
         let place = |position| match setup {
             Some(setup) => setup.config.scale.place(UserUnits(position)).0,
             None => position,
         };
-        RunError::NotProbed {
-            device: self.device_of(axis),
-            step: step.into(),
+        Cause::NotProbed {
             input: search.probe.number(),
             edge: edge_word(search.edge),
             target: place(target),
             unit: setup.map_or(String::new(), |setup| setup.unit.clone()),
         }
+        .at(self.device_of(axis))
+        .in_step(step)
     }
 
     /// Reports what was captured and stores it for the summary.

@@ -6,7 +6,7 @@ use ecaxis_axis::{AxisStatus, Command, Mode};
 use super::{SETTLE_TIMEOUT, STANDSTILL_TIME, Supervisor};
 use crate::clock::{self, Nanos};
 use crate::config::{Action, Condition, Step};
-use crate::report::RunError;
+use crate::report::{Cause, Error};
 use crate::rt::channel::Snapshot;
 
 impl Supervisor {
@@ -18,7 +18,7 @@ impl Supervisor {
         start: Nanos,
         holds: impl Fn(&Snapshot, usize) -> bool,
         axes: &[usize],
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let begun = clock::now();
         let timeout = self.machine.bus.enable_timeout_ns.max(self.longest_stop());
         self.wait_until(step, start, |this, snapshot| {
@@ -28,20 +28,18 @@ impl Supervisor {
             if let Some(mode) = snapshot.axes[axis].switch_failed
                 && matches!(step.action, Action::Mode { .. })
             {
-                return Err(RunError::NotSwitched {
-                    device: this.device_of(axis),
-                    step: step.into(),
-                    mode,
-                });
+                return Err(Cause::NotSwitched { mode }
+                    .at(this.device_of(axis))
+                    .in_step(step));
             }
             if clock::now().saturating_sub(begun) > timeout {
-                return Err(RunError::StepTimeout {
-                    device: this.device_of(axis),
-                    step: step.into(),
+                return Err(Cause::StepTimeout {
                     what: this.machine.describe(&step.action),
                     state: snapshot.axes[axis].state,
                     timeout_ms: timeout / 1_000_000,
-                });
+                }
+                .at(this.device_of(axis))
+                .in_step(step));
             }
             Ok(false)
         })
@@ -54,7 +52,7 @@ impl Supervisor {
         &mut self,
         axes: &[usize],
         start: Nanos,
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let begun = clock::now();
         let mut moved = begun;
         loop {
@@ -83,7 +81,7 @@ impl Supervisor {
         step: &Step,
         start: Nanos,
         devices: &[usize],
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let timeout = |device: &usize| {
             let axis = self.machine.devices[*device].axis.as_ref();
             let ns = axis.and_then(|a| a.homing.as_ref()).map(|h| h.timeout_ns);
@@ -101,12 +99,12 @@ impl Supervisor {
                 let status = &snapshot.axes[axis];
                 homed &= match status.homing {
                     HomingStatus::Failed(error) => {
-                        return Err(RunError::NotHomed {
-                            device: this.device_of(axis),
-                            step: step.into(),
+                        return Err(Cause::NotHomed {
                             method: this.homing_method(axis),
                             error,
-                        });
+                        }
+                        .at(this.device_of(axis))
+                        .in_step(step));
                     }
                     HomingStatus::Attained => status.switching.is_none() && status.ready,
                     HomingStatus::None | HomingStatus::Running => false,
@@ -133,7 +131,7 @@ impl Supervisor {
         start: Nanos,
         conditions: &[Condition],
         timeout: Nanos,
-    ) -> Result<(), RunError> {
+    ) -> Result<(), Error> {
         let begun = clock::now();
         loop {
             let snapshot = self.poll_and_query().await?;
@@ -144,12 +142,12 @@ impl Supervisor {
                 return Ok(());
             }
             if clock::now().saturating_sub(begun) > timeout {
-                return Err(RunError::WaitTimeout {
-                    step: step.into(),
+                let cause = Cause::WaitTimeout {
                     condition: self.machine.condition(open),
                     value: value(open.input),
                     timeout_ms: timeout / 1_000_000,
-                });
+                };
+                return Err(Error::from(cause).in_step(step));
             }
         }
     }
