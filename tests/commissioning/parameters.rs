@@ -9,13 +9,14 @@ use ecaxis_esi::Dictionary;
 use ecaxis_master::acyclic::eeprom::{Eeprom, EepromAccess};
 use ecaxis_master::acyclic::image::{with_alias, write};
 use ecaxis_master::acyclic::{AlState, al};
-use ecaxis_master::acyclic::{DatagramClient, Registers, ServiceError, device, mailbox};
+use ecaxis_master::acyclic::{DatagramClient, Registers, device, mailbox};
 use ecaxis_master::bringup::bring_up;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{self, Locator, Machine};
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::mailbox::worker::EmergencySink;
 use ecaxis_master::mailbox::{CoeClient, Emergencies, FoeClient, MailboxTransport, ObjectList};
+use ecaxis_master::report::{Cause, Error};
 use ecaxis_master::rt::image::{plan, process_data};
 use ecaxis_master::session::run_on_link;
 use ecaxis_master::session::simulated_bus;
@@ -75,11 +76,10 @@ async fn with_device<T>(
     let (_, at) = device::locate(wire, at, None).await.expect("located");
     let sii = device::read_sii(wire, &at, EepromAccess::Force).await;
     let sii = sii.expect("an image");
-    let done: Result<T, ServiceError> =
-        device::with_mailbox(wire, &at, &sii, "a test", async |lent| {
-            Ok(work(&mut lent.coe).await)
-        })
-        .await;
+    let done: Result<T, Error> = device::with_mailbox(wire, &at, &sii, "a test", async |lent| {
+        Ok(work(&mut lent.coe).await)
+    })
+    .await;
     done.expect("a mailbox")
 }
 
@@ -430,7 +430,7 @@ fn a_written_alias_applies_after_the_next_power_on() {
             // The new alias does not apply before the next power-on.
             let found = device::locate(&wire, Locator::Alias(1001), None).await;
             assert!(
-                matches!(found, Err(ServiceError::NotFound { .. })),
+                matches!(&found, Err(error) if matches!(*error.cause, Cause::NotFound { .. })),
                 "{found:?}"
             );
         });

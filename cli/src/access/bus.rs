@@ -4,7 +4,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use ecaxis_master::acyclic::{self, DatagramClient};
+use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{Machine, Nic};
 use ecaxis_master::link::{self, Link, SocketKind};
@@ -100,7 +100,7 @@ impl Bus {
             stop,
             async move |wire: DatagramClient| work(wire, heard.load(Ordering::Relaxed)).await,
         );
-        done.map_err(|error| hints::run(&error, &nic))
+        done.map_err(|error| hints::failure(&error, &nic))
     }
 
     fn open(self, heard: &AtomicU64) -> Result<Box<dyn Link>, Error> {
@@ -138,8 +138,8 @@ pub(crate) fn warn_foreign_frames(others: u64) {
 }
 
 /// Maps the error of work on a bus to a failure with hints.
-pub(crate) fn done<T>(result: Result<T, acyclic::ServiceError>, nic: &Nic) -> Result<T, Failure> {
-    result.map_err(|error| hints::service(&error, nic))
+pub(crate) fn done<T>(result: Result<T, Error>, nic: &Nic) -> Result<T, Failure> {
+    result.map_err(|error| hints::failure(&error, nic))
 }
 
 /// Shows a transient status line on stderr, on a terminal only.

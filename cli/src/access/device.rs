@@ -8,10 +8,11 @@ use ecaxis_esi::{DeviceHeader, Dictionary, Identity, SelectOptions, select};
 use ecaxis_master::acyclic::eeprom::EepromAccess;
 use ecaxis_master::acyclic::enumerate::EnumeratedDevice;
 use ecaxis_master::acyclic::{AlState, DeviceRef};
-use ecaxis_master::acyclic::{DatagramClient, ServiceError, device};
+use ecaxis_master::acyclic::{DatagramClient, device};
 use ecaxis_master::config::{self, DeviceConfig, Locator, Machine, Nic, nearest};
 use ecaxis_master::esi_library::{self, Library, RevisionMatch, cache_file};
-use ecaxis_master::mailbox::{CoeClient, NamedObject};
+use ecaxis_master::mailbox::{CoeClient, NamedObject, SdoError};
+use ecaxis_master::report::{Cause, Error};
 use ecaxis_tools::parameters::dictionary;
 use ecaxis_tools::parameters::dump::Origin;
 
@@ -203,11 +204,11 @@ impl Target {
 #[derive(Debug)]
 pub(crate) enum DeviceError {
     Reported(Failure),
-    Service(ServiceError),
+    Service(Error),
 }
 
-impl From<ServiceError> for DeviceError {
-    fn from(error: ServiceError) -> Self {
+impl From<Error> for DeviceError {
+    fn from(error: Error) -> Self {
         Self::Service(error)
     }
 }
@@ -228,7 +229,7 @@ impl OpenDevice {
     ) -> Result<Self, Failure> {
         let name = config.as_ref().map(|config| config.name.as_str());
         let located = device::locate(&wire, at, name).await;
-        let (found, device) = located.map_err(|error| hints::service(&error, &nic))?;
+        let (found, device) = located.map_err(|error| hints::failure(&error, &nic))?;
         Ok(Self {
             wire,
             device,
@@ -268,12 +269,17 @@ impl OpenDevice {
     }
 
     /// Maps a service error to a failure with hints.
-    pub fn map_error<T>(&self, result: Result<T, ServiceError>) -> Result<T, Failure> {
+    pub fn map_error<T>(&self, result: Result<T, Error>) -> Result<T, Failure> {
         result.map_err(|error| self.failure(&error))
     }
 
-    fn failure(&self, error: &ServiceError) -> Failure {
-        let failure = hints::service(error, &self.nic);
+    /// Maps an SDO error of this device to a failure with hints.
+    pub fn sdo_error<T>(&self, result: Result<T, SdoError>) -> Result<T, Failure> {
+        result.map_err(|error| self.failure(&Cause::Sdo(error).at(&self.device)))
+    }
+
+    fn failure(&self, error: &Error) -> Failure {
+        let failure = hints::failure(error, &self.nic);
         if self.others {
             return hints::with_other_main_device(failure, error);
         }
@@ -411,10 +417,7 @@ impl Open<'_> {
         match read.map_err(|error| (error.abort_code(), error)) {
             Ok(value) => Ok(Ok(value)),
             Err((Some(code), _)) => Ok(Err(code)),
-            Err((None, source)) => self.at.map_error(Err(ServiceError::Sdo {
-                device: self.at.device.clone(),
-                source,
-            })),
+            Err((None, source)) => self.at.sdo_error(Err(source)),
         }
     }
 }

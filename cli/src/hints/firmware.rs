@@ -2,9 +2,10 @@
 
 use ecaxis_master::config::Nic;
 use ecaxis_master::mailbox::FoeError;
+use ecaxis_master::report;
 use ecaxis_tools::firmware::{Cause, FinalDeviceState, FirmwareError, UpdateMethod};
 
-use super::{FAILED, Failure, INTERRUPTED, WRONG, service, state};
+use super::{FAILED, Failure, INTERRUPTED, WRONG, state};
 
 /// The failure if another MainDevice is active: a firmware update needs the bus alone.
 pub(crate) fn shared_bus() -> Failure {
@@ -22,7 +23,7 @@ pub(crate) fn firmware(error: &FirmwareError, nic: &Nic) -> Failure {
     };
     let failure = Failure::new(code, message(error));
     match error {
-        FirmwareError::Service(error) => service(error, nic),
+        FirmwareError::Service(error) => super::failure(error, nic),
         FirmwareError::Identity { .. } => failure
             .hint("`ecaxis firmware info` shows the device; select the intended one")
             .hint("if this is the right one, name its ESI file in the machine file, or `--expect-product`"),
@@ -78,7 +79,10 @@ fn cause(cause: &Cause) -> Option<String> {
         Cause::Sdo(_) => {
             "the device refuses this file or this order: use the file that its vendor specifies"
         }
-        Cause::State(error) => return Some(state(error)),
+        Cause::Service(error) => match &*error.cause {
+            report::Cause::State(error) => return Some(state(error)),
+            _ => return None,
+        },
         Cause::Control { .. } => "the device ignores 0x1F51: check whether it supports `--via foe`",
         Cause::Differs { .. } => {
             "the device did not store the sent data; its program memory may be worn"
@@ -87,7 +91,7 @@ fn cause(cause: &Cause) -> Option<String> {
             "the device took the file but does not run it: switch it off and on, then run `ecaxis firmware info`"
         }
         Cause::NotBack { .. } => "switch the device off and on, then run `ecaxis firmware info`",
-        Cause::Service(_) | Cause::Interrupted => return None,
+        Cause::Interrupted => return None,
     };
     Some(hint.to_owned())
 }

@@ -9,7 +9,6 @@ use ecaxis_axis::{CommandError, HomingError, State, Trip, VelocityUnit};
 use ecaxis_ecat::al_status_code::al_status_hint;
 use ecaxis_esi::address;
 use ecaxis_master::acyclic::StateError;
-use ecaxis_master::bringup::BringUpError;
 use ecaxis_master::config::{ConfigError, LimitConflict, Nic, UnitProblem};
 use ecaxis_master::mailbox::{NamedObject, SdoError};
 use ecaxis_master::report::{Cause, Error};
@@ -26,7 +25,8 @@ pub(crate) use fault_report::cause;
 pub(crate) use firmware::{firmware, shared_bus};
 use host::interfaces;
 pub(crate) use host::{capabilities, concern, denied, interface, overload};
-pub(crate) use service::{image, restore, service, with_other_main_device};
+use service::{FRAMES, eeprom, information, parameter};
+pub(crate) use service::{image, restore, with_other_main_device};
 
 /// Returns the advice for the error code of an emergency message, as for 0x603F.
 pub(crate) fn emergency(code: u16) -> &'static str {
@@ -42,12 +42,80 @@ pub(crate) fn no_ethercat(failure: Failure, one_interface: bool) -> Failure {
     })
 }
 
-/// Maps the error of a run to a failure. Hints depend on whether the bus is real.
-pub(crate) fn run(error: &Error, nic: &Nic) -> Failure {
+/// Maps an error of the master to a failure. Hints depend on whether the bus is real.
+pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
     let failure = Failure::new(FAILED, message(error));
     let hint = match &*error.cause {
         Cause::Open(open) => return interface(failure, open),
-        Cause::BringUp(bring_up) => return self::bring_up(failure, bring_up, nic),
+        Cause::NoAnswer => {
+            return match nic {
+                Nic::Interface(name) => failure
+                    .hint(format!("is `{name}` the right interface? {}", interfaces()))
+                    .hint("check that the first SubDevice has power and its IN port is connected"),
+                Nic::Sim => failure.hint("check the fault script: it may silence the bus"),
+            };
+        }
+        Cause::Silent { .. } | Cause::Datagram(_) | Cause::NotTaken { .. } => {
+            let failure = failure.hint(FRAMES);
+            return if error.is_in_bring_up() {
+                failure.hint("record the bring-up with `--record`")
+            } else {
+                failure
+            };
+        }
+        Cause::Scan(_) => FRAMES.to_owned(),
+        Cause::NotFound { .. } | Cause::Ambiguous { .. } => {
+            return Failure { code: WRONG, ..failure }
+                .hint("`ecaxis scan` shows the devices on the bus");
+        }
+        Cause::Eeprom(error) => eeprom(*error).to_owned(),
+        Cause::Sii(_) => {
+            "the image in its EEPROM is damaged: `ecaxis eeprom verify` shows the problems, `ecaxis esi sii` generates an image from an ESI file".to_owned()
+        }
+        Cause::NoMailbox => {
+            "devices without a mailbox, such as digital terminals, have no parameters".to_owned()
+        }
+        Cause::WrongState { .. } => "bring it to Init first, or switch it off and on".to_owned(),
+        Cause::Sdo(source) if error.is_in_bring_up() => sdo(source, "bring-up"),
+        Cause::Sdo(source) => parameter(source),
+        Cause::Information(source) => information(source).to_owned(),
+        Cause::Missing { .. } => {
+            "check the power of the first one missing and the cable to it, or remove its [[device]] from the file; `ecaxis compare` shows all differences".to_owned()
+        }
+        Cause::Unexpected { position, .. } => {
+            format!("add a [[device]] with `position = {position}`, or disconnect it")
+        }
+        Cause::Identity { .. } => {
+            "check the order of the devices; for another model or firmware, name its ESI file with `esi`, or pick with `product` and `revision`; `identity = \">=\"` accepts newer revisions as well; `ecaxis compare` shows all differences".to_owned()
+        }
+        Cause::Serial { found, .. } => {
+            format!("if the device was replaced on purpose, write `serial = {found}` or omit `serial`")
+        }
+        Cause::NotLocated { .. } => {
+            "set the device's alias or ID switch, or find it by `position`".to_owned()
+        }
+        Cause::StartUp { source, origin, .. } => sdo(source, origin),
+        Cause::NotHeld { .. } => {
+            "the device rounds or limits the value, or another object has changed it: write the value that it holds, or omit `verify` for this object".to_owned()
+        }
+        Cause::Watchdog { .. } => {
+            "without its watchdog the drive keeps moving when the outputs fail: ask its vendor how to enable it".to_owned()
+        }
+        Cause::Units { problems } => {
+            return problems.iter().map(units).fold(failure, Failure::hint);
+        }
+        Cause::Mapping { .. } => {
+            "the drive's firmware has another PDO mapping than the ESI file: use the ESI file of that firmware".to_owned()
+        }
+        Cause::MailboxMoved { .. } => {
+            "the device's EEPROM is not of this ESI file: use the ESI file of its firmware".to_owned()
+        }
+        Cause::NoStart => {
+            "frames are lost or the computer is overloaded: check cables, and stop other programs".to_owned()
+        }
+        Cause::NoClock => {
+            "run the device without distributed clock: `dc = \"off\"`".to_owned()
+        }
         Cause::State(state) => self::state(state),
         Cause::Record(_) => "name a file that can be written, on a disk with room".to_owned(),
         Cause::Replay(_) => {
@@ -108,19 +176,25 @@ pub(crate) fn run(error: &Error, nic: &Nic) -> Failure {
         Cause::Axis(_) => "check the step and the axis' limits in the machine file".to_owned(),
         Cause::EmergencyStop { .. } => "release it, then run again; `[stop] emergency` in the machine file says what it is".to_owned(),
         Cause::FollowLost { cause: Some(cause), .. } => {
-            return Failure { hints: run(cause, nic).hints, ..failure };
+            return Failure { hints: self::failure(cause, nic).hints, ..failure };
         }
         Cause::FollowLost { cause: None, .. } => "keep the followed axis under power and within what the follower's limits and range allow".to_owned(),
         Cause::EnableRefused { .. } => "`reset` the axis first, or look at what stopped it".to_owned(),
         Cause::GroupStopped { cause, .. } => {
-            let cause = run(cause, nic).hints.into_iter();
+            let cause = self::failure(cause, nic).hints.into_iter();
             let back = "once the cause is known, restart the group with the steps `reset` and `enable`";
             return cause.fold(failure, Failure::hint).hint(back);
         }
         Cause::Unsupervised => "the computer is overloaded: reserve a CPU for the cycle (`cpu` in [bus]) and run `ecaxis doctor`".to_owned(),
         Cause::Controller => "its message is on stderr; the axes were stopped".to_owned(),
         Cause::Panicked(_) => "this is a defect of ecaxis: please report it with the machine file and, if you can, `--record`".to_owned(),
-        Cause::Interrupted => return Failure { code: INTERRUPTED, ..failure },
+        Cause::Interrupted => {
+            let failure = Failure { code: INTERRUPTED, ..failure };
+            return match error.device() {
+                Some(_) => failure.hint("the device is back in its original state; the same command starts again"),
+                None => failure,
+            };
+        }
         Cause::Sim(_) | Cause::Thread(_) | Cause::Link(_) => return failure,
     };
     failure.hint(hint)
@@ -128,16 +202,13 @@ pub(crate) fn run(error: &Error, nic: &Nic) -> Failure {
 
 /// Returns the hint for a replayed run whose recording is of another bus.
 pub(crate) fn replayed(error: &Error, devices: usize) -> Option<String> {
-    let Cause::BringUp(error) = &*error.cause else {
-        return None;
-    };
-    let shown = match error.as_ref() {
-        BringUpError::Missing { found: 1, .. } => "1 SubDevice".to_owned(),
-        BringUpError::Missing { found, .. } => format!("{found} SubDevices"),
-        BringUpError::Unexpected { .. } => "more SubDevices".to_owned(),
-        BringUpError::Identity { .. }
-        | BringUpError::Serial { .. }
-        | BringUpError::NotLocated { .. } => "other SubDevices".to_owned(),
+    let shown = match &*error.cause {
+        Cause::Missing { found: 1, .. } => "1 SubDevice".to_owned(),
+        Cause::Missing { found, .. } => format!("{found} SubDevices"),
+        Cause::Unexpected { .. } => "more SubDevices".to_owned(),
+        Cause::Identity { .. } | Cause::Serial { .. } | Cause::NotLocated { .. } => {
+            "other SubDevices".to_owned()
+        }
         _ => return None,
     };
     Some(format!(
@@ -148,35 +219,27 @@ pub(crate) fn replayed(error: &Error, devices: usize) -> Option<String> {
 /// Returns the error text with the device and object address once. The source error repeats both.
 fn message(error: &Error) -> String {
     let text = error.to_string();
-    let Cause::BringUp(error) = &*error.cause else {
-        return text;
-    };
-    let (device, source, named) = match error.as_ref() {
-        BringUpError::StartUp {
-            device,
-            index,
-            sub,
-            source,
-            ..
+    let (source, object) = match &*error.cause {
+        Cause::StartUp {
+            index, sub, source, ..
         } => {
-            let object = NamedObject {
-                index: *index,
-                sub: *sub,
-            };
-            (device, source, Some(object.to_string()))
+            let (index, sub) = (*index, *sub);
+            (source.to_string(), Some(NamedObject { index, sub }))
         }
-        BringUpError::Sdo { device, source, .. } => (device, source, None),
+        Cause::Sdo(source) => (source.to_string(), None),
+        Cause::Information(source) => (source.to_string(), None),
         _ => return text,
     };
-    let long = source.to_string();
-    let mut short = long.as_str();
-    let station = format!("station {:#06x}", device.station);
-    for known in [Some(station), named].into_iter().flatten() {
+    let station = error
+        .device()
+        .map(|device| format!("station {:#06x}", device.station));
+    let mut short = source.as_str();
+    for known in station.into_iter().chain(object.map(|at| at.to_string())) {
         if let Some(rest) = short.strip_prefix(&known) {
             short = rest.trim_start_matches(':').trim_start();
         }
     }
-    match text.strip_suffix(&long) {
+    match text.strip_suffix(&source) {
         Some(head) => head.to_owned() + short,
         None => text,
     }
@@ -227,57 +290,6 @@ fn not_homed(error: HomingError) -> &'static str {
         HomingError::PowerLost => "check the drive's fault (0x603F) and its supply",
         HomingError::Aborted => "home the axis again before any absolute move",
     }
-}
-
-fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
-    let hint = match error {
-        BringUpError::Service(error) => {
-            let mut hints = service(error, nic).hints;
-            let lost = hints.iter().any(|hint| hint == service::FRAMES);
-            hints.extend(lost.then(|| "record the bring-up with `--record`".to_owned()));
-            return Failure { hints, ..failure };
-        }
-        BringUpError::Missing { .. } => {
-            "check the power of the first one missing and the cable to it, or remove its [[device]] from the file; `ecaxis compare` shows all differences".to_owned()
-        }
-        BringUpError::Unexpected { position, .. } => {
-            format!("add a [[device]] with `position = {position}`, or disconnect it")
-        }
-        BringUpError::Identity { .. } => {
-            "check the order of the devices; for another model or firmware, name its ESI file with `esi`, or pick with `product` and `revision`; `identity = \">=\"` accepts newer revisions as well; `ecaxis compare` shows all differences".to_owned()
-        }
-        BringUpError::Serial { found, .. } => {
-            format!("if the device was replaced on purpose, write `serial = {found}` or omit `serial`")
-        }
-        BringUpError::NotLocated { .. } => {
-            "set the device's alias or ID switch, or find it by `position`".to_owned()
-        }
-        BringUpError::StartUp { source, origin, .. } => sdo(source, origin),
-        BringUpError::NotHeld { .. } => {
-            "the device rounds or limits the value, or another object has changed it: write the value that it holds, or omit `verify` for this object".to_owned()
-        }
-        BringUpError::Sdo { source, .. } => sdo(source, "bring-up"),
-        BringUpError::Watchdog { .. } => {
-            "without its watchdog the drive keeps moving when the outputs fail: ask its vendor how to enable it".to_owned()
-        }
-        BringUpError::Units { problems, .. } => {
-            return problems.iter().map(units).fold(failure, Failure::hint);
-        }
-        BringUpError::Mapping { .. } => {
-            "the drive's firmware has another PDO mapping than the ESI file: use the ESI file of that firmware".to_owned()
-        }
-        BringUpError::MailboxMoved { .. } => {
-            "the device's EEPROM is not of this ESI file: use the ESI file of its firmware".to_owned()
-        }
-        BringUpError::NoStart { .. } => {
-            "frames are lost or the computer is overloaded: check cables, and stop other programs".to_owned()
-        }
-        BringUpError::NoClock { .. } => {
-            "run the device without distributed clock: `dc = \"off\"`".to_owned()
-        }
-        BringUpError::Scan { .. } => service::FRAMES.to_owned(),
-    };
-    failure.hint(hint)
 }
 
 /// Returns what to change in the machine file or in the drive.

@@ -1,4 +1,4 @@
-use ecaxis_master::acyclic::{AlState, DeviceRef, ServiceError};
+use ecaxis_master::acyclic::{AlState, DeviceRef};
 use ecaxis_master::link::OpenError;
 
 use super::*;
@@ -12,7 +12,7 @@ fn device() -> DeviceRef {
 }
 
 fn hints_of(error: &Error) -> (u8, String) {
-    let failure = run(error, &Nic::Interface("eth9".into()));
+    let failure = failure(error, &Nic::Interface("eth9".into()));
     (failure.code, failure.hints.join("\n"))
 }
 
@@ -25,24 +25,23 @@ fn every_failure_has_a_hint() {
         code,
     };
     let start_up = |code, origin: &str| {
-        Error::from(Cause::BringUp(Box::new(BringUpError::StartUp {
-            device: device(),
+        Cause::StartUp {
             index: 0x60c2,
             sub: 1,
             name: String::new(),
             value: "1".into(),
             origin: origin.into(),
             source: sdo(code),
-        })))
+        }
+        .at(device())
     };
-    let bring_up = |error| Error::from(Cause::BringUp(Box::new(error)));
     let refused = |code| {
-        bring_up(BringUpError::from(StateError::Refused {
-            device: device(),
+        let refused = StateError::Refused {
             wanted: AlState::SafeOp,
             actual: AlState::PreOp,
             code,
-        }))
+        };
+        Cause::State(refused).at(device())
     };
     let not_enabled = |state, code| {
         Cause::NotEnabled {
@@ -54,16 +53,14 @@ fn every_failure_has_a_hint() {
         }
         .at(device())
     };
-    let missing = BringUpError::Missing {
+    let missing = Cause::Missing {
         expected: 2,
         found: 1,
         missing: vec!["`y`".into()],
     };
     let units = |problem| {
-        bring_up(BringUpError::Units {
-            device: device(),
-            problems: vec![problem],
-        })
+        let problems = vec![problem];
+        Cause::Units { problems }.at(device())
     };
     let contradicts = |found| units(UnitProblem::Contradiction(found));
     for (error, code, hint) in [
@@ -123,11 +120,11 @@ fn every_failure_has_a_hint() {
             "this computer has",
         ),
         (
-            bring_up(ServiceError::NoAnswer.into()),
+            Cause::NoAnswer.into(),
             FAILED,
             "is `eth9` the right interface?",
         ),
-        (bring_up(missing), FAILED, "the first one missing"),
+        (missing.into(), FAILED, "the first one missing"),
         (
             start_up(0x0609_0030, "bus.cycle"),
             FAILED,
@@ -228,25 +225,23 @@ fn message_names_an_address_once() {
         ),
         (timeout, "(from mode csp): no answer came within 1s"),
     ] {
-        let error = Error::from(Cause::BringUp(Box::new(BringUpError::StartUp {
-            device: device(),
+        let error = Cause::StartUp {
             index: 0x6060,
             sub: 0,
             name: "Modes of operation".into(),
             value: "0x08".into(),
             origin: "mode csp".into(),
             source,
-        })));
+        }
+        .at(device());
         let text = message(&error);
         assert!(text.contains(end), "{text}");
         assert_eq!(text.matches("0x1001").count(), 1, "{text}");
         assert_eq!(text.matches("0x6060").count(), 1, "{text}");
     }
-    let error = Error::from(Cause::BringUp(Box::new(BringUpError::Sdo {
-        device: device(),
-        step: "reading the PDO mapping back",
-        source: abort,
-    })));
+    let error = Cause::Sdo(abort)
+        .at(device())
+        .during("reading the PDO mapping back");
     let text = message(&error);
     assert_eq!(text.matches("0x1001").count(), 1, "{text}");
     assert!(text.contains("back: 0x6060"), "{text}");
@@ -317,12 +312,9 @@ fn hints_keep_drives_on_with_another_main_device() {
         code: 0x0609_0030,
     };
     for (source, takes_away) in [(timeout, true), (refused, false)] {
-        let error = ServiceError::Sdo {
-            device: device(),
-            source,
-        };
-        let alone = service(&error, &nic);
-        let during = with_other_main_device(service(&error, &nic), &error);
+        let error = Cause::Sdo(source).at(device());
+        let alone = failure(&error, &nic);
+        let during = with_other_main_device(failure(&error, &nic), &error);
         let reported = during.hints.join("\n");
         assert_eq!(
             reported.contains("takes the answers away"),
@@ -345,12 +337,12 @@ fn firmware_error_names_its_device_once() {
         code: 0x0601_0002,
     };
     let state = StateError::Gone {
-        device: device(),
         wanted: AlState::PreOp,
     };
+    let state = super::Cause::State(state).at(device());
     for (step, cause) in [
         (Step::Clear, Cause::Sdo(abort)),
-        (Step::PreOp, Cause::State(state)),
+        (Step::PreOp, Cause::Service(state)),
     ] {
         let error = FirmwareError::Failed {
             device: device(),

@@ -103,7 +103,7 @@ impl Observer for ProgressPrinter {
                 note(&format!(
                     "warning: the group `{group}` stops, the rest goes on: {cause}"
                 ));
-                for hint in hints::run(cause, &self.nic).hints {
+                for hint in hints::failure(cause, &self.nic).hints {
                     note(&format!("  = help: {hint}"));
                 }
             }

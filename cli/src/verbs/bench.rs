@@ -390,7 +390,7 @@ fn failure(error: &BenchError, plan: &Plan) -> Failure {
         }
         BenchError::Open(open) => hints::interface(failed, open),
         BenchError::Run(error) => match &plan.target {
-            Target::Machine { machine, .. } => hints::run(error, &machine.bus.nic),
+            Target::Machine { machine, .. } => hints::failure(error, &machine.bus.nic),
             _ => failed,
         },
         BenchError::Turn(_) | BenchError::Rig(_) => {

@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use clap::Subcommand;
 use ecaxis_esi::Identity;
 use ecaxis_esi::sii::{self, Sii};
+use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::acyclic::eeprom::{Eeprom, EepromAccess, size_of, with_eeprom};
 use ecaxis_master::acyclic::image::{category, with_alias, with_category, write};
-use ecaxis_master::acyclic::{DatagramClient, ServiceError};
 use ecaxis_master::text::pluralize;
 use serde_json::json;
 
@@ -397,10 +397,7 @@ async fn in_eeprom<T>(
 ) -> Result<T, Failure> {
     let done = with_eeprom(&at.wire, &at.device, step, EepromAccess::of(at.state), work).await;
     // Writing that has begun is never cancelled.
-    let untouched = matches!(
-        done,
-        Err(DeviceError::Service(ServiceError::Stopped { .. }))
-    );
+    let untouched = matches!(&done, Err(DeviceError::Service(error)) if error.is_interruption());
     at.ended(done).map_err(|failure| match untouched {
         true => Failure {
             message: format!("{}; nothing was written", failure.message),

@@ -130,7 +130,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     drop(teller);
 
     let mut failure = ended.err().map(|error| {
-        let mut failure = hints::run(&error, &nic);
+        let mut failure = hints::failure(&error, &nic);
         if args.replay.is_some()
             && let Some(hint) = hints::replayed(&error, devices)
         {
@@ -305,7 +305,7 @@ const MAX_BYTES: u64 = 16 << 20;
 pub(crate) fn faults(path: &Path, machine: &Machine) -> Result<FaultScript, Failure> {
     let text = ecaxis_master::file::read_text(path, MAX_BYTES)
         .map_err(|e| Failure::new(hints::WRONG, format!("cannot read {}: {e}", path.display())))?;
-    let bus = session::topology(machine).map_err(|e| hints::run(&e, &machine.bus.nic))?;
+    let bus = session::topology(machine).map_err(|e| hints::failure(&e, &machine.bus.nic))?;
     let script = FaultScript::parse(&text).and_then(|script| {
         script.check(&bus)?;
         Ok(script)

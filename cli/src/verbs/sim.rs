@@ -100,7 +100,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         false => (faults, None),
     };
     let mut segment = session::simulated_bus(&machine, seed, at_once.as_ref(), ring)
-        .map_err(|error| hints::run(&error, &machine.bus.nic))?;
+        .map_err(|error| hints::failure(&error, &machine.bus.nic))?;
 
     let stop = Arc::new(AtomicBool::new(false));
     signals::stop_on_interrupt(&stop);

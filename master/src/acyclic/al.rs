@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use super::DeviceRef;
 use crate::mailbox::{DatagramError, MailboxTransport};
+use crate::report::{Cause, Error};
 use ecaxis_ecat::al_status_code::al_status_text;
 use ecaxis_ecat::registers;
 
@@ -78,30 +79,33 @@ impl fmt::Display for AlState {
 #[derive(Debug, thiserror::Error)]
 pub enum StateError {
     #[error(
-        "{device}: refused {wanted}: stays in {actual}, AL status code 0x{code:04x} ({})",
+        "refused {wanted}: stays in {actual}, AL status code 0x{code:04x} ({})",
         al_status_text(*code)
     )]
     Refused {
-        device: DeviceRef,
         wanted: AlState,
         actual: AlState,
         code: u16,
     },
-    #[error("{device}: did not reach {wanted} within {} ms, is in {actual}", timeout.as_millis())]
+    #[error("did not reach {wanted} within {} ms, is in {actual}", timeout.as_millis())]
     Timeout {
-        device: DeviceRef,
         wanted: AlState,
         actual: AlState,
         timeout: Duration,
     },
-    #[error("{device}: no longer answers while it should go to {wanted}")]
-    Gone { device: DeviceRef, wanted: AlState },
-    #[error("{device}: changing to {wanted}: {source}")]
+    #[error("no longer answers while it should go to {wanted}")]
+    Gone { wanted: AlState },
+    #[error("changing to {wanted}: {source}")]
     Wire {
-        device: DeviceRef,
         wanted: AlState,
         source: DatagramError,
     },
+}
+
+impl StateError {
+    pub(crate) fn at(self, device: &DeviceRef) -> Error {
+        Cause::State(self).at(device)
+    }
 }
 
 /// Returns AL status and AL status code; `None` if the device does not answer.
@@ -141,11 +145,16 @@ pub async fn change_state(
     devices: &[DeviceRef],
     wanted: AlState,
     timeout: Duration,
-) -> Result<(), StateError> {
+) -> Result<(), Error> {
     for device in devices {
         request(wire, device, wanted).await?;
     }
     wait_state(wire, devices, wanted, timeout).await
+}
+
+/// `true` if the wire failed while a state changed.
+pub(crate) fn is_wire(error: &Error) -> bool {
+    matches!(*error.cause, Cause::State(StateError::Wire { .. }))
 }
 
 /// Requests a lower state from every device, even if some fail. Returns the first error at the end.
@@ -154,11 +163,11 @@ pub async fn lower_state(
     devices: &[DeviceRef],
     wanted: AlState,
     timeout: Duration,
-) -> Result<(), StateError> {
+) -> Result<(), Error> {
     let mut trouble = None;
     for device in devices {
         if let Err(error) = request(wire, device, wanted).await {
-            let silent = matches!(error, StateError::Wire { .. });
+            let silent = is_wire(&error);
             trouble.get_or_insert(error);
             // The wire failed, not a device: the other devices would only time out.
             if silent {
@@ -166,7 +175,7 @@ pub async fn lower_state(
             }
         }
     }
-    if !matches!(trouble, Some(StateError::Wire { .. })) {
+    if !trouble.as_ref().is_some_and(is_wire) {
         for device in devices {
             if let Err(error) =
                 wait_state(wire, std::slice::from_ref(device), wanted, timeout).await
@@ -183,16 +192,9 @@ async fn request(
     wire: &impl MailboxTransport,
     device: &DeviceRef,
     wanted: AlState,
-) -> Result<(), StateError> {
-    let failed = |source| StateError::Wire {
-        device: device.clone(),
-        wanted,
-        source,
-    };
-    let gone = || StateError::Gone {
-        device: device.clone(),
-        wanted,
-    };
+) -> Result<(), Error> {
+    let failed = |source| StateError::Wire { wanted, source }.at(device);
+    let gone = || StateError::Gone { wanted }.at(device);
     let status = read_status(wire, device.station).await.map_err(failed)?;
     let (status, _) = status.ok_or_else(gone)?;
     tracing::debug!(%device, "AL status 0x{status:02x}, requesting {wanted}");
@@ -223,43 +225,36 @@ pub async fn wait_state(
     devices: &[DeviceRef],
     wanted: AlState,
     timeout: Duration,
-) -> Result<(), StateError> {
+) -> Result<(), Error> {
     let end = wire
         .now()
         .saturating_add(u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX));
     for device in devices {
         loop {
-            let failed = |source| StateError::Wire {
-                device: device.clone(),
-                wanted,
-                source,
-            };
+            let failed = |source| StateError::Wire { wanted, source }.at(device);
             let Some((status, code)) = read_status(wire, device.station).await.map_err(failed)?
             else {
-                return Err(StateError::Gone {
-                    device: device.clone(),
-                    wanted,
-                });
+                return Err(StateError::Gone { wanted }.at(device));
             };
             let actual = AlState::from_status(status);
             if status & ERROR != 0 {
-                return Err(StateError::Refused {
-                    device: device.clone(),
+                let refused = StateError::Refused {
                     wanted,
                     actual,
                     code,
-                });
+                };
+                return Err(refused.at(device));
             }
             if actual == wanted {
                 break;
             }
             if wire.now() >= end {
-                return Err(StateError::Timeout {
-                    device: device.clone(),
+                let late = StateError::Timeout {
                     wanted,
                     actual,
                     timeout,
-                });
+                };
+                return Err(late.at(device));
             }
             wire.delay(POLL).await;
         }

@@ -2,23 +2,24 @@
 
 use ecaxis_esi::sii::{self, Sii};
 
+use super::DatagramClient;
 use super::eeprom::{EepromAccess, EepromError, with_eeprom};
 use super::enumerate::{EnumeratedDevice, address, enumerate, select};
 use super::mailbox::{self, MailboxSession};
-use super::{DatagramClient, ServiceError};
 use crate::acyclic::{AlState, DeviceRef, al};
 use crate::config::Locator;
 use crate::mailbox::MailboxTransport;
+use crate::report::{Cause, Error};
 
 /// Returns the requested device with its present station address. Every device has one afterwards.
 ///
 /// # Errors
-/// [`ServiceError::NotFound`], [`ServiceError::Ambiguous`]; as [`enumerate`].
+/// [`Cause::NotFound`], [`Cause::Ambiguous`]; as [`enumerate`].
 pub async fn locate(
     wire: &DatagramClient,
     at: Locator,
     name: Option<&str>,
-) -> Result<(EnumeratedDevice, DeviceRef), ServiceError> {
+) -> Result<(EnumeratedDevice, DeviceRef), Error> {
     let mut all = enumerate(wire).await?;
     address(wire, &mut all).await?;
     let at = match at {
@@ -38,20 +39,17 @@ pub async fn locate(
 /// Reads the content of a device's EEPROM.
 ///
 /// # Errors
-/// [`ServiceError::Eeprom`], [`ServiceError::Sii`].
+/// [`Cause::Eeprom`], [`Cause::Sii`].
 pub async fn read_sii(
     wire: &impl MailboxTransport,
     device: &DeviceRef,
     access: EepromAccess,
-) -> Result<Sii, ServiceError> {
+) -> Result<Sii, Error> {
     let image = with_eeprom(wire, device, "reading its EEPROM", access, async |eeprom| {
         eeprom.image(&mut |_, _| {}).await
     });
-    let image: Result<Vec<u8>, ServiceError> = image.await;
-    sii::parse(&image?).map_err(|source| ServiceError::Sii {
-        device: device.clone(),
-        source,
-    })
+    let image: Result<Vec<u8>, Error> = image.await;
+    sii::parse(&image?).map_err(|error| Cause::Sii(error).at(device))
 }
 
 /// Reads the content of a device's EEPROM; `None` if the PDI is using the EEPROM and the mailbox is
@@ -64,13 +62,12 @@ pub async fn read_sii_unless_in_use(
     found: &EnumeratedDevice,
     device: &DeviceRef,
     access: EepromAccess,
-) -> Result<Option<Sii>, ServiceError> {
+) -> Result<Option<Sii>, Error> {
     let has_mailbox = matches!(found.state, AlState::PreOp | AlState::SafeOp | AlState::Op);
     match read_sii(wire, device, access).await {
-        Err(ServiceError::Eeprom {
-            source: EepromError::InUse,
-            ..
-        }) if has_mailbox => Ok(None),
+        Err(error) if has_mailbox && matches!(*error.cause, Cause::Eeprom(EepromError::InUse)) => {
+            Ok(None)
+        }
         sii => sii.map(Some),
     }
 }
@@ -79,9 +76,9 @@ pub async fn read_sii_unless_in_use(
 /// Init afterwards, even after an error. `step` describes the operation.
 ///
 /// # Errors
-/// As [`mailbox::open`] and [`mailbox::MailboxSession::close`]; [`ServiceError::Stopped`]. Errors
+/// As [`mailbox::open`] and [`mailbox::MailboxSession::close`]; [`Cause::Interrupted`]. Errors
 /// of the work take precedence.
-pub async fn with_mailbox<T, E: From<ServiceError>>(
+pub async fn with_mailbox<T, E: From<Error>>(
     wire: &DatagramClient,
     device: &DeviceRef,
     sii: &Sii,
@@ -96,8 +93,7 @@ pub async fn with_mailbox<T, E: From<ServiceError>>(
             None => {
                 // A device that keeps its state must not wait for the rest of a transfer.
                 let _ = lent.coe.abort_transfer(wire).await;
-                let device = device.clone();
-                Err(ServiceError::Stopped { device, step }.into())
+                Err(Cause::Interrupted.at(device).during(step).into())
             }
         };
         let back = lent.close(wire).await;

@@ -2,10 +2,11 @@
 
 use std::time::Duration;
 
-use super::{Registers, ServiceError};
+use super::Registers;
 use crate::acyclic::{AlState, DeviceRef};
 use crate::cancel::CancelToken;
 use crate::mailbox::MailboxTransport;
+use crate::report::{Cause, Error};
 use ecaxis_ecat::registers;
 
 /// 0x0500: the PDI has access to the EEPROM; the MainDevice can take it by force.
@@ -94,9 +95,9 @@ fn declared_size(word: [u8; 2]) -> usize {
 /// `step` describes the operation.
 ///
 /// # Errors
-/// As [`Eeprom::claim`] and [`Eeprom::release`]; [`ServiceError::Stopped`]. Errors of the work take
+/// As [`Eeprom::claim`] and [`Eeprom::release`]; [`Cause::Interrupted`]. Errors of the work take
 /// precedence.
-pub async fn with_eeprom<W: MailboxTransport, T, E: From<ServiceError>>(
+pub async fn with_eeprom<W: MailboxTransport, T, E: From<Error>>(
     wire: &W,
     device: &DeviceRef,
     step: &'static str,
@@ -136,7 +137,7 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
         device: &'a DeviceRef,
         step: &'static str,
         claim: EepromAccess,
-    ) -> Result<Self, ServiceError> {
+    ) -> Result<Self, Error> {
         let registers = Registers { wire, device, step };
         let [access, in_use] = registers.read(registers::EEPROM_CONFIGURATION).await?;
         let eeprom = Self { registers, access };
@@ -160,7 +161,7 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
     ///
     /// # Errors
     /// As [`Registers::write`].
-    pub async fn release(self) -> Result<(), ServiceError> {
+    pub async fn release(self) -> Result<(), Error> {
         if self.access & LENT == 0 {
             return Ok(());
         }
@@ -172,8 +173,8 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
     /// Reads bytes from a word on.
     ///
     /// # Errors
-    /// [`ServiceError::Eeprom`], and as [`Registers::read`].
-    pub async fn read(&self, word: u32, bytes: &mut [u8]) -> Result<(), ServiceError> {
+    /// [`Cause::Eeprom`], and as [`Registers::read`].
+    pub async fn read(&self, word: u32, bytes: &mut [u8]) -> Result<(), Error> {
         let mut word = word;
         let mut rest = bytes;
         while !rest.is_empty() {
@@ -196,10 +197,7 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
     ///
     /// # Errors
     /// As [`Eeprom::read`].
-    pub async fn image(
-        &self,
-        progress: &mut dyn FnMut(usize, usize),
-    ) -> Result<Vec<u8>, ServiceError> {
+    pub async fn image(&self, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<u8>, Error> {
         let size = self.size().await?;
         let mut image = vec![0; HEADER_BYTES];
         self.read(0, &mut image).await?;
@@ -227,10 +225,7 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
     ///
     /// # Errors
     /// As [`Eeprom::read`].
-    pub async fn all(
-        &self,
-        progress: &mut dyn FnMut(usize, usize),
-    ) -> Result<Vec<u8>, ServiceError> {
+    pub async fn all(&self, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<u8>, Error> {
         let size = self.size().await?;
         let image = self.image(progress).await?;
         self.longer(image, size, progress).await
@@ -245,7 +240,7 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
         mut image: Vec<u8>,
         bytes: usize,
         progress: &mut dyn FnMut(usize, usize),
-    ) -> Result<Vec<u8>, ServiceError> {
+    ) -> Result<Vec<u8>, Error> {
         let bytes = bytes.min(MAX_BYTES);
         while image.len() < bytes && self.next(&mut image, bytes, 64).await?.is_some() {
             progress(image.len(), bytes);
@@ -257,7 +252,7 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
     ///
     /// # Errors
     /// As [`Eeprom::read`].
-    pub async fn size(&self) -> Result<usize, ServiceError> {
+    pub async fn size(&self) -> Result<usize, Error> {
         let mut size = [0; 2];
         self.read(SIZE, &mut size).await?;
         Ok(declared_size(size))
@@ -269,7 +264,7 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
         image: &mut Vec<u8>,
         size: usize,
         bytes: usize,
-    ) -> Result<Option<[u8; 4]>, ServiceError> {
+    ) -> Result<Option<[u8; 4]>, Error> {
         let at = image.len();
         let end = at.saturating_add(bytes).min(size);
         if end == at && bytes > 0 {
@@ -289,8 +284,8 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
     /// Writes one word without reading it back.
     ///
     /// # Errors
-    /// [`ServiceError::Eeprom`], and as [`Registers::write`].
-    pub async fn write(&self, word: u32, value: [u8; 2]) -> Result<(), ServiceError> {
+    /// [`Cause::Eeprom`], and as [`Registers::write`].
+    pub async fn write(&self, word: u32, value: [u8; 2]) -> Result<(), Error> {
         self.registers.write(registers::EEPROM_DATA, &value).await?;
         self.command(word, WRITE | WRITE_ENABLE).await.map(drop)
     }
@@ -299,12 +294,12 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
     ///
     /// # Errors
     /// As [`Eeprom::write`].
-    pub async fn reload(&self) -> Result<(), ServiceError> {
+    pub async fn reload(&self) -> Result<(), Error> {
         self.command(0, RELOAD).await.map(drop)
     }
 
     /// Runs a command and returns the status when it is done.
-    async fn command(&self, word: u32, command: u16) -> Result<u16, ServiceError> {
+    async fn command(&self, word: u32, command: u16) -> Result<u16, Error> {
         let [c0, c1] = command.to_le_bytes();
         let [a0, a1, a2, a3] = word.to_le_bytes();
         let mut status = 0;
@@ -331,7 +326,7 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
         Err(self.failed(EepromError::NotAcknowledged { word, status }))
     }
 
-    async fn done(&self, word: u32) -> Result<u16, ServiceError> {
+    async fn done(&self, word: u32) -> Result<u16, Error> {
         let wire = self.registers.wire;
         let time = u64::try_from(TIMEOUT.as_nanos()).unwrap_or(u64::MAX);
         let end = wire.now().saturating_add(time);
@@ -352,18 +347,11 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
         self.registers.wire.stop()
     }
 
-    pub(super) fn stopped(&self) -> ServiceError {
-        ServiceError::Stopped {
-            device: self.registers.device.clone(),
-            step: self.registers.step,
-        }
+    pub(super) fn stopped(&self) -> Error {
+        self.registers.failed(Cause::Interrupted)
     }
 
-    pub(super) fn failed(&self, source: EepromError) -> ServiceError {
-        ServiceError::Eeprom {
-            device: self.registers.device.clone(),
-            step: self.registers.step,
-            source,
-        }
+    pub(super) fn failed(&self, source: EepromError) -> Error {
+        self.registers.failed(Cause::Eeprom(source))
     }
 }

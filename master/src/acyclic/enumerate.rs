@@ -1,10 +1,10 @@
 //! Enumerates the SubDevices of a segment and assigns station addresses.
 
-use super::ServiceError;
 use crate::acyclic::{AlState, DeviceRef};
 use crate::config::Locator;
 use crate::datagram::DatagramClient;
 use crate::mailbox::DatagramError;
+use crate::report::{Cause, Error};
 use ecaxis_ecat::registers;
 
 /// The number of broadcasts without an answer after which a segment counts as silent.
@@ -78,8 +78,8 @@ impl StatusRegisters {
 /// [`super::device::locate`] reads them.
 ///
 /// # Errors
-/// [`ServiceError::NotFound`], [`ServiceError::Ambiguous`].
-pub fn select(all: &[EnumeratedDevice], at: Locator) -> Result<&EnumeratedDevice, ServiceError> {
+/// [`Cause::NotFound`], [`Cause::Ambiguous`].
+pub fn select(all: &[EnumeratedDevice], at: Locator) -> Result<&EnumeratedDevice, Error> {
     let fits = |found: &&EnumeratedDevice| match at {
         Locator::Position(position) => found.position == position,
         Locator::Alias(alias) => found.alias == alias,
@@ -92,7 +92,7 @@ pub fn select(all: &[EnumeratedDevice], at: Locator) -> Result<&EnumeratedDevice
     };
     match *fitting {
         [one] => Ok(one),
-        [] => Err(ServiceError::NotFound {
+        [] => Err(Error::from(Cause::NotFound {
             wanted: at.to_string(),
             found: match (at, all.len()) {
                 (Locator::Id(_), n) => format!("{n} were asked"),
@@ -108,20 +108,20 @@ pub fn select(all: &[EnumeratedDevice], at: Locator) -> Result<&EnumeratedDevice
                     format!("{n} answer, at positions 0 to {}", n.saturating_sub(1))
                 }
             },
-        }),
-        _ => Err(ServiceError::Ambiguous {
+        })),
+        _ => Err(Error::from(Cause::Ambiguous {
             wanted: at.to_string(),
             count: fitting.len(),
             positions: list(&mut fitting.iter().map(|found| found.position)),
-        }),
+        })),
     }
 }
 
 /// Returns all SubDevices in segment order. Only reads.
 ///
 /// # Errors
-/// [`ServiceError::NoAnswer`]; [`ServiceError::Silent`] if a device leaves meanwhile.
-pub async fn enumerate(wire: &DatagramClient) -> Result<Vec<EnumeratedDevice>, ServiceError> {
+/// [`Cause::NoAnswer`]; [`Cause::Silent`] if a device leaves meanwhile.
+pub async fn enumerate(wire: &DatagramClient) -> Result<Vec<EnumeratedDevice>, Error> {
     let mut found = Vec::new();
     for position in 0..count(wire).await? {
         found.push(read_device(wire, position).await?);
@@ -132,11 +132,8 @@ pub async fn enumerate(wire: &DatagramClient) -> Result<Vec<EnumeratedDevice>, S
 /// Reads the registers of one SubDevice by its position.
 ///
 /// # Errors
-/// [`ServiceError::Silent`] if no device answers.
-pub async fn read_device(
-    wire: &DatagramClient,
-    position: u16,
-) -> Result<EnumeratedDevice, ServiceError> {
+/// [`Cause::Silent`] if no device answers.
+pub async fn read_device(wire: &DatagramClient, position: u16) -> Result<EnumeratedDevice, Error> {
     let addresses = at(wire, position, STEP, registers::STATION_ADDRESS).await?;
     let [s0, s1, a0, a1] = addresses;
     let status = at(wire, position, STEP, StatusRegisters::START).await?;
@@ -155,33 +152,40 @@ pub async fn read_device(
 /// Returns the number of devices that answer a broadcast; at least 1.
 ///
 /// # Errors
-/// [`ServiceError::NoAnswer`], [`ServiceError::Segment`].
-pub async fn count(wire: &DatagramClient) -> Result<u16, ServiceError> {
+/// [`Cause::NoAnswer`], [`Cause::Datagram`].
+pub async fn count(wire: &DatagramClient) -> Result<u16, Error> {
     for _ in 0..MAX_ATTEMPTS {
         match wire.count().await {
             Ok(0) | Err(DatagramError::Timeout { .. }) => {}
             Ok(count) => return Ok(count),
-            Err(source) => return Err(ServiceError::Segment { step: STEP, source }),
+            Err(error) => return Err(Error::from(Cause::Datagram(error)).during(STEP)),
         }
     }
-    Err(ServiceError::NoAnswer)
+    Err(Cause::NoAnswer.into())
 }
 
 /// Reads bytes of a device by its position.
 ///
 /// # Errors
-/// [`ServiceError::Silent`] if no device answers.
+/// [`Cause::Silent`] if no device answers.
 pub async fn at<const N: usize>(
     wire: &DatagramClient,
     position: u16,
     step: &'static str,
     register: u16,
-) -> Result<[u8; N], ServiceError> {
+) -> Result<[u8; N], Error> {
     let mut bytes = [0; N];
     match wire.read_at(position, register, &mut bytes).await {
         Ok(1) => Ok(bytes),
-        Ok(_) | Err(DatagramError::Timeout { .. }) => Err(ServiceError::Silent { position, step }),
-        Err(source) => Err(ServiceError::Segment { step, source }),
+        answer => Err(silent(position, step, answer)),
+    }
+}
+
+/// Returns the error of a device that should have answered.
+fn silent(position: u16, action: &'static str, answer: Result<u16, DatagramError>) -> Error {
+    match answer {
+        Ok(_) | Err(DatagramError::Timeout { .. }) => Cause::Silent { position, action }.into(),
+        Err(error) => Error::from(Cause::Datagram(error)).during(action),
     }
 }
 
@@ -189,11 +193,8 @@ pub async fn at<const N: usize>(
 /// theirs, because another program may be using it.
 ///
 /// # Errors
-/// [`ServiceError::Silent`] if a device does not accept its address.
-pub async fn address(
-    wire: &DatagramClient,
-    found: &mut [EnumeratedDevice],
-) -> Result<(), ServiceError> {
+/// [`Cause::Silent`] if a device does not accept its address.
+pub async fn address(wire: &DatagramClient, found: &mut [EnumeratedDevice]) -> Result<(), Error> {
     const STEP: &str = "giving out station addresses";
     let mut taken: Vec<u16> = Vec::with_capacity(found.len());
     let mut without = Vec::new();
@@ -218,13 +219,7 @@ pub async fn address(
             .await
         {
             Ok(1) => {}
-            Ok(_) | Err(DatagramError::Timeout { .. }) => {
-                return Err(ServiceError::Silent {
-                    position,
-                    step: STEP,
-                });
-            }
-            Err(source) => return Err(ServiceError::Segment { step: STEP, source }),
+            answer => return Err(silent(position, STEP, answer)),
         }
         device.station = next;
         taken.push(next);

@@ -5,9 +5,9 @@ use std::ops::Range;
 
 use ecaxis_esi::sii::checksum;
 
-use super::ServiceError;
 use super::eeprom::{Eeprom, EepromError};
 use crate::mailbox::MailboxTransport;
+use crate::report::Error;
 
 /// The length in bytes of the area that the controller loads by itself, including its checksum.
 const CONFIGURATION: usize = 16;
@@ -70,7 +70,7 @@ pub fn with_category(image: &[u8], kind: u16, data: &[u8]) -> Option<Vec<u8>> {
 #[derive(Debug, thiserror::Error)]
 #[error("{source}{}", self.remaining_state())]
 pub struct WriteError {
-    pub source: ServiceError,
+    pub source: Error,
     /// The number of words written.
     pub written: usize,
     /// The number of words to write.
@@ -95,7 +95,7 @@ impl WriteError {
 ///
 /// # Errors
 /// [`EepromError::Smaller`] before anything is written; [`EepromError::NotKept`] if a word reads
-/// back differently; [`ServiceError::Stopped`] before the first word; otherwise as
+/// back differently; [`Cause::Interrupted`] before the first word; otherwise as
 /// [`Eeprom::write`].
 pub async fn write<W: MailboxTransport>(
     eeprom: &Eeprom<'_, W>,

@@ -6,10 +6,11 @@ use ecaxis_ecat::registers;
 use ecaxis_esi::model::SmUse;
 use ecaxis_esi::sii::{MailboxAreas, Sii};
 
-use super::{Registers, ServiceError};
+use super::Registers;
 use crate::acyclic::al::{self, AlState};
 use crate::acyclic::{DeviceRef, StateError};
 use crate::mailbox::{CoeClient, MailboxLayout, MailboxTransport};
+use crate::report::{Cause, Error};
 
 /// The control bytes of mailboxes: one buffer each. The MainDevice writes one, with an interrupt to
 /// the device, and reads the other.
@@ -33,24 +34,20 @@ pub struct MailboxSession {
 /// EEPROM.
 ///
 /// # Errors
-/// [`ServiceError::NoMailbox`], [`ServiceError::WrongState`] in Bootstrap, [`ServiceError::State`]
+/// [`Cause::NoMailbox`], [`Cause::WrongState`] in Bootstrap, [`Cause::State`]
 /// if the device refuses PreOp.
 pub async fn open(
     wire: &impl MailboxTransport,
     device: &DeviceRef,
     sii: &Sii,
-) -> Result<MailboxSession, ServiceError> {
+) -> Result<MailboxSession, Error> {
     let registers = Registers {
         wire,
         device,
         step: "opening the mailbox",
     };
     let status = al::read_status(wire, device.station).await;
-    let status = status.map_err(|source| ServiceError::Wire {
-        device: device.clone(),
-        step: registers.step,
-        source,
-    })?;
+    let status = status.map_err(|error| registers.failed(Cause::Datagram(error)))?;
     let found = status.map_or(AlState::Unknown(0), |(status, _)| {
         AlState::from_status(status)
     });
@@ -64,19 +61,14 @@ pub async fn open(
             let there = al::change_state(wire, devices, AlState::PreOp, PRE_OP_TIMEOUT).await;
             if let Err(error) = there {
                 // After a timeout the device may still change its state later.
-                if !matches!(error, StateError::Refused { .. }) {
+                if !matches!(*error.cause, Cause::State(StateError::Refused { .. })) {
                     let _ = al::change_state(wire, devices, AlState::Init, al::BACK_TIMEOUT).await;
                 }
-                return Err(error.into());
+                return Err(error);
             }
             CoeClient::new(layout)
         }
-        state => {
-            return Err(ServiceError::WrongState {
-                device: device.clone(),
-                state: state.to_string(),
-            });
-        }
+        state => return Err(Cause::WrongState { state }.at(device)),
     };
     Ok(MailboxSession {
         coe,
@@ -89,8 +81,8 @@ impl MailboxSession {
     /// Returns the device to Init if it came from there.
     ///
     /// # Errors
-    /// [`ServiceError::State`] if the device does not change its state.
-    pub async fn close(self, wire: &impl MailboxTransport) -> Result<(), ServiceError> {
+    /// [`Cause::State`] if the device does not change its state.
+    pub async fn close(self, wire: &impl MailboxTransport) -> Result<(), Error> {
         if self.found == AlState::Init {
             let devices = std::slice::from_ref(&self.device);
             al::change_state(wire, devices, AlState::Init, al::BACK_TIMEOUT).await?;
@@ -102,7 +94,7 @@ impl MailboxSession {
 /// Returns the mailbox layout from SyncManagers 0 and 1.
 async fn configured<W: MailboxTransport>(
     registers: &Registers<'_, W>,
-) -> Result<MailboxLayout, ServiceError> {
+) -> Result<MailboxLayout, Error> {
     let out: [u8; 8] = registers.read(registers::SYNC_MANAGER).await?;
     let inp: [u8; 8] = registers.read(registers::SYNC_MANAGER + 8).await?;
     let area = |sm: [u8; 8]| {
@@ -120,21 +112,19 @@ async fn configured<W: MailboxTransport>(
             out_sm: 0,
             in_sm: 1,
         }),
-        _ => Err(ServiceError::NoMailbox {
-            device: registers.device.clone(),
-        }),
+        _ => Err(Cause::NoMailbox.at(registers.device)),
     }
 }
 
 /// Configures SyncManagers 0 and 1 for mailboxes in these areas. The device must be in Init.
 ///
 /// # Errors
-/// [`ServiceError::NoMailbox`] if an area is empty.
+/// [`Cause::NoMailbox`] if an area is empty.
 pub async fn configure<W: MailboxTransport>(
     registers: &Registers<'_, W>,
     sii: &Sii,
     areas: MailboxAreas,
-) -> Result<MailboxLayout, ServiceError> {
+) -> Result<MailboxLayout, Error> {
     let MailboxAreas {
         receive_offset,
         receive_size,
@@ -142,9 +132,7 @@ pub async fn configure<W: MailboxTransport>(
         send_size,
     } = areas;
     if receive_size == 0 || send_size == 0 {
-        return Err(ServiceError::NoMailbox {
-            device: registers.device.clone(),
-        });
+        return Err(Cause::NoMailbox.at(registers.device));
     }
     let control = |usage: SmUse, usual: u8| {
         let sm = sii.sync_managers.iter().find(|sm| sm.usage == usage);

@@ -14,9 +14,8 @@
 
 use std::fmt;
 
-use ecaxis_esi::sii::SiiError;
-
-use crate::mailbox::{DatagramError, InfoError, MailboxTransport, SdoError};
+use crate::mailbox::{DatagramError, MailboxTransport};
+use crate::report::{Cause, Error};
 
 pub use crate::datagram::DatagramClient;
 pub use al::{AlState, StateError};
@@ -49,67 +48,6 @@ impl fmt::Display for DeviceRef {
     }
 }
 
-/// An error of an operation on a device.
-#[derive(Debug, thiserror::Error)]
-pub enum ServiceError {
-    #[error("no SubDevice answers")]
-    NoAnswer,
-    #[error("the SubDevice at position {position} stopped answering while {step}")]
-    Silent { position: u16, step: &'static str },
-    #[error("{step}: {source}")]
-    Segment {
-        step: &'static str,
-        source: DatagramError,
-    },
-    #[error("no SubDevice has {wanted}; {found}")]
-    NotFound { wanted: String, found: String },
-    #[error("{count} SubDevices have {wanted}: at positions {positions}")]
-    Ambiguous {
-        wanted: String,
-        count: usize,
-        positions: String,
-    },
-    #[error("{device}: {step}: {source}")]
-    Wire {
-        device: DeviceRef,
-        step: &'static str,
-        source: DatagramError,
-    },
-    #[error("{device}: {step}: register 0x{register:04x} is not answered")]
-    NotTaken {
-        device: DeviceRef,
-        step: &'static str,
-        register: u16,
-    },
-    #[error("{device}: {step}: {source}")]
-    Eeprom {
-        device: DeviceRef,
-        step: &'static str,
-        source: eeprom::EepromError,
-    },
-    #[error("{device}: its EEPROM: {source}")]
-    Sii { device: DeviceRef, source: SiiError },
-    #[error("{device}: the EEPROM says nothing of a mailbox")]
-    NoMailbox { device: DeviceRef },
-    #[error("{device}: is in {state}, where it has no CoE mailbox")]
-    WrongState { device: DeviceRef, state: String },
-    /// The user stopped the operation. Changed states have been restored.
-    #[error("{device}: {step}: interrupted")]
-    Stopped {
-        device: DeviceRef,
-        step: &'static str,
-    },
-    #[error("{device}: {source}")]
-    Sdo { device: DeviceRef, source: SdoError },
-    #[error("{device}: {source}")]
-    Information {
-        device: DeviceRef,
-        source: Box<InfoError>,
-    },
-    #[error(transparent)]
-    State(#[from] StateError),
-}
-
 /// The registers of a device. Every error names the device.
 #[derive(Debug)]
 pub struct Registers<'a, W> {
@@ -123,8 +61,8 @@ impl<W: MailboxTransport> Registers<'_, W> {
     /// Reads a register.
     ///
     /// # Errors
-    /// [`ServiceError::Wire`], [`ServiceError::NotTaken`].
-    pub async fn read<const N: usize>(&self, register: u16) -> Result<[u8; N], ServiceError> {
+    /// [`Cause::Datagram`], [`Cause::NotTaken`].
+    pub async fn read<const N: usize>(&self, register: u16) -> Result<[u8; N], Error> {
         let mut bytes = [0; N];
         let answer = self
             .wire
@@ -137,25 +75,22 @@ impl<W: MailboxTransport> Registers<'_, W> {
     ///
     /// # Errors
     /// As [`Registers::read`].
-    pub async fn write(&self, register: u16, bytes: &[u8]) -> Result<(), ServiceError> {
+    pub async fn write(&self, register: u16, bytes: &[u8]) -> Result<(), Error> {
         let answer = self.wire.write(self.device.station, register, bytes).await;
         self.taken(register, answer)
     }
 
-    fn taken(&self, register: u16, answer: Result<u16, DatagramError>) -> Result<(), ServiceError> {
-        let (device, step) = (self.device.clone(), self.step);
-        match answer {
-            Ok(1..) => Ok(()),
-            Ok(0) => Err(ServiceError::NotTaken {
-                device,
-                step,
-                register,
-            }),
-            Err(source) => Err(ServiceError::Wire {
-                device,
-                step,
-                source,
-            }),
-        }
+    fn taken(&self, register: u16, answer: Result<u16, DatagramError>) -> Result<(), Error> {
+        let cause = match answer {
+            Ok(1..) => return Ok(()),
+            Ok(0) => Cause::NotTaken { register },
+            Err(error) => Cause::Datagram(error),
+        };
+        Err(self.failed(cause))
+    }
+
+    /// Returns the error with this cause.
+    pub(crate) fn failed(&self, cause: Cause) -> Error {
+        cause.at(self.device).during(self.step)
     }
 }

@@ -11,13 +11,13 @@ use super::device::{locate, read_sii, with_mailbox};
 use super::eeprom::{Eeprom, EepromAccess, EepromError, with_eeprom};
 use super::enumerate::{EnumeratedDevice, address, enumerate, select};
 use super::image::{WriteError, write};
-use super::{DatagramClient, ServiceError, mailbox};
+use super::{DatagramClient, mailbox};
 use crate::acyclic::{AlState, DeviceRef};
 use crate::clock::Clock;
 use crate::config::{self, Locator};
 use crate::link::sim::SimLink;
 use crate::mailbox::{DatagramError, MailboxTransport};
-use crate::report::Error;
+use crate::report::{Cause, Error};
 use crate::session::run_on_link;
 use crate::session::simulated_bus;
 
@@ -137,13 +137,8 @@ fn eeprom_of_the_pdi_is_claimed_only_by_force_and_released() {
             .await
             .expect("written");
         let refused = Eeprom::claim(&wire, &device, "reading", EepromAccess::IfFree).await;
-        assert!(matches!(
-            refused,
-            Err(ServiceError::Eeprom {
-                source: EepromError::InUse,
-                ..
-            })
-        ));
+        let error = refused.expect_err("in use");
+        assert!(matches!(*error.cause, Cause::Eeprom(EepromError::InUse)));
         let eeprom = Eeprom::claim(&wire, &device, "reading", EepromAccess::Force)
             .await
             .expect("taken");
@@ -338,24 +333,15 @@ fn with_mailbox_restores_the_device_when_stopped() {
             let sii = read_sii(&wire, &at, EepromAccess::of(found.state)).await?;
             let mut reached = 0;
             let step = "reading its parameters";
-            let all = with_mailbox(
-                &wire,
-                &at,
-                &sii,
-                step,
-                async |lent| -> Result<(), ServiceError> {
-                    loop {
-                        reached += 1;
-                        stop.store(reached >= 10, Ordering::Relaxed);
-                        let read = lent.coe.upload(&wire, 0x1018, 1, false).await;
-                        read.map_err(|source| ServiceError::Sdo {
-                            device: at.clone(),
-                            source,
-                        })?;
-                    }
-                },
-            );
-            let ended: Result<(), ServiceError> = all.await;
+            let all = with_mailbox(&wire, &at, &sii, step, async |lent| -> Result<(), Error> {
+                loop {
+                    reached += 1;
+                    stop.store(reached >= 10, Ordering::Relaxed);
+                    let read = lent.coe.upload(&wire, 0x1018, 1, false).await;
+                    read.map_err(|error| Cause::Sdo(error).at(&at))?;
+                }
+            });
+            let ended: Result<(), Error> = all.await;
             assert_eq!(reached, 10, "at once");
             ended
         };
@@ -384,7 +370,7 @@ fn with_eeprom_restores_access_when_stopped() {
         read.await
     });
     let error = done.expect("a report").expect_err("ended");
-    assert!(matches!(error, ServiceError::Stopped { .. }), "{error}");
+    assert!(error.is_interruption(), "{error}");
     assert!(
         error
             .to_string()
@@ -412,7 +398,7 @@ fn eeprom_write_completes_after_its_first_word() {
                 let image = changed(&eeprom.image(&mut |_, _| {}).await?);
                 let mut progress = |n, _| stop.store(n == stop_at, Ordering::Relaxed);
                 let written = write(eeprom, &image, &mut progress).await;
-                Ok::<_, ServiceError>((written.map_err(|e| e.to_string()), image))
+                Ok::<_, Error>((written.map_err(|e| e.to_string()), image))
             });
             written.await
         });
@@ -481,7 +467,7 @@ fn eeprom_write_error_reports_the_words_written() {
             let claim = EepromAccess::IfFree;
             let written = with_eeprom(&cut, &at, "writing its EEPROM", claim, async |eeprom| {
                 let image = changed(&eeprom.image(&mut |_, _| {}).await?);
-                Ok::<_, ServiceError>(write(eeprom, &image, &mut |_, _| {}).await)
+                Ok::<_, Error>(write(eeprom, &image, &mut |_, _| {}).await)
             });
             written.await
         });
@@ -507,7 +493,7 @@ fn eeprom_write_rejects_an_image_beyond_the_chip() {
                 let there = eeprom.all(&mut |_, _| {}).await?;
                 let mut image = changed(&there);
                 image.resize(there.len() + more, 0x5a);
-                Ok::<_, ServiceError>((there, write(eeprom, &image, &mut |_, _| {}).await))
+                Ok::<_, Error>((there, write(eeprom, &image, &mut |_, _| {}).await))
             });
             written.await
         });
@@ -515,7 +501,7 @@ fn eeprom_write_rejects_an_image_beyond_the_chip() {
         let error = failed.expect_err("no room");
         let smaller = EepromError::Smaller { bytes: there.len() };
         assert!(
-            matches!(&error.source, ServiceError::Eeprom { source, .. } if *source == smaller),
+            matches!(*error.source.cause, Cause::Eeprom(error) if error == smaller),
             "{error}"
         );
         assert_eq!(error.written, 0);
@@ -542,6 +528,6 @@ fn mailbox_open_restores_init_after_a_lost_frame() {
         mailbox::open(&lossy, &at, &sii).await.map(|_| ())
     });
     let error = done.expect("carried").expect_err("a frame was lost");
-    assert!(matches!(error, ServiceError::State(_)), "{error}");
+    assert!(matches!(*error.cause, Cause::State(_)), "{error}");
     assert_eq!(left, ("Init".to_owned(), 0));
 }

@@ -6,12 +6,13 @@
 //! Dc).
 
 use super::device::{read, write};
-use super::{BringUpError, BusDevice, Step};
-use crate::acyclic::{DeviceRef, ServiceError};
+use super::{BusDevice, Step};
+use crate::acyclic::DeviceRef;
 use crate::clock::Nanos;
 use crate::config::Machine;
 use crate::datagram::DatagramClient;
 use crate::mailbox::MailboxTransport;
+use crate::report::{Cause, Error};
 use crate::rt::phase::ClockPlan;
 use ecaxis_ecat::registers;
 
@@ -31,7 +32,7 @@ pub(super) async fn configure(
     machine: &Machine,
     devices: &[BusDevice],
     progress: &mut dyn FnMut(Step),
-) -> Result<Option<ClockPlan>, BringUpError> {
+) -> Result<Option<ClockPlan>, Error> {
     let wanting: Vec<_> = machine
         .devices
         .iter()
@@ -39,9 +40,7 @@ pub(super) async fn configure(
         .filter_map(|(config, device)| Some((config.selection.dc.as_ref()?, device)))
         .collect();
     if let Some((_, device)) = wanting.iter().find(|(_, device)| !device.dc) {
-        return Err(BringUpError::NoClock {
-            device: device.at.clone(),
-        });
+        return Err(Cause::NoClock.at(&device.at));
     }
     let reference = devices
         .iter()
@@ -90,9 +89,7 @@ pub(super) async fn configure(
         }
         ahead *= 2;
     }
-    Err(BringUpError::NoStart {
-        device: reference.at.clone(),
-    })
+    Err(Cause::NoStart.at(&reference.at))
 }
 
 /// Stops SYNC0 and SYNC1 of devices that are back in PreOp or Init. Active pulses would indicate a
@@ -113,10 +110,7 @@ pub(crate) async fn stop(wire: &impl MailboxTransport, stations: impl Iterator<I
 /// Sets the clocks again, with the first device that has a system time as reference. ethercrab uses
 /// the first device with receive times. If that device has no system time, ethercrab has given all
 /// other devices a time of zero.
-pub(super) async fn set_again(
-    wire: &DatagramClient,
-    devices: &[BusDevice],
-) -> Result<(), BringUpError> {
+pub(super) async fn set_again(wire: &DatagramClient, devices: &[BusDevice]) -> Result<(), Error> {
     const STEP: &str = "setting the clocks";
     /// The value after reset; writing it restarts the control loop at the frequency of the
     /// oscillator.
@@ -139,11 +133,7 @@ pub(super) async fn set_again(
         write(wire, at, STEP, registers::DC_SPEED_COUNTER_START, &start).await?;
         write(wire, at, STEP, registers::DC_SYSTEM_TIME_DELAY, &delay).await?;
     }
-    let failed = |source| ServiceError::Wire {
-        device: reference.at.clone(),
-        step: STEP,
-        source,
-    };
+    let failed = |error| Cause::Datagram(error).at(&reference.at).during(STEP);
     wire.write_all(registers::DC_RECEIVE_TIME, &[0; 4])
         .await
         .map_err(failed)?;
@@ -178,22 +168,15 @@ pub(super) async fn set_again(
 pub(super) async fn has_system_time(
     wire: &impl MailboxTransport,
     at: &DeviceRef,
-) -> Result<bool, BringUpError> {
+) -> Result<bool, Error> {
     let counter = wire
         .read(at.station, registers::DC_SYSTEM_TIME, &mut [0; 8])
         .await;
-    let counter = counter.map_err(|source| ServiceError::Wire {
-        device: at.clone(),
-        step: STEP,
-        source,
-    })?;
+    let counter = counter.map_err(|error| Cause::Datagram(error).at(at).during(STEP))?;
     Ok(counter > 0)
 }
 
-async fn system_time(
-    wire: &impl MailboxTransport,
-    reference: &BusDevice,
-) -> Result<u64, BringUpError> {
+async fn system_time(wire: &impl MailboxTransport, reference: &BusDevice) -> Result<u64, Error> {
     let time = read(wire, &reference.at, STEP, registers::DC_SYSTEM_TIME).await?;
     Ok(u64::from_le_bytes(time))
 }

@@ -4,10 +4,11 @@ use ecaxis_ecat::registers;
 use ecaxis_esi::layout::SmLayout;
 use ecaxis_esi::{StartupSdo, address};
 
-use super::{BringUpError, BusDevice, Step};
+use super::{BusDevice, Step};
 use crate::acyclic::{DeviceRef, Registers};
 use crate::config::{DeviceConfig, StartupOptions};
 use crate::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, object_name};
+use crate::report::{Cause, Error};
 use crate::rt::image::DeviceRegion;
 
 const FMMU_SIZE: u16 = 16;
@@ -32,7 +33,7 @@ pub(super) async fn start_up(
     device: &mut BusDevice,
     moment: StartupPhase,
     progress: &mut dyn FnMut(Step),
-) -> Result<(), BringUpError> {
+) -> Result<(), Error> {
     let due = |transition: &str| (transition == "SO") == (moment == StartupPhase::InSafeOp);
     let list: Vec<_> = config
         .selection
@@ -46,10 +47,10 @@ pub(super) async fn start_up(
     let Some(coe) = device.coe.as_mut() else {
         return Ok(());
     };
-    coe.drain(wire).await.map_err(|source| BringUpError::Sdo {
-        device: device.at.clone(),
-        step: "emptying the mailbox",
-        source,
+    coe.drain(wire).await.map_err(|source| {
+        Cause::Sdo(source)
+            .at(&device.at)
+            .during("emptying the mailbox")
     })?;
     let mut held = 0;
     for (done, sdo) in list.iter().enumerate() {
@@ -101,7 +102,7 @@ pub async fn write_startup_sdo(
     coe: &mut CoeClient,
     sdo: &StartupSdo,
     way: StartupOptions,
-) -> Result<SdoOutcome, BringUpError> {
+) -> Result<SdoOutcome, Error> {
     if way.skip_equal
         && let Some(now) = read_back(wire, at, coe, sdo).await?
         && holds(sdo, &now)
@@ -116,13 +117,13 @@ pub async fn write_startup_sdo(
     match read_back(wire, at, coe, sdo).await? {
         None => Ok(SdoOutcome::Unreadable),
         Some(now) if holds(sdo, &now) => Ok(SdoOutcome::Written),
-        Some(now) => Err(BringUpError::NotHeld {
-            device: at.clone(),
+        Some(now) => Err(Cause::NotHeld {
             object: object(sdo),
             value: format_value(&sdo.data),
             origin: sdo.origin.clone(),
             holds: format_value(&now),
-        }),
+        }
+        .at(at)),
     }
 }
 
@@ -132,7 +133,7 @@ async fn read_back(
     at: &DeviceRef,
     coe: &mut CoeClient,
     sdo: &StartupSdo,
-) -> Result<Option<Vec<u8>>, BringUpError> {
+) -> Result<Option<Vec<u8>>, Error> {
     coe.upload_optional(wire, sdo.index, sdo.sub, sdo.complete_access)
         .await
         .map_err(|source| failed(at, sdo, source))
@@ -156,14 +157,13 @@ fn object(sdo: &StartupSdo) -> String {
     format!("{} ({})", address(index, sub), sdo.name)
 }
 
-fn failed(at: &DeviceRef, sdo: &StartupSdo, source: SdoError) -> BringUpError {
+fn failed(at: &DeviceRef, sdo: &StartupSdo, source: SdoError) -> Error {
     let known = || {
         object_name(sdo.index, sdo.sub)
             .unwrap_or_default()
             .to_owned()
     };
-    BringUpError::StartUp {
-        device: at.clone(),
+    Cause::StartUp {
         index: sdo.index,
         sub: sdo.sub,
         name: if sdo.name.is_empty() {
@@ -175,6 +175,7 @@ fn failed(at: &DeviceRef, sdo: &StartupSdo, source: SdoError) -> BringUpError {
         origin: sdo.origin.clone(),
         source,
     }
+    .at(at)
 }
 
 /// Downloads one start-up SDO.
@@ -183,7 +184,7 @@ pub(super) async fn download(
     at: &DeviceRef,
     coe: &mut CoeClient,
     sdo: &StartupSdo,
-) -> Result<(), BringUpError> {
+) -> Result<(), Error> {
     coe.download(wire, sdo.index, sdo.sub, sdo.complete_access, &sdo.data)
         .await
         .map_err(|source| failed(at, sdo, source))?;
@@ -215,7 +216,7 @@ pub(super) async fn map_process_data(
     device: &BusDevice,
     region: Option<DeviceRegion>,
     status: Option<u32>,
-) -> Result<(), BringUpError> {
+) -> Result<(), Error> {
     const READ: u8 = 1;
     const WRITE: u8 = 2;
 
@@ -271,9 +272,9 @@ pub(super) async fn write(
     step: &'static str,
     register: u16,
     data: &[u8],
-) -> Result<(), BringUpError> {
+) -> Result<(), Error> {
     let registers = Registers { wire, device, step };
-    Ok(registers.write(register, data).await?)
+    registers.write(register, data).await
 }
 
 /// Reads a register; fails if the device does not answer.
@@ -282,7 +283,7 @@ pub(super) async fn read<const N: usize>(
     device: &DeviceRef,
     step: &'static str,
     register: u16,
-) -> Result<[u8; N], BringUpError> {
+) -> Result<[u8; N], Error> {
     let registers = Registers { wire, device, step };
-    Ok(registers.read(register).await?)
+    registers.read(register).await
 }

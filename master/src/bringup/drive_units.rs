@@ -3,9 +3,10 @@
 
 use ecaxis_axis::scale::DriveUnits;
 
-use super::{BringUpError, BusDevice, Step, device};
+use super::{BusDevice, Step, device};
 use crate::config::{DeviceConfig, TorqueUnit, is_maxon};
 use crate::mailbox::{CoeClient, MailboxTransport, SdoError};
+use crate::report::{Cause, Error};
 
 /// Adopts the drive's units where the configuration only assumed them. Rejects units that would
 /// move the axis wrongly.
@@ -14,27 +15,25 @@ pub(super) async fn compare(
     config: &DeviceConfig,
     device: &mut BusDevice,
     progress: &mut dyn FnMut(Step),
-) -> Result<(), BringUpError> {
+) -> Result<(), Error> {
     let (Some(axis), Some(coe)) = (&config.axis, device.coe.as_mut()) else {
         return Ok(());
     };
     let torque = &axis.torque;
     let constant = torque.unit == TorqueUnit::Amperes || torque.constant.is_some();
     let constant = constant && is_maxon(&config.selection);
-    let offered = ask(wire, coe, constant)
-        .await
-        .map_err(|source| BringUpError::Sdo {
-            device: device.at.clone(),
-            step: "reading the drive's units",
-            source,
-        })?;
+    let offered = ask(wire, coe, constant).await.map_err(|source| {
+        Cause::Sdo(source)
+            .at(&device.at)
+            .during("reading the drive's units")
+    })?;
     tracing::debug!(device = %device.at, "{offered:?}");
     let adopted = axis.adopt(&offered);
     if !adopted.wrong.is_empty() {
-        return Err(BringUpError::Units {
-            device: device.at.clone(),
+        return Err(Cause::Units {
             problems: adopted.wrong,
-        });
+        }
+        .at(&device.at));
     }
     for what in &adopted.taken {
         progress(Step::Adopted {

@@ -4,11 +4,12 @@ use ecaxis_esi::model::Identity;
 use ethercrab::error::{Error, TimeoutError};
 use ethercrab::{MainDevice, SubDeviceIdentity};
 
-use super::{BringUpError, Group, Step, scan_error};
+use super::{Group, Step, scan_error};
 use crate::acyclic::enumerate::{EnumeratedDevice, FIRST_STATION, count, read_device};
-use crate::acyclic::{DeviceRef, ServiceError, al};
+use crate::acyclic::{DeviceRef, al};
 use crate::config::{DeviceConfig, Locator, Machine};
 use crate::datagram::DatagramClient;
+use crate::report::{self, Cause};
 
 /// A scanned SubDevice.
 struct ScannedDevice {
@@ -23,9 +24,9 @@ pub(super) async fn explain_scan(
     wire: &DatagramClient,
     machine: &Machine,
     error: Error,
-) -> BringUpError {
+) -> report::Error {
     let Ok(count) = count(wire).await else {
-        return ServiceError::NoAnswer.into();
+        return Cause::NoAnswer.into();
     };
     let (mut behind, mut unaddressed) = (None, None);
     for position in 0..count {
@@ -37,7 +38,7 @@ pub(super) async fn explain_scan(
         let found = match read_device(wire, position).await {
             Ok(found) => found,
             // It was counted, but no longer answers.
-            Err(ServiceError::Silent { .. }) => {
+            Err(error) if matches!(*error.cause, Cause::Silent { .. }) => {
                 unaddressed.get_or_insert(device);
                 continue;
             }
@@ -49,38 +50,33 @@ pub(super) async fn explain_scan(
             unaddressed.get_or_insert(device);
         } else if found.error && (code != 0 || !al::emulated(wire, device.station).await) {
             let refused = al::StateError::Refused {
-                device,
                 wanted: al::AlState::PreOp,
                 actual: state,
                 code,
             };
-            return refused.into();
+            return refused.at(&device);
         } else if state != al::AlState::PreOp && behind.is_none() {
             behind = Some((device, state));
         }
     }
     if let Some(device) = unaddressed {
         let wanted = al::AlState::PreOp;
-        return al::StateError::Gone { device, wanted }.into();
+        return al::StateError::Gone { wanted }.at(&device);
     }
     let missing = positions(machine).filter(|(position, _)| *position >= count);
     let missing: Vec<_> = missing.map(named).collect();
     if !missing.is_empty() {
-        return BringUpError::Missing {
-            expected: machine.devices.len(),
-            found: usize::from(count),
-            missing,
-        };
+        let found = usize::from(count);
+        return not_all(machine, found, missing);
     }
     match (error, behind) {
         (Error::Timeout(TimeoutError::StateTransition), Some((device, actual))) => {
             let timeout = al::StateError::Timeout {
-                device,
                 wanted: al::AlState::PreOp,
                 actual,
                 timeout: crate::link::pdu_loop::STATE_TIMEOUT,
             };
-            timeout.into()
+            timeout.at(&device)
         }
         (error, _) => scan_error("scanning the segment and going to PreOp", &error),
     }
@@ -103,7 +99,7 @@ pub(super) async fn assign(
     group: &Group,
     machine: &Machine,
     progress: &mut dyn FnMut(Step),
-) -> Result<Vec<u16>, BringUpError> {
+) -> Result<Vec<u16>, report::Error> {
     let mut found = Vec::with_capacity(group.len());
     for sub_device in group.iter(main_device) {
         found.push(ScannedDevice {
@@ -143,11 +139,8 @@ pub(super) async fn assign(
         }
     }
     if missing {
-        return Err(BringUpError::Missing {
-            expected: machine.devices.len(),
-            found: found.len(),
-            missing: missing_devices(machine, &found),
-        });
+        let missing = missing_devices(machine, &found);
+        return Err(not_all(machine, found.len(), missing));
     }
 
     for (config, &position) in machine.devices.iter().zip(&order) {
@@ -166,13 +159,13 @@ pub(super) async fn assign(
         let product = (expected.vendor, expected.product) == (identity.vendor, identity.product);
         let rule = config.identity;
         if !product || !rule.accepts(expected.revision, identity.revision) {
-            return Err(BringUpError::Identity {
-                device: device(),
+            return Err(Cause::Identity {
                 esi: config.esi_path.display().to_string(),
                 expected: format!("{} ({expected})", config.selection.device_name),
                 found: known(machine, identity),
                 revisions: product.then_some((expected.revision, identity.revision)),
-            });
+            }
+            .at(device()));
         }
         if expected.revision != identity.revision {
             let at = device();
@@ -182,20 +175,18 @@ pub(super) async fn assign(
             )));
         }
         if let Some(expected) = config.serial.filter(|expected| *expected != serial) {
-            return Err(BringUpError::Serial {
-                device: device(),
+            return Err(Cause::Serial {
                 expected,
                 found: serial,
-            });
+            }
+            .at(device()));
         }
     }
     for (position, ScannedDevice { identity, .. }) in found.iter().enumerate() {
         let position = u16::try_from(position).unwrap_or(u16::MAX);
         if !order.contains(&position) {
-            return Err(BringUpError::Unexpected {
-                position,
-                identity: known(machine, *identity),
-            });
+            let identity = known(machine, *identity);
+            return Err(Cause::Unexpected { position, identity }.into());
         }
     }
     Ok(order)
@@ -252,11 +243,18 @@ fn lacking<T: PartialEq>(wanted: &[T], there: &[T]) -> Vec<usize> {
     }
 }
 
-fn not_located(name: &str, locator: String) -> BringUpError {
-    BringUpError::NotLocated {
-        name: name.to_owned(),
-        locator,
-    }
+fn not_located(name: &str, locator: String) -> report::Error {
+    Cause::NotLocated { locator }.at_name(name)
+}
+
+fn not_all(machine: &Machine, found: usize, missing: Vec<String>) -> report::Error {
+    let expected = machine.devices.len();
+    let cause = Cause::Missing {
+        expected,
+        found,
+        missing,
+    };
+    cause.into()
 }
 
 fn identity(from: SubDeviceIdentity) -> Identity {

@@ -3,24 +3,25 @@
 
 use ecaxis_esi::StartupSdo;
 
-use super::{BringUpError, BusDevice, Step, device};
+use super::{BusDevice, Step, device};
 use crate::config::DeviceConfig;
 use crate::config::drive_limits::{OFFSETS, speed_unit};
 use crate::mailbox::{MailboxTransport, NamedObject};
+use crate::report::{Cause, Error};
 
 pub(super) async fn compare(
     wire: &impl MailboxTransport,
     config: &DeviceConfig,
     device: &mut BusDevice,
     progress: &mut dyn FnMut(Step),
-) -> Result<(), BringUpError> {
+) -> Result<(), Error> {
     let (Some(axis), Some(coe)) = (&config.axis, device.coe.as_mut()) else {
         return Ok(());
     };
-    let failed = |source| BringUpError::Sdo {
-        device: device.at.clone(),
-        step: "reading the drive's limits",
-        source,
+    let failed = |source| {
+        Cause::Sdo(source)
+            .at(&device.at)
+            .during("reading the drive's limits")
     };
     let selection = &config.selection;
     let dictionary = &selection.dictionary;

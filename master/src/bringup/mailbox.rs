@@ -4,18 +4,18 @@
 use ecaxis_ecat::registers;
 use ecaxis_esi::model::SmUse;
 
-use super::BringUpError;
 use super::device::read;
 use crate::acyclic::DeviceRef;
 use crate::config::DeviceConfig;
 use crate::mailbox::{MailboxLayout, MailboxTransport};
+use crate::report::{Cause, Error};
 
 /// Returns `None` if the ESI declares no CoE mailbox.
 pub(super) async fn open(
     wire: &impl MailboxTransport,
     config: &DeviceConfig,
     device: &DeviceRef,
-) -> Result<Option<MailboxLayout>, BringUpError> {
+) -> Result<Option<MailboxLayout>, Error> {
     let coe = config.device.mailbox.as_ref().and_then(|m| m.coe.as_ref());
     let (true, Some((out_sm, out)), Some((in_sm, inp))) = (
         coe.is_some(),
@@ -31,11 +31,11 @@ pub(super) async fn open(
         let actual = (u16::from_le_bytes([a0, a1]), u16::from_le_bytes([l0, l1]));
         if actual != expected {
             let show = |(address, len): (u16, u16)| format!("0x{address:04x}, {len} bytes");
-            return Err(BringUpError::MailboxMoved {
-                device: device.clone(),
+            return Err(Cause::MailboxMoved {
                 expected: show(expected),
                 actual: show(actual),
-            });
+            }
+            .at(device));
         }
     }
     Ok(Some(MailboxLayout {

@@ -3,9 +3,10 @@
 
 use ecaxis_esi::model::Pdo;
 
-use super::{BringUpError, BusDevice};
+use super::BusDevice;
 use crate::config::DeviceConfig;
 use crate::mailbox::MailboxTransport;
+use crate::report::{Cause, Error};
 
 /// The PDO assignment of SyncManager n is 0x1C10 + n (ETG.1000.6, Table 67).
 const ASSIGNMENT: u16 = 0x1c10;
@@ -14,7 +15,7 @@ pub(super) async fn compare(
     wire: &impl MailboxTransport,
     config: &DeviceConfig,
     device: &mut BusDevice,
-) -> Result<(), BringUpError> {
+) -> Result<(), Error> {
     let selection = &config.selection;
     for (sms, pdos) in [
         (&selection.layout.outputs, &selection.rx),
@@ -52,7 +53,7 @@ async fn compare_contents(
     wire: &impl MailboxTransport,
     device: &mut BusDevice,
     pdo: &Pdo,
-) -> Result<(), BringUpError> {
+) -> Result<(), Error> {
     let Some(actual) = read_list(wire, device, pdo.index).await? else {
         return Ok(());
     };
@@ -72,15 +73,15 @@ async fn read_list(
     wire: &impl MailboxTransport,
     device: &mut BusDevice,
     index: u16,
-) -> Result<Option<Vec<u32>>, BringUpError> {
+) -> Result<Option<Vec<u32>>, Error> {
     let Some(coe) = device.coe.as_mut() else {
         return Ok(None);
     };
     let list = coe.upload_list(wire, index).await;
-    list.map_err(|source| BringUpError::Sdo {
-        device: device.at.clone(),
-        step: "reading the PDO mapping back",
-        source,
+    list.map_err(|source| {
+        Cause::Sdo(source)
+            .at(&device.at)
+            .during("reading the PDO mapping back")
     })
 }
 
@@ -91,18 +92,18 @@ fn differs(
     expected: Option<u32>,
     actual: Option<u32>,
     digits: usize,
-) -> BringUpError {
+) -> Error {
     let show = |value: Option<u32>| {
         value.map_or_else(
             || "nothing".to_owned(),
             |value| format!("0x{value:0digits$x}"),
         )
     };
-    BringUpError::Mapping {
-        device: device.at.clone(),
+    Cause::Mapping {
         index,
         sub: u8::try_from(place + 1).unwrap_or(u8::MAX),
         expected: show(expected),
         actual: show(actual),
     }
+    .at(&device.at)
 }

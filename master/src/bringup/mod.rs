@@ -16,14 +16,13 @@ use std::fmt;
 use ecaxis_ecat::registers;
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
-use ecaxis_esi::address;
-
-use crate::acyclic::{AlState, DeviceRef, ServiceError, StateError, al, enumerate};
+use crate::acyclic::{AlState, DeviceRef, al, enumerate};
 use crate::clock;
-use crate::config::{AdoptedUnits, LimitConflict, MAX_SUBDEVICES, Machine, UnitProblem};
+use crate::config::{AdoptedUnits, LimitConflict, MAX_SUBDEVICES, Machine};
 use crate::datagram::DatagramClient;
+use crate::mailbox::CoeClient;
 use crate::mailbox::worker::EmergencySink;
-use crate::mailbox::{CoeClient, SdoError};
+use crate::report::{Cause, Error};
 use crate::rt::image::{self, ImagePlan};
 use crate::rt::phase::ClockPlan;
 use crate::text::pluralize;
@@ -155,136 +154,6 @@ impl fmt::Display for Step {
     }
 }
 
-/// Returns the first names of a list, and how many follow.
-fn few(names: &[String]) -> String {
-    const FEW: usize = 3;
-    let first = names.iter().take(FEW).map(String::as_str);
-    let text = first.collect::<Vec<_>>().join(", ");
-    match names.len().saturating_sub(FEW) {
-        0 => text,
-        more => format!("{text} and {more} more"),
-    }
-}
-
-/// Why the bring-up failed.
-#[derive(Debug, thiserror::Error)]
-pub enum BringUpError {
-    #[error("{step}: {message}")]
-    Scan { step: &'static str, message: String },
-    #[error(
-        "scanning: {} of {expected} {}; missing: {}",
-        found, if *found == 1 { "SubDevice answers" } else { "SubDevices answer" }, few(missing)
-    )]
-    Missing {
-        expected: usize,
-        found: usize,
-        /// Names with positions, in the order of the segment.
-        missing: Vec<String>,
-    },
-    #[error("the SubDevice at position {position} ({identity}) is not in the machine file")]
-    Unexpected { position: u16, identity: String },
-    #[error("{device}: identify: the file `{esi}` describes {expected}, the device is {found}")]
-    Identity {
-        device: DeviceRef,
-        esi: String,
-        expected: String,
-        found: String,
-        /// The expected and the found revision, if nothing else differs.
-        revisions: Option<(u32, u32)>,
-    },
-    #[error(
-        "{device}: identify: the machine file names serial number {expected}, the device has {found}"
-    )]
-    Serial {
-        device: DeviceRef,
-        expected: u32,
-        found: u32,
-    },
-    #[error("`{name}`: no SubDevice has {locator}")]
-    NotLocated { name: String, locator: String },
-    #[error(
-        "{device}: start-up SDO {} {name} = {value} (from {origin}): {source}", address(*index, *sub)
-    )]
-    StartUp {
-        device: DeviceRef,
-        index: u16,
-        sub: u8,
-        name: String,
-        value: String,
-        origin: String,
-        source: SdoError,
-    },
-    /// `verify` in the machine file.
-    #[error(
-        "{device}: start-up SDO {object} = {value} (from {origin}) was taken, but the device holds {holds}"
-    )]
-    NotHeld {
-        device: DeviceRef,
-        object: String,
-        value: String,
-        origin: String,
-        holds: String,
-    },
-    #[error(
-        "{device}: reading the PDO mapping back: {} holds {actual}, the ESI's layout has {expected}", address(*index, *sub)
-    )]
-    Mapping {
-        device: DeviceRef,
-        index: u16,
-        sub: u8,
-        expected: String,
-        actual: String,
-    },
-    #[error(
-        "{device}: the drive's units are not those of the machine file: {}",
-        list(problems)
-    )]
-    Units {
-        device: DeviceRef,
-        problems: Vec<UnitProblem>,
-    },
-    #[error("{device}: {step}: {source}")]
-    Sdo {
-        device: DeviceRef,
-        step: &'static str,
-        source: SdoError,
-    },
-    #[error("{device}: {what}: register 0x{register:04x} holds {found}, wanted is {wanted}")]
-    Watchdog {
-        device: DeviceRef,
-        what: &'static str,
-        register: u16,
-        wanted: String,
-        found: String,
-    },
-    #[error("{device}: the ESI asks for SYNC0, the device has no distributed clock")]
-    NoClock { device: DeviceRef },
-    #[error(
-        "{device}: starting SYNC0: writing the start time to all devices takes longer than the time until the start"
-    )]
-    NoStart { device: DeviceRef },
-    #[error("{device}: the mailbox is at {actual}, the ESI says {expected}")]
-    MailboxMoved {
-        device: DeviceRef,
-        expected: String,
-        actual: String,
-    },
-    /// Lost frames, registers without an answer, refused states.
-    #[error(transparent)]
-    Service(#[from] ServiceError),
-}
-
-impl From<StateError> for BringUpError {
-    fn from(error: StateError) -> Self {
-        Self::Service(error.into())
-    }
-}
-
-fn list(problems: &[UnitProblem]) -> String {
-    let each: Vec<String> = problems.iter().map(ToString::to_string).collect();
-    each.join("; ")
-}
-
 /// Brings the segment from any state to SafeOp. Passes emergencies of the devices to the listener,
 /// on success and on failure.
 pub async fn bring_up(
@@ -293,16 +162,15 @@ pub async fn bring_up(
     image: ImagePlan,
     progress: &mut dyn FnMut(Step),
     listener: &dyn EmergencySink,
-) -> Result<Bus, BringUpError> {
+) -> Result<Bus, Error> {
     let wire = DatagramClient::new(main_device);
     progress(Step::Scan);
-    enumerate::count(&wire).await.map_err(|error| match error {
-        ServiceError::Segment { source, .. } => BringUpError::Scan {
-            step: "scanning",
-            message: source.to_string(),
-        },
-        error => error.into(),
-    })?;
+    enumerate::count(&wire)
+        .await
+        .map_err(|error| match *error.cause {
+            Cause::Datagram(_) => error.during("scanning"),
+            _ => error,
+        })?;
 
     let group = match main_device
         .init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now)
@@ -377,7 +245,7 @@ async fn set_up(
     devices: &mut [BusDevice],
     progress: &mut dyn FnMut(Step),
     listener: &dyn EmergencySink,
-) -> Result<(ImagePlan, Option<ClockPlan>), BringUpError> {
+) -> Result<(ImagePlan, Option<ClockPlan>), Error> {
     for (config, device) in machine.devices.iter().zip(&mut *devices) {
         device::start_up(wire, config, device, StartupPhase::InPreOp, progress).await?;
         mapping::compare(wire, config, device).await?;
@@ -429,7 +297,7 @@ async fn without_lrw(
     wire: &DatagramClient,
     machine: &Machine,
     devices: &[BusDevice],
-) -> Result<Option<ImagePlan>, BringUpError> {
+) -> Result<Option<ImagePlan>, Error> {
     const NO_LRW: u16 = 1 << 9;
     let mut process_data = image::process_data(machine);
     let mut more = false;
@@ -445,11 +313,8 @@ async fn without_lrw(
     Ok(more.then(|| image::plan(&process_data).ok()).flatten())
 }
 
-fn scan_error(step: &'static str, error: &ethercrab::error::Error) -> BringUpError {
-    BringUpError::Scan {
-        step,
-        message: error.to_string(),
-    }
+fn scan_error(step: &'static str, error: &ethercrab::error::Error) -> Error {
+    Error::from(Cause::Scan(error.to_string())).during(step)
 }
 
 impl Bus {

@@ -7,9 +7,10 @@
 use ecaxis_esi::address;
 use ecaxis_esi::layout::Field;
 
-use super::{BringUpError, BusDevice};
+use super::BusDevice;
 use crate::config::{DeviceConfig, further_axis};
 use crate::mailbox::MailboxTransport;
+use crate::report::{Cause, Error};
 
 /// Objects for which zero is a normal value, or the only safe one.
 const ZERO_IS_SAFE: [u16; 11] = [
@@ -31,7 +32,7 @@ pub(super) async fn read(
     wire: &impl MailboxTransport,
     config: &DeviceConfig,
     device: &mut BusDevice,
-) -> Result<(), BringUpError> {
+) -> Result<(), Error> {
     if config.axis.is_none() {
         return Ok(());
     }
@@ -42,10 +43,10 @@ pub(super) async fn read(
         };
         let (index, sub) = (field.index, field.sub);
         let data = coe.upload_optional(wire, index, sub, false).await;
-        let data = data.map_err(|source| BringUpError::Sdo {
-            device: device.at.clone(),
-            step: "reading the values of its outputs",
-            source,
+        let data = data.map_err(|source| {
+            Cause::Sdo(source)
+                .at(&device.at)
+                .during("reading the values of its outputs")
         })?;
         // If an object cannot be read over CoE, the ESI's value is used.
         let data = data.unwrap_or_else(|| {

@@ -2,10 +2,10 @@
 //! leaves Op by itself. The settings of a drive's watchdog are read back: without the watchdog,
 //! nothing stops the drive if this host fails.
 
-use super::{BringUpError, BusDevice, Step};
-use crate::acyclic::ServiceError;
+use super::{BusDevice, Step};
 use crate::config::{Bus, DeviceConfig};
 use crate::mailbox::{DatagramError, MailboxTransport};
+use crate::report::{Cause, Error};
 use ecaxis_ecat::registers;
 
 /// ControlByte of a SyncManager, and its bit 6: writing its area triggers the watchdog.
@@ -24,7 +24,7 @@ pub(super) async fn set(
     config: &DeviceConfig,
     device: &BusDevice,
     progress: &mut dyn FnMut(Step),
-) -> Result<(), BringUpError> {
+) -> Result<(), Error> {
     let has_axis = config.axis.is_some();
     let outputs = &config.selection.layout.outputs;
     let is_watched = outputs.iter().any(|sm| sm.control_byte & TRIGGER != 0);
@@ -50,15 +50,15 @@ pub(super) async fn set(
         let written = wire.write(at, register, &wanted).await;
         written.map_err(|source| lost(device, source))?;
         let found: Option<[u8; 2]> = read(wire, device, register).await?;
-        let differs = BringUpError::Watchdog {
-            device: device.at.clone(),
-            what,
+        let differs = Cause::Watchdog {
             register,
             wanted: format!("0x{value:04x}"),
             found: found.map_or("nothing".to_owned(), |found| {
                 format!("0x{:04x}", u16::from_le_bytes(found))
             }),
-        };
+        }
+        .at(&device.at)
+        .during(what);
         if found == Some(wanted) {
             continue;
         }
@@ -80,13 +80,13 @@ pub(super) async fn set(
             registers::SYNC_MANAGER + registers::SYNC_MANAGER_LEN * u16::from(sm.sm) + CONTROL;
         let found: Option<[u8; 1]> = read(wire, device, register).await?;
         if found.is_none_or(|[control]| control & TRIGGER == 0) {
-            return Err(BringUpError::Watchdog {
-                device: device.at.clone(),
-                what: "the watchdog trigger of its outputs (bit 6 of the ControlByte)",
+            return Err(Cause::Watchdog {
                 register,
                 wanted: format!("0x{:02x}", sm.control_byte),
                 found: found.map_or("nothing".to_owned(), |[control]| format!("0x{control:02x}")),
-            });
+            }
+            .at(&device.at)
+            .during("the watchdog trigger of its outputs (bit 6 of the ControlByte)"));
         }
     }
     Ok(())
@@ -97,18 +97,13 @@ async fn read<const N: usize>(
     wire: &impl MailboxTransport,
     device: &BusDevice,
     register: u16,
-) -> Result<Option<[u8; N]>, BringUpError> {
+) -> Result<Option<[u8; N]>, Error> {
     let mut data = [0; N];
     let answered = wire.read(device.at.station, register, &mut data).await;
     let answered = answered.map_err(|source| lost(device, source))?;
     Ok((answered == 1).then_some(data))
 }
 
-fn lost(device: &BusDevice, source: DatagramError) -> BringUpError {
-    let lost = ServiceError::Wire {
-        device: device.at.clone(),
-        step: STEP,
-        source,
-    };
-    lost.into()
+fn lost(device: &BusDevice, source: DatagramError) -> Error {
+    Cause::Datagram(source).at(&device.at).during(STEP)
 }

@@ -2,8 +2,7 @@
 
 use super::diagnose::{SYNC_CODES, WATCHDOG};
 use super::evidence::{Evidence, Lateness};
-use crate::acyclic::{AlState, DeviceRef, ServiceError, StateError};
-use crate::bringup::BringUpError;
+use crate::acyclic::{AlState, DeviceRef, StateError};
 use crate::mailbox::SdoError;
 use crate::report::{Cause, Error};
 
@@ -40,22 +39,16 @@ impl Class {
             } if *state != AlState::Op => Self::of_watchdog(error.device(), evidence),
             Cause::LeftOp { state, code } => Self::of_state(*state, *code, evidence),
             Cause::State(error) => Self::of_change(error, evidence),
-            Cause::BringUp(error) => match error.as_ref() {
-                BringUpError::Service(ServiceError::State(error)) => {
-                    Self::of_change(error, evidence)
-                }
-                BringUpError::Service(_)
-                | BringUpError::Scan { .. }
-                | BringUpError::Missing { .. } => Self::Bus,
-                BringUpError::NoStart { .. } => Self::Timing,
-                BringUpError::StartUp { source, .. } | BringUpError::Sdo { source, .. } => {
-                    match source {
-                        SdoError::Gone { .. } | SdoError::Wire { .. } => Self::Bus,
-                        // A device that another MainDevice sets to Init loses its mailbox.
-                        SdoError::Timeout { .. } if evidence.other_frames() > 0 => Self::Bus,
-                        _ => Self::Device,
-                    }
-                }
+            Cause::NoAnswer
+            | Cause::Silent { .. }
+            | Cause::Datagram(_)
+            | Cause::NotTaken { .. }
+            | Cause::Scan(_)
+            | Cause::Missing { .. } => Self::Bus,
+            Cause::StartUp { source, .. } | Cause::Sdo(source) => match source {
+                SdoError::Gone { .. } | SdoError::Wire { .. } => Self::Bus,
+                // A device that another MainDevice sets to Init loses its mailbox.
+                SdoError::Timeout { .. } if evidence.other_frames() > 0 => Self::Bus,
                 _ => Self::Device,
             },
             Cause::FollowLost { reason, .. }
@@ -63,7 +56,9 @@ impl Class {
             {
                 Self::Bus
             }
-            Cause::PhaseNotLocked { .. } | Cause::ClockNotSettled { .. } => Self::Timing,
+            Cause::NoStart | Cause::PhaseNotLocked { .. } | Cause::ClockNotSettled { .. } => {
+                Self::Timing
+            }
             _ => Self::Device,
         }
     }

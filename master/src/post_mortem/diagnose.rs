@@ -11,8 +11,7 @@ use super::cause::{Cause, Diagnosis};
 use super::class::Class;
 use super::evidence::{DeviceEvidence, Evidence, Lateness, place};
 use super::snapshot::SyncSnapshot;
-use crate::acyclic::{AlState, DeviceRef, ServiceError, StateError};
-use crate::bringup::BringUpError;
+use crate::acyclic::{AlState, DeviceRef, StateError};
 use crate::mailbox::SdoError;
 use crate::report::{self, Error};
 use ecaxis_ecat::al_status_code::al_status_text;
@@ -75,10 +74,7 @@ pub fn diagnose(error: &Error, evidence: &Evidence) -> Diagnosis {
             cause
         }
         None => device_cause(error, evidence).unwrap_or_else(|| Cause::Unexplained {
-            text: match &*error.cause {
-                report::Cause::BringUp(error) => error.to_string(),
-                _ => error.to_string(),
-            },
+            text: error.without_bring_up(),
         }),
     };
     // The other observations imply the outage.
@@ -209,10 +205,7 @@ fn out_of_reach(error: &Error, evidence: &Evidence, class: Class) -> Option<Seen
     let (index, device) = devices.find(|(_, device)| missing(device))?;
     // Before station addresses are assigned, devices behind a missing one move up by one position.
     let known = match &*error.cause {
-        report::Cause::BringUp(error) => match error.as_ref() {
-            BringUpError::Missing { missing, .. } => missing.first() == Some(&device.place()),
-            _ => true,
-        },
+        report::Cause::Missing { missing, .. } => missing.first() == Some(&device.place()),
         _ => true,
     };
     if !known {
@@ -325,15 +318,14 @@ fn device_cause(error: &Error, evidence: &Evidence) -> Option<Cause> {
     let device = error.device();
     match &*error.cause {
         report::Cause::LeftOp { state, code } => Some(left_op(device?, *state, *code, evidence)),
-        report::Cause::State(StateError::Refused { device, code, .. }) => {
-            sync(device, *code, true, evidence)
+        report::Cause::State(StateError::Refused { code, .. }) => {
+            sync(device?, *code, true, evidence)
         }
         report::Cause::State(StateError::Timeout {
-            device,
             wanted: AlState::Op,
             actual: AlState::SafeOp,
             ..
-        }) => late_sync(device, evidence),
+        }) => late_sync(device?, evidence),
         report::Cause::BusLost { .. } | report::Cause::LeftOpBriefly { .. }
             if evidence.all_in_op() =>
         {
@@ -367,7 +359,32 @@ fn device_cause(error: &Error, evidence: &Evidence) -> Option<Cause> {
                 watchdog_ns: watchdog.time_ns,
             })
         }
-        report::Cause::BringUp(error) => bring_up(error, evidence),
+        report::Cause::StartUp {
+            index,
+            sub,
+            name,
+            source: SdoError::Timeout { .. },
+            ..
+        } => Some(Cause::Mailbox {
+            device: place(device?),
+            doing: format!("start-up SDO {} {name}", address(*index, *sub)),
+        }),
+        report::Cause::Sdo(SdoError::Timeout { .. }) => Some(Cause::Mailbox {
+            device: place(device?),
+            doing: error.action?.to_owned(),
+        }),
+        report::Cause::Identity {
+            esi,
+            revisions: Some((expected, found)),
+            ..
+        } => Some(Cause::Revision {
+            device: place(device?),
+            expected: *expected,
+            found: *found,
+            esi: Path::new(esi)
+                .file_name()
+                .map_or_else(|| esi.clone(), |name| name.to_string_lossy().into_owned()),
+        }),
         _ => None,
     }
 }
@@ -429,47 +446,6 @@ fn interpolation(device: &DeviceRef, error: &Error, evidence: &Evidence) -> Opti
         cycle_ns: evidence.cycle_ns,
         then: short(error),
     })
-}
-
-fn bring_up(error: &BringUpError, evidence: &Evidence) -> Option<Cause> {
-    match error {
-        BringUpError::StartUp {
-            device,
-            index,
-            sub,
-            name,
-            source: SdoError::Timeout { .. },
-            ..
-        } => Some(Cause::Mailbox {
-            device: place(device),
-            doing: format!("start-up SDO {} {name}", address(*index, *sub)),
-        }),
-        BringUpError::Sdo {
-            device,
-            step,
-            source: SdoError::Timeout { .. },
-        } => Some(Cause::Mailbox {
-            device: place(device),
-            doing: (*step).to_owned(),
-        }),
-        BringUpError::Identity {
-            device,
-            esi,
-            revisions: Some((expected, found)),
-            ..
-        } => Some(Cause::Revision {
-            device: place(device),
-            expected: *expected,
-            found: *found,
-            esi: Path::new(esi)
-                .file_name()
-                .map_or_else(|| esi.clone(), |name| name.to_string_lossy().into_owned()),
-        }),
-        BringUpError::Service(ServiceError::State(StateError::Refused {
-            device, code, ..
-        })) => sync(device, *code, true, evidence),
-        _ => None,
-    }
 }
 
 /// Returns the error's text without its address.

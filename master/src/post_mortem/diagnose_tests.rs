@@ -250,12 +250,11 @@ fn diagnose_names_device_and_cause() {
         ),
         (
             report::Cause::State(StateError::Refused {
-                device: at(2),
                 wanted: AlState::Op,
                 actual: AlState::SafeOp,
                 code: 0x002d,
             })
-            .into(),
+            .at(at(2)),
             with(|e| {
                 e.devices[2].look.sync = Some(SyncSnapshot::default());
             }),

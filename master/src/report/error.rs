@@ -1,30 +1,52 @@
 //! Errors of the master: step, place and cause. Hints for the user come from the command
 //! line.
 
+use std::borrow::Borrow;
 use std::fmt;
 use std::sync::Arc;
 
 use ecaxis_axis::cia402::describe;
 use ecaxis_axis::{CommandError, Mode, State, Trip};
 
+use crate::acyclic::eeprom::EepromError;
 use crate::acyclic::{AlState, DeviceRef, StateError};
-use crate::bringup::BringUpError;
-use crate::config::LimitConflict;
+use crate::config::{LimitConflict, UnitProblem};
 use crate::link::{LinkError, OpenError};
+use crate::mailbox::{DatagramError, InfoError, SdoError};
 use crate::rt::image::{NotMapped, TooLarge};
 use crate::text::{pluralize, rounded};
 
 use super::{DiagnosisMessage, EmergencyReport, StepRef};
 use ecaxis_ecat::al_status_code::al_status_text;
+use ecaxis_esi::address;
+use ecaxis_esi::sii::SiiError;
 
 /// An error of the master: the step and the place at which it occurred, and its cause.
 #[derive(Debug, thiserror::Error)]
-#[error("{}{}{cause}", Prefix(step), Prefix(at))]
+#[error("{}{}{}{cause}", Prefix(step), Prefix(at), Prefix(action))]
 pub struct Error {
-    /// The step of the program.
-    pub step: Option<StepRef>,
+    pub step: Option<FailedStep>,
     pub at: Option<Place>,
+    /// What the master was doing there.
+    pub action: Option<&'static str>,
     pub cause: Box<Cause>,
+}
+
+/// The step of a run in which an error occurred.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum FailedStep {
+    BringUp,
+    /// A step of the machine file's program.
+    Program(StepRef),
+}
+
+impl fmt::Display for FailedStep {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::BringUp => f.write_str("bring-up"),
+            Self::Program(step) => step.fmt(f),
+        }
+    }
 }
 
 /// The place of an error.
@@ -67,14 +89,115 @@ pub enum Cause {
     Thread(String),
     #[error("the link failed: {0}")]
     Link(LinkError),
-    #[error("bring-up: {0}")]
-    BringUp(#[from] Box<BringUpError>),
     #[error(transparent)]
     TooLarge(TooLarge),
     #[error(transparent)]
     NotMapped(NotMapped),
     #[error(transparent)]
     Axis(ecaxis_axis::ConfigError),
+    #[error("no SubDevice answers")]
+    NoAnswer,
+    #[error("the SubDevice at position {position} stopped answering while {action}")]
+    Silent { position: u16, action: &'static str },
+    #[error(transparent)]
+    Datagram(DatagramError),
+    #[error("register 0x{register:04x} is not answered")]
+    NotTaken { register: u16 },
+    #[error("no SubDevice has {wanted}; {found}")]
+    NotFound { wanted: String, found: String },
+    #[error("{count} SubDevices have {wanted}: at positions {positions}")]
+    Ambiguous {
+        wanted: String,
+        count: usize,
+        positions: String,
+    },
+    #[error(transparent)]
+    Eeprom(EepromError),
+    #[error("its EEPROM: {0}")]
+    Sii(SiiError),
+    #[error("the EEPROM says nothing of a mailbox")]
+    NoMailbox,
+    #[error("is in {state}, where it has no CoE mailbox")]
+    WrongState { state: AlState },
+    #[error(transparent)]
+    Sdo(SdoError),
+    #[error(transparent)]
+    Information(InfoError),
+    /// The scan failed in a way that the devices do not explain.
+    #[error("{0}")]
+    Scan(String),
+    #[error(
+        "scanning: {found} of {expected} {}; missing: {}",
+        if *found == 1 { "SubDevice answers" } else { "SubDevices answer" }, few(missing)
+    )]
+    Missing {
+        expected: usize,
+        found: usize,
+        /// Names with positions, in the order of the segment.
+        missing: Vec<String>,
+    },
+    #[error("the SubDevice at position {position} ({identity}) is not in the machine file")]
+    Unexpected { position: u16, identity: String },
+    #[error("identify: the file `{esi}` describes {expected}, the device is {found}")]
+    Identity {
+        esi: String,
+        expected: String,
+        found: String,
+        /// The expected and the found revision, if nothing else differs.
+        revisions: Option<(u32, u32)>,
+    },
+    #[error("identify: the machine file names serial number {expected}, the device has {found}")]
+    Serial { expected: u32, found: u32 },
+    #[error("no SubDevice has {locator}")]
+    NotLocated { locator: String },
+    #[error("start-up SDO {} {name} = {value} (from {origin}): {source}", address(*index, *sub))]
+    StartUp {
+        index: u16,
+        sub: u8,
+        name: String,
+        value: String,
+        origin: String,
+        source: SdoError,
+    },
+    /// `verify` in the machine file.
+    #[error(
+        "start-up SDO {object} = {value} (from {origin}) was taken, but the device holds {holds}"
+    )]
+    NotHeld {
+        object: String,
+        value: String,
+        origin: String,
+        holds: String,
+    },
+    #[error(
+        "reading the PDO mapping back: {} holds {actual}, the ESI's layout has {expected}",
+        address(*index, *sub)
+    )]
+    Mapping {
+        index: u16,
+        sub: u8,
+        expected: String,
+        actual: String,
+    },
+    #[error(
+        "the drive's units are not those of the machine file: {}",
+        list(problems)
+    )]
+    Units { problems: Vec<UnitProblem> },
+    #[error("register 0x{register:04x} holds {found}, wanted is {wanted}")]
+    Watchdog {
+        register: u16,
+        wanted: String,
+        found: String,
+    },
+    #[error("the ESI asks for SYNC0, the device has no distributed clock")]
+    NoClock,
+    #[error(
+        "starting SYNC0: writing the start time to all devices takes longer than the time until the start"
+    )]
+    NoStart,
+    #[error("the mailbox is at {actual}, the ESI says {expected}")]
+    MailboxMoved { expected: String, actual: String },
     #[error("no process data comes back in SafeOp: {}", al_note(*al_status))]
     NoProcessData { al_status: Option<(u8, u16)> },
     #[error("the release of frames does not lock to SYNC0: phase error {error_ns} ns")]
@@ -207,6 +330,7 @@ pub enum Cause {
         "the supervisor thread (`ecaxis-mailbox`) did not run for 2 s: the machine was stopped"
     )]
     Unsupervised,
+    /// The user stopped the work. Changed states of devices have been restored.
     #[error("interrupted")]
     Interrupted,
     #[error("internal error: {0}")]
@@ -216,9 +340,9 @@ pub enum Cause {
 impl Cause {
     /// Returns the error with this cause at a device.
     #[must_use]
-    pub fn at(self, device: DeviceRef) -> Error {
+    pub fn at(self, device: impl Borrow<DeviceRef>) -> Error {
         Error {
-            at: Some(Place::Device(device)),
+            at: Some(Place::Device(device.borrow().clone())),
             ..self.into()
         }
     }
@@ -237,6 +361,7 @@ impl From<Cause> for Error {
         Self {
             step: None,
             at: None,
+            action: None,
             cause: Box::new(cause),
         }
     }
@@ -252,9 +377,39 @@ impl Error {
     /// Adds the step of the program.
     pub(crate) fn in_step(self, step: impl Into<StepRef>) -> Self {
         Self {
-            step: Some(step.into()),
+            step: Some(FailedStep::Program(step.into())),
             ..self
         }
+    }
+
+    pub(crate) fn in_bring_up(self) -> Self {
+        Self {
+            step: Some(FailedStep::BringUp),
+            ..self
+        }
+    }
+
+    /// Adds what the master was doing.
+    #[must_use]
+    pub fn during(self, action: &'static str) -> Self {
+        Self {
+            action: Some(action),
+            ..self
+        }
+    }
+
+    /// Returns the text without the bring-up as its step.
+    pub(crate) fn without_bring_up(&self) -> String {
+        let text = self.to_string();
+        let prefix = format!("{}: ", FailedStep::BringUp);
+        text.strip_prefix(&prefix)
+            .map_or(text.clone(), str::to_owned)
+    }
+
+    /// `true` if the bus did not come up.
+    #[must_use]
+    pub fn is_in_bring_up(&self) -> bool {
+        self.step == Some(FailedStep::BringUp)
     }
 
     /// Returns the device of the error.
@@ -336,6 +491,22 @@ impl fmt::Display for DriveReport {
         }
         Ok(())
     }
+}
+
+/// Returns the first names of a list, and how many follow.
+fn few(names: &[String]) -> String {
+    const FEW: usize = 3;
+    let first = names.iter().take(FEW).map(String::as_str);
+    let text = first.collect::<Vec<_>>().join(", ");
+    match names.len().saturating_sub(FEW) {
+        0 => text,
+        more => format!("{text} and {more} more"),
+    }
+}
+
+fn list(problems: &[UnitProblem]) -> String {
+    let each: Vec<String> = problems.iter().map(ToString::to_string).collect();
+    each.join("; ")
 }
 
 fn al_note(al_status: Option<(u8, u16)>) -> String {

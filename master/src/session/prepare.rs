@@ -351,7 +351,7 @@ fn bring_up_catching_panics(
     });
     match std::panic::catch_unwind(run) {
         Ok(Ok(Some(Ok(bus)))) => Ok(bus),
-        Ok(Ok(Some(Err(error)))) => Err(Cause::BringUp(Box::new(error)).into()),
+        Ok(Ok(Some(Err(error)))) => Err(error.in_bring_up()),
         Ok(Ok(None)) => Err(Cause::Interrupted.into()),
         Ok(Err(error)) => Err(Cause::Link(error).into()),
         Err(panic) => Err(Cause::Panicked(panic_text(&*panic)).into()),

@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use ecaxis_axis::{Command, CommandError};
 
-use crate::acyclic::{AlState, DeviceRef, StateError, al};
+use crate::acyclic::{AlState, DeviceRef, al};
 use crate::bringup::{Bus, clocks};
 use crate::cancel::run_until_set;
 use crate::clock::{self, Nanos};
@@ -150,9 +150,7 @@ impl Supervisor {
         self.await_phase().await?;
         let devices = self.bus.addresses();
         let timeout = Duration::from_nanos(self.machine.bus.op_timeout_ns);
-        al::change_state(&self.wire, &devices, AlState::Op, timeout)
-            .await
-            .map_err(Cause::State)?;
+        al::change_state(&self.wire, &devices, AlState::Op, timeout).await?;
         self.report(Progress::Step(crate::bringup::Step::State(AlState::Op)));
         self.order(RtCommand::Guard).await;
         if !self.enable {
@@ -395,10 +393,10 @@ impl Supervisor {
             match al::lower_state(&self.wire, &others, state, al::BACK_TIMEOUT).await {
                 Ok(()) => self.report(Progress::Step(crate::bringup::Step::State(state))),
                 Err(error) => {
-                    let silent = matches!(error, StateError::Wire { .. });
+                    let silent = al::is_wire(&error);
                     self.report(Progress::Warning(error.to_string()));
                     if lowered.is_ok() {
-                        lowered = Err(Cause::State(error).into());
+                        lowered = Err(error);
                     }
                     if silent {
                         break;

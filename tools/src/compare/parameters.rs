@@ -4,10 +4,11 @@ use ecaxis_esi::StartupSdo;
 
 use super::{Comparison, Difference};
 use crate::scan::Scan;
+use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::acyclic::device::with_mailbox;
-use ecaxis_master::acyclic::{DatagramClient, ServiceError};
 use ecaxis_master::config::Machine;
 use ecaxis_master::mailbox::SdoError;
+use ecaxis_master::report::Cause;
 
 /// False for PDO mapping and assignment, the module list and the mode, which every start-up
 /// rewrites.
@@ -65,8 +66,7 @@ pub async fn parameters(
                     // Some objects are write-only.
                     Err(SdoError::Abort { .. }) => {}
                     Err(source) => {
-                        let device = at.clone();
-                        return Err(ServiceError::Sdo { device, source });
+                        return Err(Cause::Sdo(source).at(&at));
                     }
                 }
             }

@@ -6,9 +6,10 @@ use std::time::Duration;
 use super::error::{Cause, Step, StepFailure};
 use super::{DeviceIdentity, INIT_TIMEOUT, ReadBack, UpdateProgress, UpdateRequest, since};
 use ecaxis_master::acyclic::al::{self, AlState};
-use ecaxis_master::acyclic::{DatagramClient, Registers, mailbox};
+use ecaxis_master::acyclic::{DatagramClient, Registers, StateError, mailbox};
 use ecaxis_master::mailbox::foe::FoeProgress;
 use ecaxis_master::mailbox::{FoeClient, FoeError, MailboxTransport};
+use ecaxis_master::report;
 
 pub(super) async fn send(
     wire: &DatagramClient,
@@ -68,7 +69,12 @@ pub(super) async fn send(
     report(UpdateProgress::Step(Step::Leave));
     // A device that resets itself cannot confirm Init; a later check detects whether it returns.
     match al::change_state(wire, devices, AlState::Init, al::BACK_TIMEOUT).await {
-        Err(error @ ecaxis_master::acyclic::StateError::Refused { .. }) => {
+        Err(error)
+            if matches!(
+                *error.cause,
+                report::Cause::State(StateError::Refused { .. })
+            ) =>
+        {
             Err(Step::Leave.failed(error))
         }
         Ok(()) | Err(_) => Ok((read_back, took)),

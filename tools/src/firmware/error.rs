@@ -6,9 +6,9 @@ use std::time::Duration;
 use super::{RunningProgram, UpdateMethod};
 use ecaxis_master::acyclic::al::AlState;
 use ecaxis_master::acyclic::enumerate::{EnumeratedDevice, read_device};
-use ecaxis_master::acyclic::{DatagramClient, ServiceError};
-use ecaxis_master::acyclic::{DeviceRef, StateError};
+use ecaxis_master::acyclic::{DatagramClient, DeviceRef};
 use ecaxis_master::mailbox::{FoeError, SdoError};
+use ecaxis_master::report::Error;
 
 /// A step of an update.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -53,9 +53,7 @@ pub enum Cause {
     #[error(transparent)]
     Sdo(#[from] SdoError),
     #[error(transparent)]
-    State(#[from] StateError),
-    #[error(transparent)]
-    Service(#[from] ServiceError),
+    Service(#[from] Error),
     /// 0x1F51 did not reach the expected value.
     #[error("0x1F51:01 is not {wanted} within {after:?}: {last}{}", Refusal(refused.as_deref()))]
     Control {
@@ -120,7 +118,7 @@ impl fmt::Display for FinalDeviceState {
 #[derive(Debug, thiserror::Error)]
 pub enum FirmwareError {
     #[error(transparent)]
-    Service(#[from] ServiceError),
+    Service(#[from] Error),
     #[error("{device}: is {found} by {by}, {expected} is meant")]
     Identity {
         device: DeviceRef,

@@ -6,12 +6,13 @@ use std::time::Duration;
 use ecaxis_esi::sii::{Protocols, Sii};
 
 use super::FirmwareError;
+use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::acyclic::device::{locate, read_sii_unless_in_use, with_mailbox};
 use ecaxis_master::acyclic::eeprom::EepromAccess;
 use ecaxis_master::acyclic::{AlState, DeviceRef};
-use ecaxis_master::acyclic::{DatagramClient, ServiceError};
 use ecaxis_master::config::Locator;
 use ecaxis_master::mailbox::{CoeClient, SdoError, Timeouts};
+use ecaxis_master::report::{Cause, Error};
 
 /// The device type (0x1000) of a maxon drive with stopped program; with running program it is
 /// 0x00020192.
@@ -82,7 +83,7 @@ pub struct DeviceIdentity {
     pub code: u16,
     pub spoken: Option<CoeIdentity>,
     /// Why a device with CoE did not answer.
-    pub silent: Option<ServiceError>,
+    pub silent: Option<Error>,
 }
 
 /// Finds a device and reads its identity. Objects are read in PreOp, from Init and back; Bootstrap
@@ -125,7 +126,7 @@ pub(super) async fn examine_with(
     if has_coe && examined.state != AlState::Bootstrap {
         match read_coe_identity(wire, &examined).await {
             Ok(spoken) => examined.spoken = Some(spoken),
-            Err(error @ ServiceError::Stopped { .. }) => return Err(error.into()),
+            Err(error) if error.is_interruption() => return Err(error.into()),
             Err(error) => examined.silent = Some(error),
         }
     }
@@ -135,15 +136,12 @@ pub(super) async fn examine_with(
 async fn read_coe_identity(
     wire: &DatagramClient,
     examined: &DeviceIdentity,
-) -> Result<CoeIdentity, ServiceError> {
+) -> Result<CoeIdentity, Error> {
     let DeviceIdentity { device, sii, .. } = examined;
     with_mailbox(wire, device, sii, "asking it who it is", async |lent| {
         lent.coe.set_timeouts(PATIENT);
         let spoken = ask(wire, &mut lent.coe).await;
-        spoken.map_err(|source| ServiceError::Sdo {
-            device: device.clone(),
-            source,
-        })
+        spoken.map_err(|error| Cause::Sdo(error).at(device))
     })
     .await
 }

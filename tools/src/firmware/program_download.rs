@@ -14,9 +14,10 @@ use super::{
 use ecaxis_master::acyclic::DeviceRef;
 use ecaxis_master::acyclic::al::{self, AlState};
 use ecaxis_master::acyclic::device::locate;
-use ecaxis_master::acyclic::{DatagramClient, Registers, ServiceError, mailbox};
+use ecaxis_master::acyclic::{DatagramClient, Registers, mailbox};
 use ecaxis_master::config::Locator;
 use ecaxis_master::mailbox::{CoeClient, MailboxTransport, SdoError, Timeouts};
+use ecaxis_master::report::Error;
 
 const PROGRAM_DATA: u16 = 0x1f50;
 const PROGRAM_CONTROL: u16 = 0x1f51;
@@ -113,7 +114,7 @@ async fn pre_op(
     wire: &DatagramClient,
     examined: &DeviceIdentity,
     device: &DeviceRef,
-) -> Result<CoeClient, ServiceError> {
+) -> Result<CoeClient, Error> {
     let devices = std::slice::from_ref(device);
     al::change_state(wire, devices, AlState::Init, INIT_TIMEOUT).await?;
     let registers = Registers {

@@ -4,8 +4,9 @@
 use std::time::Duration;
 
 use ecaxis_master::acyclic::DeviceRef;
-use ecaxis_master::acyclic::ServiceError;
+
 use ecaxis_master::mailbox::{CoeClient, MailboxTransport, Timeouts};
+use ecaxis_master::report::{Cause, Error};
 
 /// The time-out of the command. A device answers when it is done; flash memories take tens of
 /// seconds.
@@ -30,13 +31,13 @@ impl Command {
     /// Sends the command and waits until the device has completed it.
     ///
     /// # Errors
-    /// [`ServiceError::Sdo`] with the device's reason.
+    /// [`Cause::Sdo`] with the device's reason.
     pub async fn give(
         self,
         coe: &mut CoeClient,
         wire: &impl MailboxTransport,
         device: &DeviceRef,
-    ) -> Result<(), ServiceError> {
+    ) -> Result<(), Error> {
         let (index, signature) = self.object();
         let patient = Timeouts {
             answer: WAIT,
@@ -46,9 +47,6 @@ impl Command {
         let usual = coe.set_timeouts(patient);
         let done = coe.download(wire, index, 1, false, signature).await;
         coe.set_timeouts(usual);
-        done.map_err(|source| ServiceError::Sdo {
-            device: device.clone(),
-            source,
-        })
+        done.map_err(|error| Cause::Sdo(error).at(device))
     }
 }

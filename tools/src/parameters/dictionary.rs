@@ -5,11 +5,12 @@ use ecaxis_esi::{Dictionary, Object, ObjectCode, ObjectItem, Writable};
 
 use super::DataType;
 use ecaxis_master::acyclic::DeviceRef;
-use ecaxis_master::acyclic::ServiceError;
+
 use ecaxis_master::mailbox::{
     CoeClient, EntryDescription, InfoError, InfoRequest, MailboxTransport, ObjectDescription,
     ObjectList,
 };
+use ecaxis_master::report::{Cause, Error};
 
 /// The maximum number of subindices; the largest known device has a tenth of it.
 const MAX_ITEMS: usize = 50_000;
@@ -17,18 +18,15 @@ const MAX_ITEMS: usize = 50_000;
 /// Reads all descriptions. `progress` receives the number of completed and of all objects.
 ///
 /// # Errors
-/// [`ServiceError::Information`], also without SDO Information. Objects and subindices without a
+/// [`Cause::Information`], also without SDO Information. Objects and subindices without a
 /// description are skipped.
 pub async fn dictionary(
     coe: &mut CoeClient,
     wire: &impl MailboxTransport,
     device: &DeviceRef,
     progress: &mut dyn FnMut(usize, usize),
-) -> Result<Dictionary, ServiceError> {
-    let failed = |source| ServiceError::Information {
-        device: device.clone(),
-        source: Box::new(source),
-    };
+) -> Result<Dictionary, Error> {
+    let failed = |error| Cause::Information(error).at(device);
     let all = coe.object_list(wire, ObjectList::All).await;
     let all = all.map_err(failed)?;
     let mut objects = Vec::new();

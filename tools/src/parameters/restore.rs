@@ -6,8 +6,9 @@ use super::compare::Difference;
 use super::restore_order::{Write, is_list, is_setting, order, settings_only};
 use super::{Parameter, writable_in_pre_op};
 use ecaxis_master::acyclic::DeviceRef;
-use ecaxis_master::acyclic::ServiceError;
+
 use ecaxis_master::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, abort_text};
+use ecaxis_master::report::{Cause, Error};
 
 /// The maximum number of passes. Settings limit each other, so refused writes are retried after the
 /// others.
@@ -39,7 +40,7 @@ impl Restored {
 #[derive(Debug, thiserror::Error)]
 #[error("{source}{}", self.left())]
 pub struct RestoreError {
-    pub source: ServiceError,
+    pub source: Error,
     /// The number of confirmed writes.
     pub written: usize,
     /// The number of planned writes; 0 if it ended before the first.
@@ -80,7 +81,7 @@ struct RestoreProgress {
 }
 
 impl RestoreProgress {
-    fn aborted(self, source: ServiceError) -> RestoreError {
+    fn aborted(self, source: Error) -> RestoreError {
         RestoreError {
             source,
             written: self.written,
@@ -99,23 +100,20 @@ struct Device<'a, W> {
 
 impl<W: MailboxTransport> Device<'_, W> {
     /// Returns the abort code if the device refuses the object.
-    fn refusal<T>(&self, result: Result<T, SdoError>) -> Result<Result<T, u32>, ServiceError> {
+    fn refusal<T>(&self, result: Result<T, SdoError>) -> Result<Result<T, u32>, Error> {
         match result {
             Ok(value) => Ok(Ok(value)),
             Err(SdoError::Abort { code, .. }) => Ok(Err(code)),
-            Err(source) => Err(ServiceError::Sdo {
-                device: self.device.clone(),
-                source,
-            }),
+            Err(error) => Err(Cause::Sdo(error).at(self.device)),
         }
     }
 
-    async fn read(&mut self, at: NamedObject) -> Result<Result<Vec<u8>, u32>, ServiceError> {
+    async fn read(&mut self, at: NamedObject) -> Result<Result<Vec<u8>, u32>, Error> {
         let read = self.coe.upload(self.wire, at.index, at.sub, false).await;
         self.refusal(read)
     }
 
-    async fn write(&mut self, write: Write<'_>) -> Result<Result<(), u32>, ServiceError> {
+    async fn write(&mut self, write: Write<'_>) -> Result<Result<(), u32>, Error> {
         let (index, sub, value) = match write {
             Write::Empty(index) => (index, 0, &[0_u8][..]),
             Write::Value(p) => (p.at.index, p.at.sub, p.value.as_slice()),
@@ -131,7 +129,7 @@ impl<W: MailboxTransport> Device<'_, W> {
         &mut self,
         write: Write<'_>,
         course: &mut RestoreProgress,
-    ) -> Result<Result<(), u32>, ServiceError> {
+    ) -> Result<Result<(), u32>, Error> {
         // A request may have taken effect even without an answer.
         let list = match write {
             Write::Empty(index) => {
@@ -162,7 +160,7 @@ impl<W: MailboxTransport> Device<'_, W> {
 /// cancellation takes effect when no list is empty.
 ///
 /// # Errors
-/// [`ServiceError::Sdo`] with the remaining state if the device stops answering. Refused objects
+/// [`Cause::Sdo`] with the remaining state if the device stops answering. Refused objects
 /// are part of the result.
 pub async fn restore(
     coe: &mut CoeClient,
@@ -181,14 +179,13 @@ pub async fn restore(
 
 impl<W: MailboxTransport> Device<'_, W> {
     /// Fails if a cancellation was requested.
-    fn go_on(&self, course: &RestoreProgress) -> Result<(), ServiceError> {
+    fn go_on(&self, course: &RestoreProgress) -> Result<(), Error> {
         if !self.wire.stop().is_cancelled() || !course.open.is_empty() {
             return Ok(());
         }
-        Err(ServiceError::Stopped {
-            device: self.device.clone(),
-            step: "restoring its settings",
-        })
+        Err(Cause::Interrupted
+            .at(self.device)
+            .during("restoring its settings"))
     }
 
     async fn restore(
@@ -197,7 +194,7 @@ impl<W: MailboxTransport> Device<'_, W> {
         parameters: &[Parameter],
         progress: &mut dyn FnMut(usize, usize),
         course: &mut RestoreProgress,
-    ) -> Result<Restored, ServiceError> {
+    ) -> Result<Restored, Error> {
         let mut restored = Restored::default();
         let mut wanted = Vec::new();
         let mut differing: Vec<NamedObject> = Vec::new();

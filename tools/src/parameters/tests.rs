@@ -14,9 +14,9 @@ use super::restore::{RestoreError, Restored, restore};
 use super::restore_order::{Write, order};
 use super::{DataType, Kind, Parameter};
 use ecaxis_master::acyclic::DeviceRef;
-use ecaxis_master::acyclic::ServiceError;
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::mailbox::{DatagramError, MailboxTransport, NamedObject};
+use ecaxis_master::report::Cause;
 use ecaxis_test_support::mailbox::server::Server;
 use ecaxis_test_support::mailbox::{STATION, block_on, client};
 
@@ -371,7 +371,7 @@ fn failed_restore_reports_the_remaining_state() {
         for k in 1..=WRITES {
             let device = Failing::new(k, arrives);
             let error = device.restore(&mut |_, _| {}).expect_err("no frames");
-            assert!(matches!(error.source, ServiceError::Sdo { .. }), "{error}");
+            assert!(matches!(*error.source.cause, Cause::Sdo(_)), "{error}");
             assert_eq!((error.written, error.of), (k - 1, WRITES), "{error}");
             let text = error.to_string();
             let reported = match k {
@@ -411,7 +411,7 @@ fn cancelled_restore_leaves_no_list_empty() {
         let ended = device.restore(&mut progress);
         assert!(!device.is_empty(0x1c12) && !device.is_empty(0x1600), "{k}");
         let error = ended.expect_err("ended");
-        let stopped = matches!(error.source, ServiceError::Stopped { .. });
+        let stopped = error.source.is_interruption();
         assert!(stopped && error.emptied.is_empty(), "{k}: {error}");
         // The lists are six writes; a cancellation during these takes effect after the sixth.
         assert_eq!(error.written, (k + 1).max(6), "{k}: {error}");

@@ -4,8 +4,9 @@ use ecaxis_esi::Dictionary;
 
 use super::{Parameter, items, name_of, type_of, writable_in_pre_op};
 use ecaxis_master::acyclic::DeviceRef;
-use ecaxis_master::acyclic::ServiceError;
+
 use ecaxis_master::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError};
+use ecaxis_master::report::{Cause, Error};
 
 /// The values of a device.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -19,14 +20,14 @@ pub struct UploadResult {
 /// Reads the objects one by one. `progress` receives the number of completed and of all subindices.
 ///
 /// # Errors
-/// [`ServiceError::Sdo`] if the device stops answering. A refused object is not an error.
+/// [`Cause::Sdo`] if the device stops answering. A refused object is not an error.
 pub async fn collect(
     coe: &mut CoeClient,
     wire: &impl MailboxTransport,
     device: &DeviceRef,
     dictionary: &Dictionary,
     progress: &mut dyn FnMut(usize, usize),
-) -> Result<UploadResult, ServiceError> {
+) -> Result<UploadResult, Error> {
     let mut readable: Vec<_> = items(dictionary)
         .filter(|(_, item)| item.access.read && item.bit_len > 0)
         .collect();
@@ -48,12 +49,7 @@ pub async fn collect(
                 value,
             }),
             Err(SdoError::Abort { code, .. }) => collected.refused.push((at, code)),
-            Err(source) => {
-                return Err(ServiceError::Sdo {
-                    device: device.clone(),
-                    source,
-                });
-            }
+            Err(error) => return Err(Cause::Sdo(error).at(device)),
         }
     }
     Ok(collected)

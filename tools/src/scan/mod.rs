@@ -17,13 +17,14 @@ use ecaxis_ecat::registers as esc;
 use ecaxis_esi::Identity;
 use ecaxis_esi::sii::{General, Protocols, Sii};
 
+use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::acyclic::al::{self, AlState};
 use ecaxis_master::acyclic::device::{read_sii, with_mailbox};
 use ecaxis_master::acyclic::eeprom::EepromAccess;
 use ecaxis_master::acyclic::enumerate::{self, EnumeratedDevice};
 use ecaxis_master::acyclic::topology::{ParentPort, open_ports, parents};
-use ecaxis_master::acyclic::{DatagramClient, ServiceError};
 use ecaxis_master::mailbox::MailboxTransport;
+use ecaxis_master::report::{Cause, Error};
 
 pub mod coe_info;
 pub mod delays;
@@ -164,13 +165,13 @@ impl Device {
 /// Scans all devices on the segment.
 ///
 /// # Errors
-/// [`ServiceError::NoAnswer`], or a device that leaves during the scan. Failures of one device are
+/// [`Cause::NoAnswer`], or a device that leaves during the scan. Failures of one device are
 /// stored in its result.
 pub async fn scan(
     wire: &DatagramClient,
     options: Options,
     report: &mut dyn FnMut(Step),
-) -> Result<Scan, ServiceError> {
+) -> Result<Scan, Error> {
     let mut found = enumerate::enumerate(wire).await?;
     let others = other_main_device::look(wire, &found, options.heard, WATCH).await?;
     let quiet = others.is_empty();
@@ -232,7 +233,7 @@ async fn look_at(
     wire: &DatagramClient,
     found: EnumeratedDevice,
     readable: bool,
-) -> Result<Device, ServiceError> {
+) -> Result<Device, Error> {
     const STEP: &str = "reading what its controller is";
     let position = found.position;
     let controller: [u8; CONTROLLER_BYTES] = enumerate::at(wire, position, STEP, esc::TYPE).await?;
@@ -270,7 +271,7 @@ async fn measure_delays(
     wire: &DatagramClient,
     devices: &mut [Device],
     quiet: bool,
-) -> Result<(), ServiceError> {
+) -> Result<(), Error> {
     const STEP: &str = "measuring propagation delays";
     if !quiet {
         for device in devices.iter_mut().filter(|device| device.dc) {
@@ -292,7 +293,7 @@ async fn measure_delays(
     for _ in 0..LATCHES {
         wire.write_all(esc::DC_RECEIVE_TIME, &[0; 4])
             .await
-            .map_err(|source| ServiceError::Segment { step: STEP, source })?;
+            .map_err(|error| Error::from(Cause::Datagram(error)).during(STEP))?;
         let mut times = Vec::with_capacity(devices.len());
         for device in devices.iter() {
             times.push(if device.controller.has_receive_times() {
@@ -320,7 +321,7 @@ async fn measure_delays(
 
 /// Reads the explicit device identification if the EEPROM declares it. It is requested by AL
 /// control in the present state.
-async fn explicit_id(wire: &DatagramClient, device: &Device) -> Result<Option<u16>, ServiceError> {
+async fn explicit_id(wire: &DatagramClient, device: &Device) -> Result<Option<u16>, Error> {
     const STEP: &str = "reading its device identification";
     let Ok(Sii {
         general: Some(general),
@@ -331,7 +332,7 @@ async fn explicit_id(wire: &DatagramClient, device: &Device) -> Result<Option<u1
     };
     if general.flags & General::IDENTIFICATION_AL_STATUS != 0 && !device.found.error {
         let id = al::read_explicit_id(wire, device.found.station).await;
-        return id.map_err(|source| ServiceError::Segment { step: STEP, source });
+        return id.map_err(|error| Error::from(Cause::Datagram(error)).during(STEP));
     }
     if general.flags & General::IDENTIFICATION_ADDRESS != 0 {
         let mut bytes = [0; 2];
@@ -353,10 +354,7 @@ async fn ask(wire: &DatagramClient, device: &Device) -> Option<Result<CoeInfo, S
         .named(format!("position {}", device.position()));
     let answers = with_mailbox(wire, &at, sii, "asking it who it is", async |lent| {
         let answers = coe_info::ask(wire, &mut lent.coe, device).await;
-        answers.map_err(|source| ServiceError::Sdo {
-            device: at.clone(),
-            source,
-        })
+        answers.map_err(|error| Cause::Sdo(error).at(&at))
     });
     Some(answers.await.map_err(|error| error.to_string()))
 }

@@ -5,9 +5,10 @@ use std::time::Duration;
 
 use ecaxis_ecat::registers;
 use ecaxis_master::acyclic::AlState;
+use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::acyclic::enumerate::{self, EnumeratedDevice};
-use ecaxis_master::acyclic::{DatagramClient, ServiceError};
 use ecaxis_master::mailbox::MailboxTransport;
+use ecaxis_master::report::Error;
 
 const STEP: &str = "looking for another MainDevice";
 /// The number of samples within the given time.
@@ -77,13 +78,13 @@ struct LivenessSample {
 /// Samples all devices repeatedly for `time`. `heard`: foreign frames before the detection.
 ///
 /// # Errors
-/// [`ServiceError::Silent`] if a device leaves during the detection.
+/// [`Cause::Silent`] if a device leaves during the detection.
 pub async fn look(
     wire: &DatagramClient,
     found: &[EnumeratedDevice],
     heard: u64,
     time: Duration,
-) -> Result<Vec<MainDeviceEvidence>, ServiceError> {
+) -> Result<Vec<MainDeviceEvidence>, Error> {
     let mut signs = Vec::new();
     if heard > 0 {
         signs.push(MainDeviceEvidence::Frames { count: heard });
@@ -171,7 +172,7 @@ fn of(sign: &MainDeviceEvidence) -> Option<u16> {
     }
 }
 
-async fn look_at(wire: &DatagramClient, position: u16) -> Result<LivenessSample, ServiceError> {
+async fn look_at(wire: &DatagramClient, position: u16) -> Result<LivenessSample, Error> {
     let [control, _] = enumerate::at(wire, position, STEP, registers::AL_CONTROL).await?;
     let mut sms = [0; SM_SIZE * MOST_SMS];
     // Controllers have four or eight SyncManagers; reading more gets no answer.

@@ -107,7 +107,9 @@ pub(super) fn run(
     let outcome = session::run_with_operator(machine, options, stop, &mut teller, Box::new(script));
     drop(teller);
     let _ = printer.join();
-    outcome.result.map_err(|error| hints::run(&error, &nic))?;
+    outcome
+        .result
+        .map_err(|error| hints::failure(&error, &nic))?;
     let mut failure = failure.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(failure) = failure.take() {
         return Err(failure);

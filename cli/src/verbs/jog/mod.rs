@@ -135,7 +135,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         Ok(()) if left => written,
         Err(error) if left && error.is_interruption() => written,
         Ok(()) => Err(Failure::interrupted()),
-        Err(error) => Err(hints::run(&error, &nic)),
+        Err(error) => Err(hints::failure(&error, &nic)),
     }
 }
 
@@ -354,7 +354,7 @@ impl Observer for Listener {
             Progress::Overload(overload) => (overload.to_string(), true),
             Progress::Concern(concern) => (concern.to_string(), true),
             Progress::GroupStopped { group, cause } => {
-                let hint = hints::run(cause, &self.nic).hints.into_iter().next();
+                let hint = hints::failure(cause, &self.nic).hints.into_iter().next();
                 let group = format!("the group `{group}` stops: {cause}");
                 self.shared.show(group, true);
                 (hint.unwrap_or_else(|| "r resets it".to_owned()), false)

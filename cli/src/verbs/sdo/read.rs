@@ -3,7 +3,6 @@
 use std::path::PathBuf;
 
 use ecaxis_esi::Object;
-use ecaxis_master::acyclic::ServiceError;
 use ecaxis_master::mailbox::{NamedObject, SdoError, object_name};
 use ecaxis_master::text::pluralize;
 use ecaxis_tools::document::format::hex_bytes;
@@ -79,14 +78,11 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
         }
         // A refused single value is an error; among others it is a row.
         match out.as_slice() {
-            [(at, .., Err(code))] => open.at.map_error(Err(ServiceError::Sdo {
-                device: open.at.device.clone(),
-                source: SdoError::Abort {
-                    station: open.at.device.station,
-                    index: at.index,
-                    sub: at.sub,
-                    code: *code,
-                },
+            [(at, .., Err(code))] => open.at.sdo_error(Err(SdoError::Abort {
+                station: open.at.device.station,
+                index: at.index,
+                sub: at.sub,
+                code: *code,
             })),
             [_, _, ..] if to_file => {
                 Err(Failure::new(hints::WRONG, "a file takes one subindex")
@@ -247,10 +243,7 @@ async fn whole(
     let index = wanted.index;
     let first = wanted.sub.unwrap_or(0);
     let read = open.coe.upload(&open.at.wire, index, first, true).await;
-    let bytes = open.at.map_error(read.map_err(|source| ServiceError::Sdo {
-        device: open.at.device.clone(),
-        source,
-    }))?;
+    let bytes = open.at.sdo_error(read)?;
     let at = NamedObject { index, sub: first };
     let Some(object) = object.filter(|object| object.items.len() > 1 && data_type.is_none()) else {
         let name = object

@@ -2,7 +2,6 @@
 
 use std::path::PathBuf;
 
-use ecaxis_master::acyclic::ServiceError;
 use ecaxis_master::file;
 use ecaxis_master::mailbox::MailboxTransport;
 use ecaxis_tools::parameters::{DataType, ValueError};
@@ -97,10 +96,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
         let download = open.coe.download(wire, at.index, at.sub, complete, &value);
         // A started download is not cancelled.
         let sent = wire.stop().shield(download).await;
-        open.at.map_error(sent.map_err(|source| ServiceError::Sdo {
-            device: open.at.device.clone(),
-            source,
-        }))?;
+        open.at.sdo_error(sent)?;
         // A value that cannot be read back was still accepted.
         let after = open.coe.upload(wire, at.index, at.sub, complete).await.ok();
         Ok((at, name, shown, value, before, after))
