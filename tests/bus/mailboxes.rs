@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use ecaxis_master::bringup::Step;
 use ecaxis_master::config::Machine;
-use ecaxis_master::mailbox::{MailboxError, Mailboxes, SdoError};
+use ecaxis_master::mailbox::{MailboxError, Mailboxes};
 use ecaxis_master::session::{self, Cause, EmergencyReport, Observer, Options, Outcome, Progress};
 use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::{Heard, axes, faults, machine, run, virtual_time};
@@ -251,14 +251,10 @@ fn users_read_and_write_in_cyclic_operation() {
             ("a1", Some(0x0602_0000))
         );
         let read_only = mailboxes.download("a0", 0x1018, 1, &[0; 4]).await;
-        let Err(MailboxError::Sdo {
-            source: SdoError::Abort { code, .. },
-            ..
-        }) = read_only
-        else {
+        let Err(MailboxError::Sdo { source, .. }) = read_only else {
             panic!("{read_only:?}")
         };
-        assert_eq!(code, 0x0601_0002);
+        assert_eq!(source.abort_code(), Some(0x0601_0002));
     });
     outcome.result.expect("an undisturbed run");
     let summary = outcome.summary.expect("a summary");

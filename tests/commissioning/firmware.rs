@@ -14,7 +14,7 @@ use ecaxis_master::clock::Clock;
 use ecaxis_master::config::Locator;
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME, Nanos};
-use ecaxis_master::mailbox::{FoeError, MailboxTransport, SdoError};
+use ecaxis_master::mailbox::{CoeCause, FoeCause, FoeError, MailboxTransport};
 use ecaxis_master::session::run_on_link;
 use ecaxis_master::session::simulated_bus;
 use ecaxis_sim::{
@@ -295,15 +295,27 @@ fn an_update_succeeds_after_power_loss_at_forty_percent() {
                 UpdateMethod::Foe => {
                     assert_eq!(*step, Step::Send);
                     let gone = match position {
-                        0 => matches!(cause, Cause::Foe(FoeError::Wire { .. })),
-                        _ => matches!(cause, Cause::Foe(FoeError::Gone { .. })),
+                        0 => matches!(
+                            **cause,
+                            Cause::Foe(FoeError {
+                                cause: FoeCause::Wire { .. },
+                                ..
+                            })
+                        ),
+                        _ => matches!(
+                            **cause,
+                            Cause::Foe(FoeError {
+                                cause: FoeCause::Gone { .. },
+                                ..
+                            })
+                        ),
                     };
                     assert!(gone, "{error}");
                 }
                 UpdateMethod::Program => {
                     assert_eq!(*step, Step::Download);
                     assert!(
-                        matches!(cause, Cause::Sdo(SdoError::Wire { .. })),
+                        matches!(&**cause, Cause::Sdo(error) if matches!(error.cause, CoeCause::Wire(_))),
                         "{error}"
                     );
                 }
@@ -354,7 +366,7 @@ fn a_cancelled_update_leaves_no_device_in_bootstrap() {
                 let FirmwareError::Failed { cause, left, .. } = &error else {
                     panic!("{error}")
                 };
-                assert!(matches!(cause, Cause::Interrupted), "{error}");
+                assert!(matches!(**cause, Cause::Interrupted), "{error}");
                 let init = FinalDeviceState::In {
                     state: AlState::Init,
                     code: 0,
@@ -487,14 +499,14 @@ fn a_busy_device_is_awaited_for_a_limited_time() {
         let error = bench
             .update(UpdateMethod::Foe, &good, &mut |_| {})
             .expect_err("busy");
-        let FirmwareError::Failed {
-            cause: Cause::Foe(FoeError::Busy { entire: 100, .. }),
-            left,
-            ..
-        } = &error
-        else {
+        let FirmwareError::Failed { cause, left, .. } = &error else {
             panic!("{error}")
         };
+        let Cause::Foe(FoeError { cause, .. }) = &**cause else {
+            panic!("{error}")
+        };
+        let busy = matches!(cause, FoeCause::Busy { entire: 100, .. });
+        assert!(busy, "{error}");
         assert_eq!(
             *left,
             FinalDeviceState::In {

@@ -5,8 +5,8 @@ mod timeouts;
 use std::time::Duration;
 
 use ecaxis_master::mailbox::{
-    CoeClient, DatagramError, FoeClient, MAX_OBJECT, MailboxTransport, NamedObject, Phase,
-    SdoError, Subject,
+    CoeCause, CoeClient, DatagramError, FoeClient, MAX_OBJECT, MailboxTransport, NamedObject,
+    Phase, SdoError, Subject,
 };
 use ecaxis_test_support::mailbox::fault_injection::{Mischief, emergency};
 use ecaxis_test_support::mailbox::server::Server;
@@ -18,6 +18,14 @@ const OBJECTS: &[(u16, u8, &[u8])] = &[
     (0x6041, 0, &[0x37, 0x02]),
     (0x2000, 0, LONG),
 ];
+
+fn sdo_error(index: u16, cause: CoeCause) -> SdoError {
+    SdoError {
+        station: STATION,
+        asked: Subject::Object(NamedObject { index, sub: 0 }),
+        cause,
+    }
+}
 
 fn server(mischief: &[Mischief]) -> Server {
     Server::new(48, OBJECTS, mischief)
@@ -54,15 +62,7 @@ fn download_error(index: u16, data: &[u8], mischief: &[Mischief]) -> (SdoError, 
 #[test]
 fn abort_error_contains_code_and_text() {
     let (error, _) = upload_error(0x6060, &[]);
-    assert_eq!(
-        error,
-        SdoError::Abort {
-            station: STATION,
-            index: 0x6060,
-            sub: 0,
-            code: 0x0602_0000
-        }
-    );
+    assert_eq!(error, sdo_error(0x6060, CoeCause::Abort(0x0602_0000)));
     assert_eq!(
         error.to_string(),
         "station 0x1001: 0x6060:00 (Modes of operation) was refused with 0x06020000: the object does not exist"
@@ -101,15 +101,7 @@ fn abort_among_segments_ends_the_transfer_at_any_address() {
 fn a_mailbox_error_reply_ends_the_transfer() {
     let reply = [4, 0, 0, 0, 0, 0x10, 1, 0, 2, 0];
     let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, reply.to_vec())]);
-    assert_eq!(
-        error,
-        SdoError::Refused {
-            station: STATION,
-            index: 0x6041,
-            sub: 0,
-            code: 2
-        }
-    );
+    assert_eq!(error, sdo_error(0x6041, CoeCause::Refused(2)));
     assert!(
         error.to_string().contains("protocol is not supported"),
         "{error}"
@@ -124,10 +116,7 @@ fn a_length_beyond_the_mailbox_is_malformed() {
             low, high, 0, 0, 0, 0x13, 0, 0x30, 0x4b, 0x41, 0x60, 0, 0, 0, 0, 0,
         ];
         let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, answer.to_vec())]);
-        assert!(
-            matches!(error, SdoError::Malformed { index: 0x6041, .. }),
-            "{error}"
-        );
+        assert!(matches!(error.cause, CoeCause::Malformed(_)), "{error}");
         assert!(
             error
                 .to_string()
@@ -147,7 +136,7 @@ fn answers_that_end_too_early_are_malformed() {
         answer[0] = length;
         let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, answer.to_vec())]);
         assert!(
-            matches!(error, SdoError::Malformed { .. }),
+            matches!(error.cause, CoeCause::Malformed(_)),
             "{length}: {error}"
         );
     }
@@ -220,18 +209,12 @@ fn wrong_announced_sizes_are_malformed() {
 fn oversized_objects_are_rejected_before_the_transfer() {
     let (error, log) = upload_error(0x2000, &[Mischief::AnnounceSize(u32::MAX)]);
     assert!(
-        matches!(
-            error,
-            SdoError::TooLarge {
-                size: 0xffff_ffff,
-                ..
-            }
-        ),
+        matches!(error.cause, CoeCause::TooLarge(0xffff_ffff)),
         "{error}"
     );
     assert_eq!(log.len(), 1);
     let (error, log) = download_error(0x2000, &vec![0; MAX_OBJECT + 1], &[]);
-    assert!(matches!(error, SdoError::TooLarge { .. }), "{error}");
+    assert!(matches!(error.cause, CoeCause::TooLarge(_)), "{error}");
     assert!(log.is_empty());
 }
 
@@ -240,11 +223,13 @@ fn mailboxes_that_cannot_carry_coe_are_refused_before_anything_is_sent() {
     for len in [0, 6, 15, 1487] {
         let server = server(&[]);
         let mut client = CoeClient::new(layout(len));
-        let refused = |asked| SdoError::Mailbox {
+        let refused = |asked| SdoError {
             station: STATION,
             asked,
-            out_len: len,
-            in_len: len,
+            cause: CoeCause::Mailbox {
+                out_len: len,
+                in_len: len,
+            },
         };
         let object = Subject::Object(NamedObject {
             index: 0x6041,
@@ -303,56 +288,25 @@ fn every_error_names_its_object_or_file() {
     let error = block_on(client().upload(&off, 0x6065, 0, false)).unwrap_err();
     assert!(named(error.to_string()).ends_with("it is off, or has lost its address"));
 
-    let (index, sub, station) = (0x6065, 0, STATION);
-    let asked = Subject::Object(NamedObject { index, sub });
     let source = DatagramError::Other("a frame was too long".to_owned());
-    for error in [
-        SdoError::Abort {
-            station,
-            index,
-            sub,
-            code: 1,
-        },
-        SdoError::Timeout {
-            station,
-            index,
-            sub,
+    for cause in [
+        CoeCause::Abort(1),
+        CoeCause::Timeout {
             phase: Phase::Answer,
             after: Duration::ZERO,
             set_aside: 0,
         },
-        SdoError::Refused {
-            station,
-            index,
-            sub,
-            code: 1,
-        },
-        SdoError::Malformed {
-            station,
-            index,
-            sub,
-            what: String::new(),
-        },
-        SdoError::TooLarge {
-            station,
-            index,
-            sub,
-            size: 1,
-        },
-        SdoError::Gone { station, asked },
-        SdoError::Mailbox {
-            station,
-            asked,
+        CoeCause::Refused(1),
+        CoeCause::Malformed(String::new()),
+        CoeCause::TooLarge(1),
+        CoeCause::Gone,
+        CoeCause::Mailbox {
             out_len: 1,
             in_len: 1,
         },
-        SdoError::Wire {
-            station,
-            asked,
-            source,
-        },
+        CoeCause::Wire(source),
     ] {
-        named(error.to_string());
+        named(sdo_error(0x6065, cause).to_string());
     }
 
     let asked = "station 0x1001: the description of 0x6065:00 (Following error window): ";

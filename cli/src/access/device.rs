@@ -275,7 +275,7 @@ impl OpenDevice {
 
     /// Maps an SDO error of this device to a failure with hints.
     pub fn sdo_error<T>(&self, result: Result<T, SdoError>) -> Result<T, Failure> {
-        result.map_err(|error| self.failure(&Cause::Sdo(error).at(&self.device)))
+        result.map_err(|error| self.failure(&Cause::Sdo(error).with_device(&self.device)))
     }
 
     fn failure(&self, error: &Error) -> Failure {

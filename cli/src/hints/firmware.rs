@@ -1,7 +1,7 @@
 //! Advice for a firmware update that was refused or interrupted.
 
 use ecaxis_master::config::Nic;
-use ecaxis_master::mailbox::FoeError;
+use ecaxis_master::mailbox::{FoeCause, FoeError};
 use ecaxis_master::report;
 use ecaxis_tools::firmware::{Cause, FinalDeviceState, FirmwareError, UpdateMethod};
 
@@ -15,13 +15,10 @@ pub(crate) fn shared_bus() -> Failure {
 
 pub(crate) fn firmware(error: &FirmwareError, nic: &Nic) -> Failure {
     let code = match error {
-        FirmwareError::Failed {
-            cause: Cause::Interrupted,
-            ..
-        } => INTERRUPTED,
+        FirmwareError::Failed { cause, .. } if matches!(**cause, Cause::Interrupted) => INTERRUPTED,
         _ => FAILED,
     };
-    let failure = Failure::new(code, message(error));
+    let failure = Failure::new(code, error.to_string());
     match error {
         FirmwareError::Service(error) => super::failure(error, nic),
         FirmwareError::Identity { .. } => failure
@@ -50,20 +47,6 @@ pub(crate) fn firmware(error: &FirmwareError, nic: &Nic) -> Failure {
             failure.hint(again(*left))
         }
     }
-}
-
-/// Returns the error text with the device name once. Most causes repeat it.
-fn message(error: &FirmwareError) -> String {
-    let text = error.to_string();
-    let FirmwareError::Failed { device, .. } = error else {
-        return text;
-    };
-    let head = format!("{device}: ");
-    let Some(rest) = text.strip_prefix(&head) else {
-        return text;
-    };
-    let station = format!("station {:#06x}: ", device.station);
-    head.clone() + &rest.replace(&head, "").replace(&station, "")
 }
 
 fn wrong(failure: Failure) -> Failure {
@@ -97,8 +80,8 @@ fn cause(cause: &Cause) -> Option<String> {
 }
 
 fn foe(error: &FoeError) -> Option<&'static str> {
-    match error {
-        FoeError::Refused { code, .. } => Some(match code {
+    match error.cause {
+        FoeCause::Refused { code, .. } => Some(match code {
             0x8001 | 0x8006 | 0x8009 => {
                 "the device expects another file name: set it with `--name`"
             }
@@ -113,10 +96,10 @@ fn foe(error: &FoeError) -> Option<&'static str> {
                 "the file is damaged or for another device: use the file that its vendor specifies"
             }
         }),
-        FoeError::Busy { .. } | FoeError::Timeout { .. } => {
+        FoeCause::Busy { .. } | FoeCause::Timeout { .. } => {
             Some("the device stopped responding: switch it off and on")
         }
-        FoeError::Gone { .. } | FoeError::Wire { .. } => {
+        FoeCause::Gone { .. } | FoeCause::Wire { .. } => {
             Some("check the device's power and the cable to it")
         }
         _ => None,

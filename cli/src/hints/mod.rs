@@ -10,7 +10,7 @@ use ecaxis_ecat::al_status_code::al_status_hint;
 use ecaxis_esi::address;
 use ecaxis_master::acyclic::StateError;
 use ecaxis_master::config::{ConfigError, LimitConflict, Nic, UnitProblem};
-use ecaxis_master::mailbox::{NamedObject, SdoError};
+use ecaxis_master::mailbox::{CoeCause, SdoError};
 use ecaxis_master::report::{Cause, Error};
 use ecaxis_sim::ServeError;
 
@@ -44,7 +44,7 @@ pub(crate) fn no_ethercat(failure: Failure, one_interface: bool) -> Failure {
 
 /// Maps an error of the master to a failure. Hints depend on whether the bus is real.
 pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
-    let failure = Failure::new(FAILED, message(error));
+    let failure = Failure::new(FAILED, error.to_string());
     let hint = match &*error.cause {
         Cause::Open(open) => return interface(failure, open),
         Cause::NoAnswer => {
@@ -216,35 +216,6 @@ pub(crate) fn replayed(error: &Error, devices: usize) -> Option<String> {
     ))
 }
 
-/// Returns the error text with the device and object address once. The source error repeats both.
-fn message(error: &Error) -> String {
-    let text = error.to_string();
-    let (source, object) = match &*error.cause {
-        Cause::StartUp {
-            index, sub, source, ..
-        } => {
-            let (index, sub) = (*index, *sub);
-            (source.to_string(), Some(NamedObject { index, sub }))
-        }
-        Cause::Sdo(source) => (source.to_string(), None),
-        Cause::Information(source) => (source.to_string(), None),
-        _ => return text,
-    };
-    let station = error
-        .device()
-        .map(|device| format!("station {:#06x}", device.station));
-    let mut short = source.as_str();
-    for known in station.into_iter().chain(object.map(|at| at.to_string())) {
-        if let Some(rest) = short.strip_prefix(&known) {
-            short = rest.trim_start_matches(':').trim_start();
-        }
-    }
-    match text.strip_suffix(&source) {
-        Some(head) => head.to_owned() + short,
-        None => text,
-    }
-}
-
 /// Returns the hint for a refused command. `name`: the axis that refused it.
 fn refused(reason: Option<&CommandError>, name: &str) -> String {
     match reason {
@@ -340,8 +311,8 @@ fn units(problem: &UnitProblem) -> String {
 /// user's own list.
 fn sdo(error: &SdoError, origin: &str) -> String {
     let own = origin == OWN_SDO;
-    match error {
-        SdoError::Abort { code, .. } => match code {
+    match error.cause {
+        CoeCause::Abort(code) => match code {
             0x0602_0000 | 0x0609_0011 if own => {
                 "the drive has no such object: check `index` and `sub` in `sdo`"
             }
@@ -379,8 +350,8 @@ fn sdo(error: &SdoError, origin: &str) -> String {
             0x0800_0022 => "the drive refuses it in its present state: switch it off and on",
             _ => "look the code up in the drive's manual; `ecaxis explain` shows where the value comes from",
         },
-        SdoError::Timeout { .. } => "the drive does not answer its mailbox: switch it off and on",
-        SdoError::Gone { .. } | SdoError::Wire { .. } => "check the device's power and the cable to it",
+        CoeCause::Timeout { .. } => "the drive does not answer its mailbox: switch it off and on",
+        CoeCause::Gone | CoeCause::Wire(_) => "check the device's power and the cable to it",
         _ => "record the exchange with `--record`",
     }
     .to_owned()

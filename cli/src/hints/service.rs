@@ -5,7 +5,7 @@ use std::path::Path;
 use ecaxis_master::acyclic::eeprom::EepromError;
 use ecaxis_master::acyclic::image::WriteError;
 use ecaxis_master::config::Nic;
-use ecaxis_master::mailbox::{InfoError, SdoError};
+use ecaxis_master::mailbox::{CoeCause, InfoError, SdoError};
 use ecaxis_master::report::{Cause, Error};
 use ecaxis_tools::parameters::restore::RestoreError;
 
@@ -31,9 +31,9 @@ pub(super) fn eeprom(error: EepromError) -> &'static str {
 
 /// Returns the hint for an error of the SDO Information service.
 pub(super) fn information(error: &InfoError) -> &'static str {
-    match error {
-        InfoError::Gone { .. } | InfoError::Wire { .. } => FRAMES,
-        error if error.is_refusal() => {
+    match error.cause {
+        CoeCause::Gone | CoeCause::Wire(_) => FRAMES,
+        CoeCause::Abort(_) | CoeCause::Refused(_) => {
             "the device does not support SDO Information: name its ESI file in a machine file or with `--esi`"
         }
         _ => {

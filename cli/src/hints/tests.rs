@@ -1,5 +1,6 @@
 use ecaxis_master::acyclic::{AlState, DeviceRef};
 use ecaxis_master::link::OpenError;
+use ecaxis_master::mailbox::{NamedObject, Subject};
 
 use super::*;
 
@@ -11,6 +12,14 @@ fn device() -> DeviceRef {
     }
 }
 
+fn sdo_error(index: u16, sub: u8, cause: CoeCause) -> SdoError {
+    SdoError {
+        station: 0x1001,
+        asked: Subject::Object(NamedObject { index, sub }),
+        cause,
+    }
+}
+
 fn hints_of(error: &Error) -> (u8, String) {
     let failure = failure(error, &Nic::Interface("eth9".into()));
     (failure.code, failure.hints.join("\n"))
@@ -18,12 +27,7 @@ fn hints_of(error: &Error) -> (u8, String) {
 
 #[test]
 fn every_failure_has_a_hint() {
-    let sdo = |code| SdoError::Abort {
-        station: 0x1001,
-        index: 0x60c2,
-        sub: 1,
-        code,
-    };
+    let sdo = |code| sdo_error(0x60c2, 1, CoeCause::Abort(code));
     let start_up = |code, origin: &str| {
         Cause::StartUp {
             index: 0x60c2,
@@ -33,7 +37,7 @@ fn every_failure_has_a_hint() {
             origin: origin.into(),
             source: sdo(code),
         }
-        .at(device())
+        .with_device(device())
     };
     let refused = |code| {
         let refused = StateError::Refused {
@@ -41,7 +45,7 @@ fn every_failure_has_a_hint() {
             actual: AlState::PreOp,
             code,
         };
-        Cause::State(refused).at(device())
+        Cause::State(refused).with_device(device())
     };
     let not_enabled = |state, code| {
         Cause::NotEnabled {
@@ -51,7 +55,7 @@ fn every_failure_has_a_hint() {
             code,
             timeout_ms: 5000,
         }
-        .at(device())
+        .with_device(device())
     };
     let missing = Cause::Missing {
         expected: 2,
@@ -60,7 +64,7 @@ fn every_failure_has_a_hint() {
     };
     let units = |problem| {
         let problems = vec![problem];
-        Cause::Units { problems }.at(device())
+        Cause::Units { problems }.with_device(device())
     };
     let contradicts = |found| units(UnitProblem::Contradiction(found));
     for (error, code, hint) in [
@@ -153,7 +157,7 @@ fn every_failure_has_a_hint() {
                 statusword: 8,
                 report: Box::default(),
             }
-            .at(device()),
+            .with_device(device()),
             FAILED,
             describe(0x2310).hint,
         ),
@@ -165,7 +169,7 @@ fn every_failure_has_a_hint() {
                 },
                 limits: Vec::new(),
             }
-            .at(device()),
+            .with_device(device()),
             FAILED,
             "following_error",
         ),
@@ -190,12 +194,7 @@ fn every_failure_has_a_hint() {
 #[test]
 fn sdo_hint_names_the_sdo_key_only_for_user_sdos() {
     for code in (0x0503_0000..0x0504_0010).chain(0x0601_0000..0x060a_0030) {
-        let error = SdoError::Abort {
-            station: 0x1001,
-            index: 0x6060,
-            sub: 0,
-            code,
-        };
+        let error = sdo_error(0x6060, 0, CoeCause::Abort(code));
         for origin in ["mode csp", "bus.cycle", "Sm 2 (line 3)"] {
             assert!(!sdo(&error, origin).contains("`sdo`"), "{code:#x}");
         }
@@ -204,20 +203,16 @@ fn sdo_hint_names_the_sdo_key_only_for_user_sdos() {
 
 #[test]
 fn message_names_an_address_once() {
-    let abort = SdoError::Abort {
-        station: 0x1001,
-        index: 0x6060,
-        sub: 0,
-        code: 0x0601_0002,
-    };
-    let timeout = SdoError::Timeout {
-        station: 0x1001,
-        index: 0x6060,
-        sub: 0,
-        phase: ecaxis_master::mailbox::Phase::Answer,
-        after: std::time::Duration::from_secs(1),
-        set_aside: 0,
-    };
+    let abort = sdo_error(0x6060, 0, CoeCause::Abort(0x0601_0002));
+    let timeout = sdo_error(
+        0x6060,
+        0,
+        CoeCause::Timeout {
+            phase: ecaxis_master::mailbox::Phase::Answer,
+            after: std::time::Duration::from_secs(1),
+            set_aside: 0,
+        },
+    );
     for (source, end) in [
         (
             abort.clone(),
@@ -233,16 +228,16 @@ fn message_names_an_address_once() {
             origin: "mode csp".into(),
             source,
         }
-        .at(device());
-        let text = message(&error);
+        .with_device(device());
+        let text = failure(&error, &Nic::Sim).message;
         assert!(text.contains(end), "{text}");
         assert_eq!(text.matches("0x1001").count(), 1, "{text}");
         assert_eq!(text.matches("0x6060").count(), 1, "{text}");
     }
     let error = Cause::Sdo(abort)
-        .at(device())
-        .during("reading the PDO mapping back");
-    let text = message(&error);
+        .with_device(device())
+        .with_action("reading the PDO mapping back");
+    let text = failure(&error, &Nic::Sim).message;
     assert_eq!(text.matches("0x1001").count(), 1, "{text}");
     assert!(text.contains("back: 0x6060"), "{text}");
 }
@@ -297,22 +292,18 @@ fn config_suggests_files_only_for_a_missing_file() {
 #[test]
 fn hints_keep_drives_on_with_another_main_device() {
     let nic = Nic::Interface("eth9".into());
-    let timeout = SdoError::Timeout {
-        station: 0x1001,
-        index: 0x6065,
-        sub: 0,
-        phase: ecaxis_master::mailbox::Phase::Answer,
-        after: std::time::Duration::from_secs(6),
-        set_aside: 0,
-    };
-    let refused = SdoError::Abort {
-        station: 0x1001,
-        index: 0x6065,
-        sub: 0,
-        code: 0x0609_0030,
-    };
+    let timeout = sdo_error(
+        0x6065,
+        0,
+        CoeCause::Timeout {
+            phase: ecaxis_master::mailbox::Phase::Answer,
+            after: std::time::Duration::from_secs(6),
+            set_aside: 0,
+        },
+    );
+    let refused = sdo_error(0x6065, 0, CoeCause::Abort(0x0609_0030));
     for (source, takes_away) in [(timeout, true), (refused, false)] {
-        let error = Cause::Sdo(source).at(device());
+        let error = Cause::Sdo(source).with_device(device());
         let alone = failure(&error, &nic);
         let during = with_other_main_device(failure(&error, &nic), &error);
         let reported = during.hints.join("\n");
@@ -330,26 +321,16 @@ fn hints_keep_drives_on_with_another_main_device() {
 #[test]
 fn firmware_error_names_its_device_once() {
     use ecaxis_tools::firmware::{Cause, FinalDeviceState, FirmwareError, Step};
-    let abort = SdoError::Abort {
-        station: 0x1001,
-        index: 0x1f51,
-        sub: 1,
-        code: 0x0601_0002,
-    };
+    let abort = sdo_error(0x1f51, 1, CoeCause::Abort(0x0601_0002));
     let state = StateError::Gone {
         wanted: AlState::PreOp,
     };
-    let state = super::Cause::State(state).at(device());
+    let state = super::Cause::State(state).with_device(device());
     for (step, cause) in [
         (Step::Clear, Cause::Sdo(abort)),
         (Step::PreOp, Cause::Service(state)),
     ] {
-        let error = FirmwareError::Failed {
-            device: device(),
-            step,
-            cause,
-            left: FinalDeviceState::Silent,
-        };
+        let error = FirmwareError::from_step(&device(), step, cause, FinalDeviceState::Silent);
         let text = firmware(&error, &Nic::Sim).message;
         assert!(
             text.starts_with(&format!("{}: {step}: ", device())),

@@ -103,8 +103,8 @@ pub enum StateError {
 }
 
 impl StateError {
-    pub(crate) fn at(self, device: &DeviceRef) -> Error {
-        Cause::State(self).at(device)
+    pub(crate) fn with_device(self, device: &DeviceRef) -> Error {
+        Cause::State(self).with_device(device)
     }
 }
 
@@ -193,8 +193,8 @@ async fn request(
     device: &DeviceRef,
     wanted: AlState,
 ) -> Result<(), Error> {
-    let failed = |source| StateError::Wire { wanted, source }.at(device);
-    let gone = || StateError::Gone { wanted }.at(device);
+    let failed = |source| StateError::Wire { wanted, source }.with_device(device);
+    let gone = || StateError::Gone { wanted }.with_device(device);
     let status = read_status(wire, device.station).await.map_err(failed)?;
     let (status, _) = status.ok_or_else(gone)?;
     tracing::debug!(%device, "AL status 0x{status:02x}, requesting {wanted}");
@@ -231,10 +231,10 @@ pub async fn wait_state(
         .saturating_add(u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX));
     for device in devices {
         loop {
-            let failed = |source| StateError::Wire { wanted, source }.at(device);
+            let failed = |source| StateError::Wire { wanted, source }.with_device(device);
             let Some((status, code)) = read_status(wire, device.station).await.map_err(failed)?
             else {
-                return Err(StateError::Gone { wanted }.at(device));
+                return Err(StateError::Gone { wanted }.with_device(device));
             };
             let actual = AlState::from_status(status);
             if status & ERROR != 0 {
@@ -243,7 +243,7 @@ pub async fn wait_state(
                     actual,
                     code,
                 };
-                return Err(refused.at(device));
+                return Err(refused.with_device(device));
             }
             if actual == wanted {
                 break;
@@ -254,7 +254,7 @@ pub async fn wait_state(
                     actual,
                     timeout,
                 };
-                return Err(late.at(device));
+                return Err(late.with_device(device));
             }
             wire.delay(POLL).await;
         }

@@ -49,7 +49,7 @@ pub async fn read_sii(
         eeprom.image(&mut |_, _| {}).await
     });
     let image: Result<Vec<u8>, Error> = image.await;
-    sii::parse(&image?).map_err(|error| Cause::Sii(error).at(device))
+    sii::parse(&image?).map_err(|error| Cause::Sii(error).with_device(device))
 }
 
 /// Reads the content of a device's EEPROM; `None` if the PDI is using the EEPROM and the mailbox is
@@ -93,7 +93,10 @@ pub async fn with_mailbox<T, E: From<Error>>(
             None => {
                 // A device that keeps its state must not wait for the rest of a transfer.
                 let _ = lent.coe.abort_transfer(wire).await;
-                Err(Cause::Interrupted.at(device).during(step).into())
+                Err(Cause::Interrupted
+                    .with_device(device)
+                    .with_action(step)
+                    .into())
             }
         };
         let back = lent.close(wire).await;

@@ -348,10 +348,10 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
     }
 
     pub(super) fn stopped(&self) -> Error {
-        self.registers.failed(Cause::Interrupted)
+        self.registers.error(Cause::Interrupted)
     }
 
     pub(super) fn failed(&self, source: EepromError) -> Error {
-        self.registers.failed(Cause::Eeprom(source))
+        self.registers.error(Cause::Eeprom(source))
     }
 }

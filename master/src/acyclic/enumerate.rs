@@ -158,7 +158,7 @@ pub async fn count(wire: &DatagramClient) -> Result<u16, Error> {
         match wire.count().await {
             Ok(0) | Err(DatagramError::Timeout { .. }) => {}
             Ok(count) => return Ok(count),
-            Err(error) => return Err(Error::from(Cause::Datagram(error)).during(STEP)),
+            Err(error) => return Err(Error::from(Cause::Datagram(error)).with_action(STEP)),
         }
     }
     Err(Cause::NoAnswer.into())
@@ -185,7 +185,7 @@ pub async fn at<const N: usize>(
 fn silent(position: u16, action: &'static str, answer: Result<u16, DatagramError>) -> Error {
     match answer {
         Ok(_) | Err(DatagramError::Timeout { .. }) => Cause::Silent { position, action }.into(),
-        Err(error) => Error::from(Cause::Datagram(error)).during(action),
+        Err(error) => Error::from(Cause::Datagram(error)).with_action(action),
     }
 }
 

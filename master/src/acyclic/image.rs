@@ -95,8 +95,8 @@ impl WriteError {
 ///
 /// # Errors
 /// [`EepromError::Smaller`] before anything is written; [`EepromError::NotKept`] if a word reads
-/// back differently; [`Cause::Interrupted`] before the first word; otherwise as
-/// [`Eeprom::write`].
+/// back differently; [`Cause::Interrupted`](crate::report::Cause::Interrupted) before the first
+/// word; otherwise as [`Eeprom::write`].
 pub async fn write<W: MailboxTransport>(
     eeprom: &Eeprom<'_, W>,
     image: &[u8],

@@ -47,7 +47,7 @@ pub async fn open(
         step: "opening the mailbox",
     };
     let status = al::read_status(wire, device.station).await;
-    let status = status.map_err(|error| registers.failed(Cause::Datagram(error)))?;
+    let status = status.map_err(|error| registers.error(Cause::Datagram(error)))?;
     let found = status.map_or(AlState::Unknown(0), |(status, _)| {
         AlState::from_status(status)
     });
@@ -68,7 +68,7 @@ pub async fn open(
             }
             CoeClient::new(layout)
         }
-        state => return Err(Cause::WrongState { state }.at(device)),
+        state => return Err(Cause::WrongState { state }.with_device(device)),
     };
     Ok(MailboxSession {
         coe,
@@ -112,7 +112,7 @@ async fn configured<W: MailboxTransport>(
             out_sm: 0,
             in_sm: 1,
         }),
-        _ => Err(Cause::NoMailbox.at(registers.device)),
+        _ => Err(Cause::NoMailbox.with_device(registers.device)),
     }
 }
 
@@ -132,7 +132,7 @@ pub async fn configure<W: MailboxTransport>(
         send_size,
     } = areas;
     if receive_size == 0 || send_size == 0 {
-        return Err(Cause::NoMailbox.at(registers.device));
+        return Err(Cause::NoMailbox.with_device(registers.device));
     }
     let control = |usage: SmUse, usual: u8| {
         let sm = sii.sync_managers.iter().find(|sm| sm.usage == usage);

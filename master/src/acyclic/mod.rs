@@ -86,11 +86,11 @@ impl<W: MailboxTransport> Registers<'_, W> {
             Ok(0) => Cause::NotTaken { register },
             Err(error) => Cause::Datagram(error),
         };
-        Err(self.failed(cause))
+        Err(self.error(cause))
     }
 
     /// Returns the error with this cause.
-    pub(crate) fn failed(&self, cause: Cause) -> Error {
-        cause.at(self.device).during(self.step)
+    pub(crate) fn error(&self, cause: Cause) -> Error {
+        cause.with_device(self.device).with_action(self.step)
     }
 }

@@ -338,7 +338,7 @@ fn with_mailbox_restores_the_device_when_stopped() {
                     reached += 1;
                     stop.store(reached >= 10, Ordering::Relaxed);
                     let read = lent.coe.upload(&wire, 0x1018, 1, false).await;
-                    read.map_err(|error| Cause::Sdo(error).at(&at))?;
+                    read.map_err(|error| Cause::Sdo(error).with_device(&at))?;
                 }
             });
             let ended: Result<(), Error> = all.await;

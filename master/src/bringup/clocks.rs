@@ -40,7 +40,7 @@ pub(super) async fn configure(
         .filter_map(|(config, device)| Some((config.selection.dc.as_ref()?, device)))
         .collect();
     if let Some((_, device)) = wanting.iter().find(|(_, device)| !device.dc) {
-        return Err(Cause::NoClock.at(&device.at));
+        return Err(Cause::NoClock.with_device(&device.at));
     }
     let reference = devices
         .iter()
@@ -89,7 +89,7 @@ pub(super) async fn configure(
         }
         ahead *= 2;
     }
-    Err(Cause::NoStart.at(&reference.at))
+    Err(Cause::NoStart.with_device(&reference.at))
 }
 
 /// Stops SYNC0 and SYNC1 of devices that are back in PreOp or Init. Active pulses would indicate a
@@ -133,7 +133,11 @@ pub(super) async fn set_again(wire: &DatagramClient, devices: &[BusDevice]) -> R
         write(wire, at, STEP, registers::DC_SPEED_COUNTER_START, &start).await?;
         write(wire, at, STEP, registers::DC_SYSTEM_TIME_DELAY, &delay).await?;
     }
-    let failed = |error| Cause::Datagram(error).at(&reference.at).during(STEP);
+    let failed = |error| {
+        Cause::Datagram(error)
+            .with_device(&reference.at)
+            .with_action(STEP)
+    };
     wire.write_all(registers::DC_RECEIVE_TIME, &[0; 4])
         .await
         .map_err(failed)?;
@@ -172,7 +176,8 @@ pub(super) async fn has_system_time(
     let counter = wire
         .read(at.station, registers::DC_SYSTEM_TIME, &mut [0; 8])
         .await;
-    let counter = counter.map_err(|error| Cause::Datagram(error).at(at).during(STEP))?;
+    let counter =
+        counter.map_err(|error| Cause::Datagram(error).with_device(at).with_action(STEP))?;
     Ok(counter > 0)
 }
 

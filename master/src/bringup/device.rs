@@ -49,8 +49,8 @@ pub(super) async fn start_up(
     };
     coe.drain(wire).await.map_err(|source| {
         Cause::Sdo(source)
-            .at(&device.at)
-            .during("emptying the mailbox")
+            .with_device(&device.at)
+            .with_action("emptying the mailbox")
     })?;
     let mut held = 0;
     for (done, sdo) in list.iter().enumerate() {
@@ -123,7 +123,7 @@ pub async fn write_startup_sdo(
             origin: sdo.origin.clone(),
             holds: format_value(&now),
         }
-        .at(at)),
+        .with_device(at)),
     }
 }
 
@@ -175,7 +175,7 @@ fn failed(at: &DeviceRef, sdo: &StartupSdo, source: SdoError) -> Error {
         origin: sdo.origin.clone(),
         source,
     }
-    .at(at)
+    .with_device(at)
 }
 
 /// Downloads one start-up SDO.

@@ -24,8 +24,8 @@ pub(super) async fn compare(
     let constant = constant && is_maxon(&config.selection);
     let offered = ask(wire, coe, constant).await.map_err(|source| {
         Cause::Sdo(source)
-            .at(&device.at)
-            .during("reading the drive's units")
+            .with_device(&device.at)
+            .with_action("reading the drive's units")
     })?;
     tracing::debug!(device = %device.at, "{offered:?}");
     let adopted = axis.adopt(&offered);
@@ -33,7 +33,7 @@ pub(super) async fn compare(
         return Err(Cause::Units {
             problems: adopted.wrong,
         }
-        .at(&device.at));
+        .with_device(&device.at));
     }
     for what in &adopted.taken {
         progress(Step::Adopted {

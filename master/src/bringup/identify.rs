@@ -54,14 +54,14 @@ pub(super) async fn explain_scan(
                 actual: state,
                 code,
             };
-            return refused.at(&device);
+            return refused.with_device(&device);
         } else if state != al::AlState::PreOp && behind.is_none() {
             behind = Some((device, state));
         }
     }
     if let Some(device) = unaddressed {
         let wanted = al::AlState::PreOp;
-        return al::StateError::Gone { wanted }.at(&device);
+        return al::StateError::Gone { wanted }.with_device(&device);
     }
     let missing = positions(machine).filter(|(position, _)| *position >= count);
     let missing: Vec<_> = missing.map(named).collect();
@@ -76,7 +76,7 @@ pub(super) async fn explain_scan(
                 actual,
                 timeout: crate::link::pdu_loop::STATE_TIMEOUT,
             };
-            timeout.at(&device)
+            timeout.with_device(&device)
         }
         (error, _) => scan_error("scanning the segment and going to PreOp", &error),
     }
@@ -165,7 +165,7 @@ pub(super) async fn assign(
                 found: known(machine, identity),
                 revisions: product.then_some((expected.revision, identity.revision)),
             }
-            .at(device()));
+            .with_device(device()));
         }
         if expected.revision != identity.revision {
             let at = device();
@@ -179,7 +179,7 @@ pub(super) async fn assign(
                 expected,
                 found: serial,
             }
-            .at(device()));
+            .with_device(device()));
         }
     }
     for (position, ScannedDevice { identity, .. }) in found.iter().enumerate() {
@@ -244,7 +244,7 @@ fn lacking<T: PartialEq>(wanted: &[T], there: &[T]) -> Vec<usize> {
 }
 
 fn not_located(name: &str, locator: String) -> report::Error {
-    Cause::NotLocated { locator }.at_name(name)
+    Cause::NotLocated { locator }.with_name(name)
 }
 
 fn not_all(machine: &Machine, found: usize, missing: Vec<String>) -> report::Error {

@@ -20,8 +20,8 @@ pub(super) async fn compare(
     };
     let failed = |source| {
         Cause::Sdo(source)
-            .at(&device.at)
-            .during("reading the drive's limits")
+            .with_device(&device.at)
+            .with_action("reading the drive's limits")
     };
     let selection = &config.selection;
     let dictionary = &selection.dictionary;

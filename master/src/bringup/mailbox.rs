@@ -35,7 +35,7 @@ pub(super) async fn open(
                 expected: show(expected),
                 actual: show(actual),
             }
-            .at(device));
+            .with_device(device));
         }
     }
     Ok(Some(MailboxLayout {

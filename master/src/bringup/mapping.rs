@@ -80,8 +80,8 @@ async fn read_list(
     let list = coe.upload_list(wire, index).await;
     list.map_err(|source| {
         Cause::Sdo(source)
-            .at(&device.at)
-            .during("reading the PDO mapping back")
+            .with_device(&device.at)
+            .with_action("reading the PDO mapping back")
     })
 }
 
@@ -105,5 +105,5 @@ fn differs(
         expected: show(expected),
         actual: show(actual),
     }
-    .at(&device.at)
+    .with_device(&device.at)
 }

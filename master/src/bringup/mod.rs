@@ -168,7 +168,7 @@ pub async fn bring_up(
     enumerate::count(&wire)
         .await
         .map_err(|error| match *error.cause {
-            Cause::Datagram(_) => error.during("scanning"),
+            Cause::Datagram(_) => error.with_action("scanning"),
             _ => error,
         })?;
 
@@ -314,7 +314,7 @@ async fn without_lrw(
 }
 
 fn scan_error(step: &'static str, error: &ethercrab::error::Error) -> Error {
-    Error::from(Cause::Scan(error.to_string())).during(step)
+    Error::from(Cause::Scan(error.to_string())).with_action(step)
 }
 
 impl Bus {

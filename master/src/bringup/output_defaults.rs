@@ -45,8 +45,8 @@ pub(super) async fn read(
         let data = coe.upload_optional(wire, index, sub, false).await;
         let data = data.map_err(|source| {
             Cause::Sdo(source)
-                .at(&device.at)
-                .during("reading the values of its outputs")
+                .with_device(&device.at)
+                .with_action("reading the values of its outputs")
         })?;
         // If an object cannot be read over CoE, the ESI's value is used.
         let data = data.unwrap_or_else(|| {

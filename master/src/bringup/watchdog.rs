@@ -57,8 +57,8 @@ pub(super) async fn set(
                 format!("0x{:04x}", u16::from_le_bytes(found))
             }),
         }
-        .at(&device.at)
-        .during(what);
+        .with_device(&device.at)
+        .with_action(what);
         if found == Some(wanted) {
             continue;
         }
@@ -85,8 +85,8 @@ pub(super) async fn set(
                 wanted: format!("0x{:02x}", sm.control_byte),
                 found: found.map_or("nothing".to_owned(), |[control]| format!("0x{control:02x}")),
             }
-            .at(&device.at)
-            .during("the watchdog trigger of its outputs (bit 6 of the ControlByte)"));
+            .with_device(&device.at)
+            .with_action("the watchdog trigger of its outputs (bit 6 of the ControlByte)"));
         }
     }
     Ok(())
@@ -105,5 +105,7 @@ async fn read<const N: usize>(
 }
 
 fn lost(device: &BusDevice, source: DatagramError) -> Error {
-    Cause::Datagram(source).at(&device.at).during(STEP)
+    Cause::Datagram(source)
+        .with_device(&device.at)
+        .with_action(STEP)
 }

@@ -1,84 +1,100 @@
-//! SDO errors, with the full address of the object.
+//! CoE errors, with the full address of the object.
 
 use std::fmt;
 use std::time::Duration;
 
 use ecaxis_ecat::mailbox::{abort_text, mailbox_error_text};
 
-use super::{DatagramError, MAX_OBJECT};
+use super::{DatagramError, InfoRequest, MAX_OBJECT};
 use ecaxis_ecat::object::NamedObject;
 
-/// An SDO error. `station` is the SubDevice's configured address. The transfer has ended in every
-/// case, and the next one starts clean.
+/// An error of a CoE service. `station` is the SubDevice's configured address. The transfer has
+/// ended in every case, and the next one starts clean.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CoeError<S> {
+    pub station: u16,
+    pub asked: S,
+    pub cause: CoeCause,
+}
+
+/// An SDO error.
+pub type SdoError = CoeError<Subject>;
+/// An SDO Information error.
+pub type InfoError = CoeError<InfoRequest>;
+
+/// Why a CoE service failed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum SdoError {
+pub enum CoeCause {
     /// The SubDevice aborted, with a CiA 301 or vendor-specific code.
-    #[error("station {station:#06x}: {} was refused with {code:#010x}: {}", object(index, sub), abort_text(*code))]
-    Abort {
-        station: u16,
-        index: u16,
-        sub: u8,
-        code: u32,
-    },
+    #[error("was refused with {:#010x}: {}", .0, abort_text(*.0))]
+    Abort(u32),
     /// No answer in time. Meanwhile `set_aside` messages arrived that belong to something else.
-    #[error("station {station:#06x}: {}: {phase} within {after:?}{}", object(index, sub), StrayReplies(*set_aside))]
+    #[error("{phase} within {after:?}{}", StrayReplies(*set_aside))]
     Timeout {
-        station: u16,
-        index: u16,
-        sub: u8,
         phase: Phase,
         after: Duration,
         set_aside: u64,
     },
-    /// The SubDevice's mailbox rejected the request itself.
-    #[error("station {station:#06x}: {}: the mailbox refused the request with {code:#06x}: {}", object(index, sub), mailbox_error_text(*code))]
-    Refused {
-        station: u16,
-        index: u16,
-        sub: u8,
-        code: u16,
-    },
-    #[error(
-        "station {station:#06x}: {}: the answer makes no sense: {what}",
-        object(index, sub)
-    )]
-    Malformed {
-        station: u16,
-        index: u16,
-        sub: u8,
-        what: String,
-    },
-    #[error(
-        "station {station:#06x}: {} has {size} bytes, more than the {MAX_OBJECT} that are supported",
-        object(index, sub)
-    )]
-    TooLarge {
-        station: u16,
-        index: u16,
-        sub: u8,
-        size: usize,
-    },
+    /// The SubDevice's mailbox rejected the request itself. Most such devices have no SDO
+    /// Information.
+    #[error("the mailbox refused the request with {:#06x}: {}", .0, mailbox_error_text(*.0))]
+    Refused(u16),
+    #[error("the answer makes no sense: {0}")]
+    Malformed(String),
+    #[error("has {0} bytes, more than the {MAX_OBJECT} that are supported")]
+    TooLarge(usize),
     /// Frames come back, but this SubDevice processed none of them.
-    #[error(
-        "station {station:#06x}: {asked}: the device does not answer: it is off, or has lost its address"
-    )]
-    Gone { station: u16, asked: Subject },
-    #[error(
-        "station {station:#06x}: {asked}: mailboxes of {out_len} bytes out and {in_len} bytes in cannot carry CoE"
-    )]
-    Mailbox {
-        station: u16,
-        asked: Subject,
-        out_len: u16,
-        in_len: u16,
-    },
+    #[error("the device does not answer: it is off, or has lost its address")]
+    Gone,
+    #[error("mailboxes of {out_len} bytes out and {in_len} bytes in cannot carry CoE")]
+    Mailbox { out_len: u16, in_len: u16 },
     /// No frames come back.
-    #[error("station {station:#06x}: {asked}: {}", LostDatagram(source))]
-    Wire {
-        station: u16,
-        asked: Subject,
-        source: DatagramError,
-    },
+    #[error("{}", LostDatagram(.0))]
+    Wire(DatagramError),
+}
+
+impl<S: fmt::Display> fmt::Display for CoeError<S> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "station {:#06x}: {}",
+            self.station,
+            self.without_station()
+        )
+    }
+}
+
+impl<S: fmt::Debug + fmt::Display> std::error::Error for CoeError<S> {}
+
+impl<S: fmt::Display> CoeError<S> {
+    /// Returns the text without the station, for a reader who knows the device.
+    pub fn without_station(&self) -> impl fmt::Display {
+        let colon = match self.cause {
+            CoeCause::Abort(_) | CoeCause::TooLarge(_) => "",
+            _ => ":",
+        };
+        format!("{}{colon} {}", self.asked, self.cause)
+    }
+}
+
+impl<S> CoeError<S> {
+    /// Returns the device's abort code, if there is one.
+    pub fn abort_code(&self) -> Option<u32> {
+        match self.cause {
+            CoeCause::Abort(code) => Some(code),
+            _ => None,
+        }
+    }
+
+    /// True if the device did not answer in time.
+    pub fn is_timeout(&self) -> bool {
+        matches!(self.cause, CoeCause::Timeout { .. })
+    }
+
+    /// True if the device itself refused; it may still answer other requests.
+    pub fn is_refusal(&self) -> bool {
+        matches!(self.cause, CoeCause::Abort(_) | CoeCause::Refused(_))
+    }
 }
 
 /// The purpose of a mailbox access that failed.
@@ -110,16 +126,6 @@ impl fmt::Display for LostDatagram<'_> {
     }
 }
 
-impl SdoError {
-    /// Returns the device's abort code, if there is one.
-    pub fn abort_code(&self) -> Option<u32> {
-        match self {
-            Self::Abort { code, .. } => Some(*code),
-            _ => None,
-        }
-    }
-}
-
 /// The phase in which a timeout occurred.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Phase {
@@ -141,13 +147,6 @@ impl fmt::Display for Phase {
             Self::Repeat => "a lost answer was not repeated",
             Self::Transfer => "the transfer was not complete",
         })
-    }
-}
-
-fn object(index: &u16, sub: &u8) -> NamedObject {
-    NamedObject {
-        index: *index,
-        sub: *sub,
     }
 }
 

@@ -26,10 +26,10 @@ pub mod worker;
 pub use ecaxis_ecat::mailbox::{abort_text, mailbox_error_text};
 pub use ecaxis_ecat::object::{NamedObject, object_name};
 pub use emergency::{EMERGENCY_QUEUE, Emergencies, Emergency, Received};
-pub use error::{Phase, SdoError, Subject};
-pub use foe::{FoeClient, FoeError};
+pub use error::{CoeCause, CoeError, InfoError, Phase, SdoError, Subject};
+pub use foe::{FoeCause, FoeClient, FoeError};
 pub use sdo::{CoeClient, MAX_OBJECT};
-pub use sdo_info::{EntryDescription, InfoError, InfoRequest, ObjectDescription, ObjectList};
+pub use sdo_info::{EntryDescription, InfoRequest, ObjectDescription, ObjectList};
 pub use worker::{DeviceMailbox, MailboxError, Mailboxes};
 
 /// Datagrams to a SubDevice, and time. This module has no other access to the outside.

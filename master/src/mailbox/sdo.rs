@@ -4,7 +4,7 @@
 use ecaxis_ecat::mailbox::coe::{Answer, Message, Request, download_room, segment_room};
 
 use super::emergency::{Emergencies, Emergency};
-use super::error::{Phase, SdoError};
+use super::error::{CoeCause, Phase, SdoError};
 use super::transfer::{Transfer, TransferFailure, drain_error};
 use super::transport::{Deadline, Port, TransportError};
 use super::{MailboxLayout, MailboxTransport, Timeouts};
@@ -93,7 +93,7 @@ impl CoeClient {
     ) -> Result<Option<Vec<u8>>, SdoError> {
         match self.upload(w, index, sub, complete).await {
             Ok(data) => Ok(Some(data)),
-            Err(SdoError::Abort { .. }) => Ok(None),
+            Err(error) if error.abort_code().is_some() => Ok(None),
             Err(error) => Err(error),
         }
     }
@@ -278,7 +278,7 @@ impl CoeClient {
                 Ok(value)
             }
             Err(TransferFailure { error, abort }) => {
-                if matches!(error, SdoError::Abort { .. }) {
+                if error.abort_code().is_some() {
                     self.unsettled = false;
                 }
                 if let Some(code) = abort {
@@ -322,7 +322,9 @@ impl CoeClient {
             )
             .await?;
         if size > MAX_OBJECT {
-            return Err(transfer.too_large(size).with_abort_code(ABORT_MEMORY));
+            return Err(transfer
+                .failure(CoeCause::TooLarge(size))
+                .with_abort_code(ABORT_MEMORY));
         }
         if data.len() >= size {
             return Ok(data);
@@ -386,7 +388,7 @@ impl CoeClient {
         } = *transfer;
         let size = match u32::try_from(data.len()) {
             Ok(size) if data.len() <= most => size,
-            _ => return Err(transfer.too_large(data.len())),
+            _ => return Err(transfer.failure(CoeCause::TooLarge(data.len()))),
         };
         let expedited = (1..=4).contains(&data.len()) && !complete;
         let room = download_room(self.port.layout.out_len);
@@ -490,7 +492,7 @@ impl CoeClient {
                     if in_segments || index == transfer.index =>
                 {
                     self.port.free = true;
-                    return Err(transfer.aborted(code));
+                    return Err(transfer.failure(CoeCause::Abort(code)));
                 }
                 Ok(Message::Sdo(answer)) if transfer.fits(&answer) => {
                     if let Some(value) = expected(&answer) {
@@ -498,7 +500,7 @@ impl CoeClient {
                         return Ok(value);
                     }
                 }
-                Ok(Message::Refused(code)) => return Err(transfer.refused(code)),
+                Ok(Message::Refused(code)) => return Err(transfer.failure(CoeCause::Refused(code))),
                 Ok(_) => {}
                 Err(flaw) => return Err(reported(transfer.malformed(flaw), ABORT_GENERAL)),
             }

@@ -2,14 +2,13 @@
 //! answer may have many fragments; they are joined before the answer is parsed.
 
 use std::fmt;
-use std::time::Duration;
 
 use ecaxis_ecat::mailbox::coe::{Answer, Fragment, Message, Request};
-use ecaxis_ecat::mailbox::{abort_text, mailbox_error_text};
 
-use super::error::{LostDatagram, Phase};
+use super::error::{CoeCause, InfoError, Phase};
+use super::transfer::explain;
 use super::transport::{Deadline, TransportError};
-use super::{CoeClient, DatagramError, MailboxLayout, MailboxTransport};
+use super::{CoeClient, MailboxTransport};
 use ecaxis_ecat::object::NamedObject;
 
 const LIST: u8 = 1;
@@ -96,68 +95,6 @@ impl fmt::Display for InfoRequest {
                 write!(f, "the description of {}", NamedObject { index, sub })
             }
         }
-    }
-}
-
-/// An SDO Information error. `station` is the SubDevice's configured address. The next request
-/// starts clean in every case.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum InfoError {
-    /// The SubDevice refused, with an SDO abort code.
-    #[error("station {station:#06x}: {asked} was refused with {code:#010x}: {}", abort_text(*code))]
-    Abort {
-        station: u16,
-        asked: InfoRequest,
-        code: u32,
-    },
-    /// The SubDevice's mailbox rejected the request itself. Most such devices have no SDO
-    /// Information.
-    #[error("station {station:#06x}: {asked}: the mailbox refused the request with {code:#06x}: {}", mailbox_error_text(*code))]
-    Refused {
-        station: u16,
-        asked: InfoRequest,
-        code: u16,
-    },
-    #[error("station {station:#06x}: {asked}: {phase} within {after:?}")]
-    Timeout {
-        station: u16,
-        asked: InfoRequest,
-        phase: Phase,
-        after: Duration,
-    },
-    #[error("station {station:#06x}: {asked}: the answer makes no sense: {what}")]
-    Malformed {
-        station: u16,
-        asked: InfoRequest,
-        what: String,
-    },
-    /// Frames come back, but this SubDevice processed none of them.
-    #[error(
-        "station {station:#06x}: {asked}: the device does not answer: it is off, or has lost its address"
-    )]
-    Gone { station: u16, asked: InfoRequest },
-    #[error(
-        "station {station:#06x}: {asked}: mailboxes of {out_len} bytes out and {in_len} bytes in cannot carry CoE"
-    )]
-    Mailbox {
-        station: u16,
-        asked: InfoRequest,
-        out_len: u16,
-        in_len: u16,
-    },
-    /// No frames come back.
-    #[error("station {station:#06x}: {asked}: {}", LostDatagram(source))]
-    Wire {
-        station: u16,
-        asked: InfoRequest,
-        source: DatagramError,
-    },
-}
-
-impl InfoError {
-    /// True if the device itself refused; it may still answer other requests.
-    pub fn is_refusal(&self) -> bool {
-        matches!(self, Self::Abort { .. } | Self::Refused { .. })
     }
 }
 
@@ -359,12 +296,7 @@ impl CoeClient {
                     return Err(self.aborted(asked, code).into());
                 }
                 Ok(Message::Refused(code)) => {
-                    return Err(InfoError::Refused {
-                        station: self.port.layout.station,
-                        asked,
-                        code,
-                    }
-                    .into());
+                    return Err(self.failure(asked, CoeCause::Refused(code)).into());
                 }
                 Ok(_) => {
                     self.port.set_aside(w);
@@ -421,47 +353,22 @@ impl CoeClient {
     fn aborted(&mut self, asked: InfoRequest, code: u32) -> InfoError {
         self.port.free = true;
         self.unsettled = false;
-        InfoError::Abort {
-            station: self.port.layout.station,
-            asked,
-            code,
-        }
+        self.failure(asked, CoeCause::Abort(code))
     }
 
     fn malformed(&self, asked: InfoRequest, what: impl ToString) -> InfoError {
-        InfoError::Malformed {
-            station: self.port.layout.station,
-            asked,
-            what: what.to_string(),
-        }
+        self.failure(asked, CoeCause::Malformed(what.to_string()))
     }
 
     fn error(&self, asked: InfoRequest, trouble: TransportError) -> InfoError {
-        let MailboxLayout {
-            station,
-            out_len,
-            in_len,
-            ..
-        } = self.port.layout;
-        match trouble {
-            TransportError::Timeout(phase) => InfoError::Timeout {
-                station,
-                asked,
-                phase,
-                after: self.port.timeouts.of(phase),
-            },
-            TransportError::Gone => InfoError::Gone { station, asked },
-            TransportError::Wire(source) => InfoError::Wire {
-                station,
-                asked,
-                source,
-            },
-            TransportError::Layout => InfoError::Mailbox {
-                station,
-                asked,
-                out_len,
-                in_len,
-            },
+        self.failure(asked, explain(&self.port, trouble, 0))
+    }
+
+    fn failure(&self, asked: InfoRequest, cause: CoeCause) -> InfoError {
+        InfoError {
+            station: self.port.layout.station,
+            asked,
+            cause,
         }
     }
 }

@@ -3,7 +3,7 @@
 use super::MailboxLayout;
 use ecaxis_ecat::mailbox::coe::Answer;
 
-use super::error::{Phase, SdoError, Subject};
+use super::error::{CoeCause, SdoError, Subject};
 use super::transport::{Deadline, Port, TransportError};
 use ecaxis_ecat::object::NamedObject;
 
@@ -54,118 +54,51 @@ impl Transfer {
     }
 
     pub(super) fn trouble(&self, port: &Port, trouble: TransportError) -> TransferFailure {
-        let Self {
-            station,
-            index,
-            sub,
-            ..
-        } = *self;
-        let asked = Subject::Object(NamedObject { index, sub });
-        TransferFailure::from(explain(port, trouble, asked, |phase| SdoError::Timeout {
-            station,
-            index,
-            sub,
-            phase,
-            after: port.timeouts.of(phase),
-            set_aside: port.forgotten.saturating_sub(self.forgotten),
-        }))
+        let set_aside = port.forgotten.saturating_sub(self.forgotten);
+        self.failure(explain(port, trouble, set_aside))
     }
 
-    pub(super) fn aborted(&self, code: u32) -> TransferFailure {
-        let Self {
-            station,
-            index,
-            sub,
-            ..
-        } = *self;
-        TransferFailure::from(SdoError::Abort {
-            station,
-            index,
-            sub,
-            code,
-        })
-    }
-
-    pub(super) fn refused(&self, code: u16) -> TransferFailure {
-        let Self {
-            station,
-            index,
-            sub,
-            ..
-        } = *self;
-        TransferFailure::from(SdoError::Refused {
-            station,
-            index,
-            sub,
-            code,
+    pub(super) fn failure(&self, cause: CoeCause) -> TransferFailure {
+        let (index, sub) = (self.index, self.sub);
+        TransferFailure::from(SdoError {
+            station: self.station,
+            asked: Subject::Object(NamedObject { index, sub }),
+            cause,
         })
     }
 
     pub(super) fn malformed(&self, what: impl ToString) -> TransferFailure {
-        let Self {
-            station,
-            index,
-            sub,
-            ..
-        } = *self;
-        TransferFailure::from(SdoError::Malformed {
-            station,
-            index,
-            sub,
-            what: what.to_string(),
-        })
-    }
-
-    pub(super) fn too_large(&self, size: usize) -> TransferFailure {
-        let Self {
-            station,
-            index,
-            sub,
-            ..
-        } = *self;
-        TransferFailure::from(SdoError::TooLarge {
-            station,
-            index,
-            sub,
-            size,
-        })
+        self.failure(CoeCause::Malformed(what.to_string()))
     }
 }
 
-/// Converts a transport error to an SDO error with the SubDevice's address and the request.
-/// `timeout` creates the error for a timeout.
-pub(super) fn explain(
-    port: &Port,
-    trouble: TransportError,
-    asked: Subject,
-    timeout: impl FnOnce(Phase) -> SdoError,
-) -> SdoError {
+/// Converts a transport error. Meanwhile `set_aside` messages arrived that belong to something
+/// else.
+pub(super) fn explain(port: &Port, trouble: TransportError, set_aside: u64) -> CoeCause {
     let MailboxLayout {
-        station,
-        out_len,
-        in_len,
-        ..
+        out_len, in_len, ..
     } = port.layout;
     match trouble {
-        TransportError::Timeout(phase) => timeout(phase),
-        TransportError::Gone => SdoError::Gone { station, asked },
-        TransportError::Wire(source) => SdoError::Wire {
-            station,
-            asked,
-            source,
+        TransportError::Timeout(phase) => CoeCause::Timeout {
+            phase,
+            after: port.timeouts.of(phase),
+            set_aside,
         },
-        TransportError::Layout => SdoError::Mailbox {
-            station,
-            asked,
-            out_len,
-            in_len,
-        },
+        TransportError::Gone => CoeCause::Gone,
+        TransportError::Wire(error) => CoeCause::Wire(error),
+        TransportError::Layout => CoeCause::Mailbox { out_len, in_len },
     }
 }
 
 /// Converts an error while emptying a mailbox. Emptying waits for no answer, so a timeout means
 /// that the device is gone.
 pub(super) fn drain_error(port: &Port, trouble: TransportError) -> SdoError {
-    let (station, asked) = (port.layout.station, Subject::Emptying);
-    explain(port, trouble, asked, |_| SdoError::Gone { station, asked })
+    SdoError {
+        station: port.layout.station,
+        asked: Subject::Emptying,
+        cause: match trouble {
+            TransportError::Timeout(_) => CoeCause::Gone,
+            trouble => explain(port, trouble, 0),
+        },
+    }
 }

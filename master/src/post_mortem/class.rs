@@ -3,7 +3,7 @@
 use super::diagnose::{SYNC_CODES, WATCHDOG};
 use super::evidence::{Evidence, Lateness};
 use crate::acyclic::{AlState, DeviceRef, StateError};
-use crate::mailbox::SdoError;
+use crate::mailbox::CoeCause;
 use crate::report::{Cause, Error};
 
 /// The class of causes that an error can have.
@@ -45,10 +45,10 @@ impl Class {
             | Cause::NotTaken { .. }
             | Cause::Scan(_)
             | Cause::Missing { .. } => Self::Bus,
-            Cause::StartUp { source, .. } | Cause::Sdo(source) => match source {
-                SdoError::Gone { .. } | SdoError::Wire { .. } => Self::Bus,
+            Cause::StartUp { source, .. } | Cause::Sdo(source) => match source.cause {
+                CoeCause::Gone | CoeCause::Wire(_) => Self::Bus,
                 // A device that another MainDevice sets to Init loses its mailbox.
-                SdoError::Timeout { .. } if evidence.other_frames() > 0 => Self::Bus,
+                CoeCause::Timeout { .. } if evidence.other_frames() > 0 => Self::Bus,
                 _ => Self::Device,
             },
             Cause::FollowLost { reason, .. }

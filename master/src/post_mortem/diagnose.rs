@@ -12,7 +12,6 @@ use super::class::Class;
 use super::evidence::{DeviceEvidence, Evidence, Lateness, place};
 use super::snapshot::SyncSnapshot;
 use crate::acyclic::{AlState, DeviceRef, StateError};
-use crate::mailbox::SdoError;
 use crate::report::{self, Error};
 use ecaxis_ecat::al_status_code::al_status_text;
 
@@ -315,7 +314,7 @@ fn downstream(evidence: &Evidence, index: usize) -> impl Iterator<Item = &Device
 }
 
 fn device_cause(error: &Error, evidence: &Evidence) -> Option<Cause> {
-    let device = error.device();
+    let (device, action) = (error.device(), error.action);
     match &*error.cause {
         report::Cause::LeftOp { state, code } => Some(left_op(device?, *state, *code, evidence)),
         report::Cause::State(StateError::Refused { code, .. }) => {
@@ -363,15 +362,15 @@ fn device_cause(error: &Error, evidence: &Evidence) -> Option<Cause> {
             index,
             sub,
             name,
-            source: SdoError::Timeout { .. },
+            source,
             ..
-        } => Some(Cause::Mailbox {
+        } if source.is_timeout() => Some(Cause::Mailbox {
             device: place(device?),
             doing: format!("start-up SDO {} {name}", address(*index, *sub)),
         }),
-        report::Cause::Sdo(SdoError::Timeout { .. }) => Some(Cause::Mailbox {
+        report::Cause::Sdo(error) if error.is_timeout() => Some(Cause::Mailbox {
             device: place(device?),
-            doing: error.action?.to_owned(),
+            doing: action?.to_owned(),
         }),
         report::Cause::Identity {
             esi,

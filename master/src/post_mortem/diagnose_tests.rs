@@ -100,7 +100,7 @@ fn left_op(position: u16, code: u16) -> Error {
         state: AlState::SafeOp,
         code,
     }
-    .at(at(position))
+    .with_device(at(position))
 }
 
 fn absent(evidence: &mut Evidence, from: usize) {
@@ -134,7 +134,7 @@ fn diagnose_names_device_and_cause() {
             "`a1` (position 1) is out of reach, with 1 behind it: port 1 of `a0` has no link; the cable is broken, or the device has no power",
         ),
         (
-            report::Cause::Gone.at(at(2)),
+            report::Cause::Gone.with_device(at(2)),
             with(|e| absent(e, 2)),
             "`a2` (position 2) is out of reach: port 1 of `a1` has no link; the cable is broken, or the device has no power",
         ),
@@ -147,7 +147,7 @@ fn diagnose_names_device_and_cause() {
             "`a2` (position 2) is out of reach: port 1 of `a1` has a link, but no device behind it answers",
         ),
         (
-            report::Cause::Gone.at(at(1)),
+            report::Cause::Gone.with_device(at(1)),
             with(|e| {
                 absent(e, 1);
                 for device in &mut e.devices[1..] {
@@ -221,7 +221,7 @@ fn diagnose_names_device_and_cause() {
                 statusword: 0x0218,
                 report: Box::default(),
             }
-            .at(at(1)),
+            .with_device(at(1)),
             with(overrun),
             "`a1` (position 1, station 0x1001): drive fault (Statusword 0x0218), error code (0x603F) 0x3220: DC link undervoltage",
         ),
@@ -254,7 +254,7 @@ fn diagnose_names_device_and_cause() {
                 actual: AlState::SafeOp,
                 code: 0x002d,
             })
-            .at(at(2)),
+            .with_device(at(2)),
             with(|e| {
                 e.devices[2].look.sync = Some(SyncSnapshot::default());
             }),
@@ -265,7 +265,7 @@ fn diagnose_names_device_and_cause() {
                 state: AlState::Init,
                 code: 0,
             }
-            .at(at(0)),
+            .with_device(at(0)),
             with(|e| {
                 e.notes
                     .insert(0, note(999, LogEntryKind::OtherMainDevice(12)));
@@ -278,7 +278,7 @@ fn diagnose_names_device_and_cause() {
                 state: AlState::PreOp,
                 code: 0,
             }
-            .at(at(0)),
+            .with_device(at(0)),
             good(),
             "`a0` (position 0) is in PreOp without an error: another program requested it, or the device restarted",
         ),
@@ -290,7 +290,7 @@ fn diagnose_names_device_and_cause() {
                 },
                 limits: Vec::new(),
             }
-            .at(at(1)),
+            .with_device(at(1)),
             with(|e| e.devices[1].look.interpolation_ns = Some(20 * MS)),
             "`a1` (position 1): the drive counts on a cycle of 20 ms (0x60C2), it is 1 ms; then: `a1`: following error 2.0000 exceeds 1.0000",
         ),
@@ -302,7 +302,7 @@ fn diagnose_names_device_and_cause() {
                 },
                 limits: Vec::new(),
             }
-            .at(at(1)),
+            .with_device(at(1)),
             with(|e| e.devices[1].look.interpolation_ns = Some(MS)),
             "`a1` (position 1, station 0x1001): following error 2.0000 exceeds 1.0000",
         ),
@@ -314,7 +314,7 @@ fn diagnose_names_device_and_cause() {
                 code: None,
                 timeout_ms: 5000,
             }
-            .at(at(1)),
+            .with_device(at(1)),
             with(|e| {
                 e.devices[1].look.watchdog = Some(WatchdogSnapshot {
                     time_ns: 100 * MS,
@@ -427,9 +427,9 @@ fn stopped_find_returns_the_stop_of_an_error() {
 fn diagnose_returns_the_cause_of_a_stopped_group() {
     let error = report::Cause::GroupStopped {
         group: "g".into(),
-        cause: std::sync::Arc::new(report::Cause::Gone.at(at(2))),
+        cause: std::sync::Arc::new(report::Cause::Gone.with_device(at(2))),
     }
-    .at(at(1));
+    .with_device(at(1));
     let evidence = with(|e| absent(e, 2));
     let found = diagnose(&error, &evidence);
     assert!(matches!(found.cause, Cause::OutOfReach { .. }), "{found:?}");
@@ -443,7 +443,7 @@ fn diagnose_keeps_other_observations() {
         statusword: 0x0218,
         report: Box::default(),
     }
-    .at(at(1));
+    .with_device(at(1));
     let evidence = with(|e| {
         e.devices[2].recent.invalid_frames[0] = 7;
         e.notes

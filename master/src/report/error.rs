@@ -1,5 +1,4 @@
-//! Errors of the master: step, place and cause. Hints for the user come from the command
-//! line.
+//! Errors of the master: step, place and cause. Hints for the user come from the command line.
 
 use std::borrow::Borrow;
 use std::fmt;
@@ -10,7 +9,7 @@ use ecaxis_axis::{CommandError, Mode, State, Trip};
 
 use crate::acyclic::eeprom::EepromError;
 use crate::acyclic::{AlState, DeviceRef, StateError};
-use crate::config::{LimitConflict, UnitProblem};
+use crate::config::{LimitConflict, Step, UnitProblem};
 use crate::link::{LinkError, OpenError};
 use crate::mailbox::{DatagramError, InfoError, SdoError};
 use crate::rt::image::{NotMapped, TooLarge};
@@ -38,6 +37,12 @@ pub enum FailedStep {
     BringUp,
     /// A step of the machine file's program.
     Program(StepRef),
+}
+
+impl From<&Step> for FailedStep {
+    fn from(step: &Step) -> Self {
+        Self::Program(step.into())
+    }
 }
 
 impl fmt::Display for FailedStep {
@@ -119,9 +124,9 @@ pub enum Cause {
     NoMailbox,
     #[error("is in {state}, where it has no CoE mailbox")]
     WrongState { state: AlState },
-    #[error(transparent)]
+    #[error("{}", .0.without_station())]
     Sdo(SdoError),
-    #[error(transparent)]
+    #[error("{}", .0.without_station())]
     Information(InfoError),
     /// The scan failed in a way that the devices do not explain.
     #[error("{0}")]
@@ -150,7 +155,7 @@ pub enum Cause {
     Serial { expected: u32, found: u32 },
     #[error("no SubDevice has {locator}")]
     NotLocated { locator: String },
-    #[error("start-up SDO {} {name} = {value} (from {origin}): {source}", address(*index, *sub))]
+    #[error("start-up SDO {} {name} = {value} (from {origin}): {}", address(*index, *sub), source.cause)]
     StartUp {
         index: u16,
         sub: u8,
@@ -340,7 +345,7 @@ pub enum Cause {
 impl Cause {
     /// Returns the error with this cause at a device.
     #[must_use]
-    pub fn at(self, device: impl Borrow<DeviceRef>) -> Error {
+    pub fn with_device(self, device: impl Borrow<DeviceRef>) -> Error {
         Error {
             at: Some(Place::Device(device.borrow().clone())),
             ..self.into()
@@ -348,7 +353,7 @@ impl Cause {
     }
 
     /// Returns the error with this cause at a device or signal of the machine file.
-    pub(crate) fn at_name(self, name: &str) -> Error {
+    pub(crate) fn with_name(self, name: &str) -> Error {
         Error {
             at: Some(Place::Name(name.to_owned())),
             ..self.into()
@@ -374,26 +379,28 @@ impl From<OpenError> for Error {
 }
 
 impl Error {
-    /// Adds the step of the program.
-    pub(crate) fn in_step(self, step: impl Into<StepRef>) -> Self {
+    /// Adds the step.
+    pub(crate) fn with_step(self, step: impl Into<FailedStep>) -> Self {
         Self {
-            step: Some(FailedStep::Program(step.into())),
-            ..self
-        }
-    }
-
-    pub(crate) fn in_bring_up(self) -> Self {
-        Self {
-            step: Some(FailedStep::BringUp),
+            step: Some(step.into()),
             ..self
         }
     }
 
     /// Adds what the master was doing.
     #[must_use]
-    pub fn during(self, action: &'static str) -> Self {
+    pub fn with_action(self, action: &'static str) -> Self {
         Self {
             action: Some(action),
+            ..self
+        }
+    }
+
+    /// Removes the device if the error is part of a text that names it.
+    #[must_use]
+    pub fn without_device(self, device: &DeviceRef) -> Self {
+        Self {
+            at: (self.device() != Some(device)).then_some(self.at).flatten(),
             ..self
         }
     }

@@ -23,6 +23,7 @@ use crate::mailbox::Mailboxes;
 use crate::mailbox::worker::{self, EmergencySink, MailboxWorker, WorkerConfig};
 use crate::post_mortem::DeviceSnapshot;
 use crate::post_mortem::snapshot::{self, Depth};
+use crate::report::FailedStep;
 use crate::rt::axis::RtAxis;
 use crate::rt::bus_monitor::BusMonitor;
 use crate::rt::channel::channel;
@@ -243,7 +244,7 @@ fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
     let name = |index: usize| machine.devices[index].name.as_str();
     let image = image::of(machine).map_err(|error| {
         let device = error.device;
-        Cause::TooLarge(error).at_name(name(device))
+        Cause::TooLarge(error).with_name(name(device))
     })?;
     let mut slots = Vec::new();
     let mut axes = Vec::new();
@@ -252,12 +253,12 @@ fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
             continue;
         };
         let bits = AxisBits::new(&device.selection.layout, region)
-            .map_err(|error| Cause::NotMapped(error).at_name(name(index)))?;
+            .map_err(|error| Cause::NotMapped(error).with_name(name(index)))?;
         let mut config = setup.config;
         // A feedback value belongs to the set-point of an earlier cycle.
         config.answers_late = machine.bus.exchange.frame_sets() - 1;
         config.dead_time_s += f64::from(config.answers_late) * machine.bus.cycle_ns as f64 * 1e-9;
-        let axis = Axis::new(config).map_err(|error| Cause::Axis(error).at_name(name(index)))?;
+        let axis = Axis::new(config).map_err(|error| Cause::Axis(error).with_name(name(index)))?;
         slots.push(RtAxis::new(axis, bits, index, image.groups[index]));
         axes.push(index);
     }
@@ -276,7 +277,7 @@ fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
         let each = signals.iter().map(|signal| {
             bits(signal, output).ok_or_else(|| {
                 let (index, sub) = (signal.field.index, signal.field.sub);
-                Cause::NotMapped(NotMapped { index, sub }).at_name(&signal.name)
+                Cause::NotMapped(NotMapped { index, sub }).with_name(&signal.name)
             })
         });
         each.collect::<Result<Vec<_>, _>>()
@@ -351,7 +352,7 @@ fn bring_up_catching_panics(
     });
     match std::panic::catch_unwind(run) {
         Ok(Ok(Some(Ok(bus)))) => Ok(bus),
-        Ok(Ok(Some(Err(error)))) => Err(error.in_bring_up()),
+        Ok(Ok(Some(Err(error)))) => Err(error.with_step(FailedStep::BringUp)),
         Ok(Ok(None)) => Err(Cause::Interrupted.into()),
         Ok(Err(error)) => Err(Cause::Link(error).into()),
         Err(panic) => Err(Cause::Panicked(panic_text(&*panic)).into()),

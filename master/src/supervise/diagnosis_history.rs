@@ -1,7 +1,7 @@
 //! The diagnosis history of a device, 0x10F3 (ETG.1020): the last messages of a failed device.
 
 use crate::config::DeviceConfig;
-use crate::mailbox::{DeviceMailbox, MailboxError, SdoError};
+use crate::mailbox::{DeviceMailbox, MailboxError};
 use crate::report::DiagnosisMessage;
 
 const HISTORY: u16 = 0x10f3;
@@ -35,10 +35,7 @@ pub(super) async fn read(
         let bytes = match mailbox.upload(HISTORY, sub).await {
             Ok(bytes) => bytes,
             // This entry holds no message yet.
-            Err(MailboxError::Sdo {
-                source: SdoError::Abort { .. },
-                ..
-            }) => break,
+            Err(MailboxError::Sdo { source, .. }) if source.abort_code().is_some() => break,
             Err(error) => return Err(error),
         };
         if bytes.iter().all(|byte| *byte == 0) {

@@ -103,7 +103,7 @@ impl Supervisor {
             },
         };
         match axis {
-            Some(axis) => cause.at(self.device_of(axis)),
+            Some(axis) => cause.with_device(self.device_of(axis)),
             None => cause.into(),
         }
     }
@@ -119,9 +119,9 @@ impl Supervisor {
             match al::read_status(&self.wire, device.station).await {
                 Ok(Some((status, code))) if status != 8 => {
                     let state = al::AlState::from_status(status);
-                    return Some(Cause::LeftOp { state, code }.at(device));
+                    return Some(Cause::LeftOp { state, code }.with_device(device));
                 }
-                Ok(None) => return Some(Cause::Gone.at(device)),
+                Ok(None) => return Some(Cause::Gone.with_device(device)),
                 _ => {}
             }
         }
@@ -160,7 +160,7 @@ impl Supervisor {
             code,
             timeout_ms: timeout / 1_000_000,
         }
-        .at(self.device_of(axis))
+        .with_device(self.device_of(axis))
     }
 
     /// Reports a fault from before this run; enabling clears it.
@@ -291,7 +291,7 @@ impl Supervisor {
                     expected,
                     display: i8::from_le_bytes([display]),
                 }
-                .at(self.device_of(axis)));
+                .with_device(self.device_of(axis)));
             }
         }
         Ok(())

@@ -115,9 +115,9 @@ impl Supervisor {
             group: self.group_name(stop.group),
             cause: Arc::clone(&stop.cause),
         }
-        .at(self.device_of(axis));
+        .with_device(self.device_of(axis));
         Err(match step {
-            Some(step) => error.in_step(step),
+            Some(step) => error.with_step(step),
             None => error,
         })
     }

@@ -192,7 +192,7 @@ impl Supervisor {
             if clock::now().saturating_sub(start) > timeout {
                 let cause = match (snapshot.phase, unsettled) {
                     (_, Some((device, difference_ns))) if snapshot.inputs_fresh => {
-                        return Err(Cause::ClockNotSettled { difference_ns }.at(device));
+                        return Err(Cause::ClockNotSettled { difference_ns }.with_device(device));
                     }
                     (Some(phase), None) if snapshot.inputs_fresh => Cause::PhaseNotLocked {
                         error_ns: phase.error_ns,
@@ -247,7 +247,7 @@ impl Supervisor {
                 return Err(Cause::EnableRefused {
                     reason: reason.to_string(),
                 }
-                .at(self.device_of(axis)));
+                .with_device(self.device_of(axis)));
             }
             let status = |axis: usize| snapshot.axes.get(axis).copied();
             let late = axes
@@ -452,7 +452,7 @@ impl Supervisor {
             Some((axis, status)) => Err(Cause::NotDisabled {
                 state: status.state,
             }
-            .at(self.device_of(axis))),
+            .with_device(self.device_of(axis))),
             None => Ok(()),
         }
     }

@@ -383,8 +383,8 @@ impl Supervisor {
                     reason: reason.to_string(),
                     by_axis: Some(Box::new(reason)),
                 }
-                .at(self.device_of(axis))
-                .in_step(step));
+                .with_device(self.device_of(axis))
+                .with_step(step));
             }
             if look(self, &snapshot)? {
                 return Ok(());
@@ -397,7 +397,7 @@ impl Supervisor {
             reason: reason.to_string(),
             by_axis: None,
         }
-        .at(self.device_of(axis))
-        .in_step(step)
+        .with_device(self.device_of(axis))
+        .with_step(step)
     }
 }

@@ -47,7 +47,7 @@ fn a_wrong_file_is_rejected_and_the_right_one_accepted_afterwards() {
                 let FirmwareError::Failed { cause, left, .. } = &error else {
                     panic!("{what}: {error}")
                 };
-                let state = match (via, cause) {
+                let state = match (via, &**cause) {
                     (UpdateMethod::Foe, Cause::Foe(error)) => {
                         assert_eq!(error.code(), Some(foe), "{what}: {error}");
                         AlState::Bootstrap
@@ -145,7 +145,7 @@ fn a_file_larger_than_the_program_memory_is_rejected() {
             let FirmwareError::Failed { cause, .. } = &error else {
                 panic!("{error}")
             };
-            match cause {
+            match &**cause {
                 Cause::Foe(error) => assert_eq!(error.code(), Some(0x8003)),
                 Cause::Sdo(error) => assert_eq!(error.abort_code(), Some(0x0607_0012)),
                 other => panic!("{other}"),

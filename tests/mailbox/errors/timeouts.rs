@@ -8,14 +8,14 @@ use super::*;
 fn a_mute_device_times_out() {
     let (error, log) = upload_error(0x6041, &[Mischief::Mute]);
     let after = Duration::from_millis(500);
-    let timeout = SdoError::Timeout {
-        station: STATION,
-        index: 0x6041,
-        sub: 0,
-        phase: Phase::Answer,
-        after,
-        set_aside: 0,
-    };
+    let timeout = sdo_error(
+        0x6041,
+        CoeCause::Timeout {
+            phase: Phase::Answer,
+            after,
+            set_aside: 0,
+        },
+    );
     assert_eq!(error, timeout);
     assert_eq!(log.len(), 1, "a request that came back is not sent again");
 }
@@ -28,8 +28,8 @@ fn a_mailbox_that_stays_full_times_out() {
     let first = block_on(client.upload(&server, 0x6041, 0, false)).unwrap_err();
     assert!(
         matches!(
-            first,
-            SdoError::Timeout {
+            first.cause,
+            CoeCause::Timeout {
                 phase: Phase::Answer,
                 ..
             }
@@ -40,8 +40,8 @@ fn a_mailbox_that_stays_full_times_out() {
     let second = block_on(client.upload(&server, 0x6041, 0, false)).unwrap_err();
     assert!(
         matches!(
-            second,
-            SdoError::Timeout {
+            second.cause,
+            CoeCause::Timeout {
                 phase: Phase::Request,
                 ..
             }
@@ -58,10 +58,7 @@ fn a_mailbox_that_stays_full_times_out() {
 }
 
 fn gone(index: u16) -> SdoError {
-    SdoError::Gone {
-        station: STATION,
-        asked: Subject::Object(NamedObject { index, sub: 0 }),
-    }
+    sdo_error(index, CoeCause::Gone)
 }
 
 #[test]
@@ -71,9 +68,10 @@ fn missing_device_fails_without_timeout() {
     assert_eq!(error, gone(0x6041));
     assert_eq!(
         block_on(client().drain(&server)),
-        Err(SdoError::Gone {
+        Err(SdoError {
             station: STATION,
-            asked: Subject::Emptying
+            asked: Subject::Emptying,
+            cause: CoeCause::Gone
         })
     );
     assert!(server.now() < 10_000_000, "{}", server.now());
@@ -97,8 +95,8 @@ fn timeout_error_counts_unrelated_answers() {
     let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, other.to_vec())]);
     assert!(
         matches!(
-            error,
-            SdoError::Timeout {
+            error.cause,
+            CoeCause::Timeout {
                 phase: Phase::Answer,
                 set_aside: 1,
                 ..
@@ -162,8 +160,8 @@ fn endless_messages_end_in_bounded_time() {
     let error = block_on(client().upload(&wire, 0x6041, 0, false)).unwrap_err();
     assert!(
         matches!(
-            error,
-            SdoError::Timeout {
+            error.cause,
+            CoeCause::Timeout {
                 phase: Phase::Answer,
                 ..
             }
@@ -178,8 +176,8 @@ fn unrepeated_lost_answer_times_out() {
     let (error, _) = upload_error(0x6041, &[Mischief::LoseAnswer(1), Mischief::NoRepeat]);
     assert!(
         matches!(
-            error,
-            SdoError::Timeout {
+            error.cause,
+            CoeCause::Timeout {
                 phase: Phase::Repeat,
                 ..
             }
@@ -190,8 +188,8 @@ fn unrepeated_lost_answer_times_out() {
     let (error, _) = upload_error(0x6041, &again);
     assert!(
         matches!(
-            error,
-            SdoError::Timeout {
+            error.cause,
+            CoeCause::Timeout {
                 phase: Phase::Repeat,
                 ..
             }
@@ -210,8 +208,8 @@ fn endless_emergencies_do_not_block_the_client() {
     let error = block_on(client.upload(&server, 0x6041, 0, false)).unwrap_err();
     assert!(
         matches!(
-            error,
-            SdoError::Timeout {
+            error.cause,
+            CoeCause::Timeout {
                 phase: Phase::Answer,
                 ..
             }
@@ -226,14 +224,11 @@ fn a_silent_bus_is_reported_as_such() {
     let error = block_on(client().upload(&Silent, 0x6041, 0, false)).unwrap_err();
     assert!(
         matches!(
-            error,
-            SdoError::Wire {
-                source: DatagramError::Timeout {
-                    station: STATION,
-                    ..
-                },
+            error.cause,
+            CoeCause::Wire(DatagramError::Timeout {
+                station: STATION,
                 ..
-            }
+            })
         ),
         "{error}"
     );

@@ -7,7 +7,6 @@ use crate::scan::Scan;
 use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::acyclic::device::with_mailbox;
 use ecaxis_master::config::Machine;
-use ecaxis_master::mailbox::SdoError;
 use ecaxis_master::report::Cause;
 
 /// False for PDO mapping and assignment, the module list and the mode, which every start-up
@@ -64,10 +63,8 @@ pub async fn parameters(
                         found,
                     }),
                     // Some objects are write-only.
-                    Err(SdoError::Abort { .. }) => {}
-                    Err(source) => {
-                        return Err(Cause::Sdo(source).at(&at));
-                    }
+                    Err(error) if error.abort_code().is_some() => {}
+                    Err(error) => return Err(Cause::Sdo(error).with_device(&at)),
                 }
             }
             Ok(())

@@ -8,7 +8,7 @@ use super::{DeviceIdentity, INIT_TIMEOUT, ReadBack, UpdateProgress, UpdateReques
 use ecaxis_master::acyclic::al::{self, AlState};
 use ecaxis_master::acyclic::{DatagramClient, Registers, StateError, mailbox};
 use ecaxis_master::mailbox::foe::FoeProgress;
-use ecaxis_master::mailbox::{FoeClient, FoeError, MailboxTransport};
+use ecaxis_master::mailbox::{FoeCause, FoeClient, MailboxTransport};
 use ecaxis_master::report;
 
 pub(super) async fn send(
@@ -98,12 +98,14 @@ async fn compare(
             let same = file.iter().zip(&order.file).take_while(|(a, b)| a == b);
             Err(Cause::Differs { at: same.count() })
         }
-        Err(FoeError::TooLarge { .. }) => Err(Cause::Differs {
-            at: order.file.len(),
-        }),
-        Err(error @ (FoeError::Refused { .. } | FoeError::Mailbox { .. })) => {
-            Ok(ReadBack::Refused(error.to_string()))
-        }
-        Err(error) => Err(error.into()),
+        Err(error) => match error.cause {
+            FoeCause::TooLarge { .. } => Err(Cause::Differs {
+                at: order.file.len(),
+            }),
+            FoeCause::Refused { .. } | FoeCause::Mailbox(_) => {
+                Ok(ReadBack::Refused(error.to_string()))
+            }
+            _ => Err(error.into()),
+        },
     }
 }

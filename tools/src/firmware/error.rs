@@ -48,9 +48,9 @@ impl fmt::Display for Step {
 /// Why a step failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Cause {
-    #[error(transparent)]
+    #[error("{}", .0.without_station())]
     Foe(#[from] FoeError),
-    #[error(transparent)]
+    #[error("{}", .0.without_station())]
     Sdo(#[from] SdoError),
     #[error(transparent)]
     Service(#[from] Error),
@@ -75,10 +75,7 @@ pub enum Cause {
         after: Duration,
     },
     #[error("after {after:?} it is not back: {error}")]
-    NotBack {
-        error: Box<FirmwareError>,
-        after: Duration,
-    },
+    NotBack { error: Error, after: Duration },
 }
 
 struct Refusal<'a>(Option<&'a SdoError>);
@@ -86,7 +83,9 @@ struct Refusal<'a>(Option<&'a SdoError>);
 impl fmt::Display for Refusal<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.0 {
-            Some(error @ SdoError::Abort { .. }) => write!(f, "; {error}"),
+            Some(error) if error.abort_code().is_some() => {
+                write!(f, "; {}", error.without_station())
+            }
             _ => Ok(()),
         }
     }
@@ -159,9 +158,30 @@ pub enum FirmwareError {
     Failed {
         device: DeviceRef,
         step: Step,
-        cause: Cause,
+        cause: Box<Cause>,
         left: FinalDeviceState,
     },
+}
+
+impl FirmwareError {
+    /// Returns the error of a step. The error names the device, its cause does not.
+    #[must_use]
+    pub fn from_step(device: &DeviceRef, step: Step, cause: Cause, left: FinalDeviceState) -> Self {
+        let cause = match cause {
+            Cause::Service(error) => Cause::Service(error.without_device(device)),
+            Cause::NotBack { error, after } => Cause::NotBack {
+                error: error.without_device(device),
+                after,
+            },
+            cause => cause,
+        };
+        Self::Failed {
+            device: device.clone(),
+            step,
+            cause: Box::new(cause),
+            left,
+        }
+    }
 }
 
 /// A failed step.
@@ -187,11 +207,6 @@ impl StepFailure {
             Ok(EnumeratedDevice { state, code, .. }) => FinalDeviceState::In { state, code },
             Err(_) => FinalDeviceState::Silent,
         };
-        FirmwareError::Failed {
-            device: device.clone(),
-            step: self.step,
-            cause: self.cause,
-            left,
-        }
+        FirmwareError::from_step(device, self.step, self.cause, left)
     }
 }

@@ -90,12 +90,12 @@ pub struct DeviceIdentity {
 /// has no objects. An EEPROM in use by the device is not read, except in Init and Bootstrap.
 ///
 /// # Errors
-/// [`FirmwareError::Service`]. A device without answers is not an error.
+/// As [`locate`] and [`read_sii_unless_in_use`]. A device without answers is not an error.
 pub async fn examine(
     wire: &DatagramClient,
     at: Locator,
     name: Option<&str>,
-) -> Result<DeviceIdentity, FirmwareError> {
+) -> Result<DeviceIdentity, Error> {
     examine_with(wire, at, name, false).await
 }
 
@@ -105,7 +105,7 @@ pub(super) async fn examine_with(
     at: Locator,
     name: Option<&str>,
     seize: bool,
-) -> Result<DeviceIdentity, FirmwareError> {
+) -> Result<DeviceIdentity, Error> {
     let (found, device) = locate(wire, at, name).await?;
     let access = match (seize, found.state) {
         (true, _) | (false, AlState::Bootstrap) => EepromAccess::Force,
@@ -126,7 +126,7 @@ pub(super) async fn examine_with(
     if has_coe && examined.state != AlState::Bootstrap {
         match read_coe_identity(wire, &examined).await {
             Ok(spoken) => examined.spoken = Some(spoken),
-            Err(error) if error.is_interruption() => return Err(error.into()),
+            Err(error) if error.is_interruption() => return Err(error),
             Err(error) => examined.silent = Some(error),
         }
     }
@@ -141,7 +141,7 @@ async fn read_coe_identity(
     with_mailbox(wire, device, sii, "asking it who it is", async |lent| {
         lent.coe.set_timeouts(PATIENT);
         let spoken = ask(wire, &mut lent.coe).await;
-        spoken.map_err(|error| Cause::Sdo(error).at(device))
+        spoken.map_err(|error| Cause::Sdo(error).with_device(device))
     })
     .await
 }

@@ -276,7 +276,7 @@ async fn running(wire: &DatagramClient, before: &DeviceIdentity) -> Result<Devic
                 },
             },
             Err(error) => Cause::NotBack {
-                error: Box::new(error),
+                error,
                 after: START_TIMEOUT,
             },
         };

@@ -155,7 +155,7 @@ impl Session<'_> {
                 Ok(value) => format!("it is {value:?}"),
                 Err(error) => {
                     self.wait_until_running().await;
-                    error.to_string()
+                    error.without_station().to_string()
                 }
             };
             if self.wire.now() >= end {

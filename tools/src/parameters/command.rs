@@ -47,6 +47,6 @@ impl Command {
         let usual = coe.set_timeouts(patient);
         let done = coe.download(wire, index, 1, false, signature).await;
         coe.set_timeouts(usual);
-        done.map_err(|error| Cause::Sdo(error).at(device))
+        done.map_err(|error| Cause::Sdo(error).with_device(device))
     }
 }

@@ -7,8 +7,8 @@ use super::DataType;
 use ecaxis_master::acyclic::DeviceRef;
 
 use ecaxis_master::mailbox::{
-    CoeClient, EntryDescription, InfoError, InfoRequest, MailboxTransport, ObjectDescription,
-    ObjectList,
+    CoeCause, CoeClient, EntryDescription, InfoError, InfoRequest, MailboxTransport,
+    ObjectDescription, ObjectList,
 };
 use ecaxis_master::report::{Cause, Error};
 
@@ -26,7 +26,7 @@ pub async fn dictionary(
     device: &DeviceRef,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Dictionary, Error> {
-    let failed = |error| Cause::Information(error).at(device);
+    let failed = |error| Cause::Information(error).with_device(device);
     let all = coe.object_list(wire, ObjectList::All).await;
     let all = all.map_err(failed)?;
     let mut objects = Vec::new();
@@ -40,10 +40,11 @@ pub async fn dictionary(
         };
         count += found.items.len();
         if count > MAX_ITEMS {
-            return Err(failed(InfoError::Malformed {
+            let what = format!("it leads to more than {MAX_ITEMS} subindices");
+            return Err(failed(InfoError {
                 station: device.station,
                 asked: InfoRequest::List(ObjectList::All),
-                what: format!("it leads to more than {MAX_ITEMS} subindices"),
+                cause: CoeCause::Malformed(what),
             }));
         }
         objects.push(found);

@@ -40,7 +40,7 @@ impl Restored {
 #[derive(Debug, thiserror::Error)]
 #[error("{source}{}", self.left())]
 pub struct RestoreError {
-    pub source: Error,
+    pub source: Box<Error>,
     /// The number of confirmed writes.
     pub written: usize,
     /// The number of planned writes; 0 if it ended before the first.
@@ -83,7 +83,7 @@ struct RestoreProgress {
 impl RestoreProgress {
     fn aborted(self, source: Error) -> RestoreError {
         RestoreError {
-            source,
+            source: Box::new(source),
             written: self.written,
             of: self.of,
             emptied: self.lost.into_iter().chain(self.open).collect(),
@@ -101,11 +101,10 @@ struct Device<'a, W> {
 impl<W: MailboxTransport> Device<'_, W> {
     /// Returns the abort code if the device refuses the object.
     fn refusal<T>(&self, result: Result<T, SdoError>) -> Result<Result<T, u32>, Error> {
-        match result {
-            Ok(value) => Ok(Ok(value)),
-            Err(SdoError::Abort { code, .. }) => Ok(Err(code)),
-            Err(error) => Err(Cause::Sdo(error).at(self.device)),
-        }
+        result.map(Ok).or_else(|error| match error.abort_code() {
+            Some(code) => Ok(Err(code)),
+            None => Err(Cause::Sdo(error).with_device(self.device)),
+        })
     }
 
     async fn read(&mut self, at: NamedObject) -> Result<Result<Vec<u8>, u32>, Error> {
@@ -184,8 +183,8 @@ impl<W: MailboxTransport> Device<'_, W> {
             return Ok(());
         }
         Err(Cause::Interrupted
-            .at(self.device)
-            .during("restoring its settings"))
+            .with_device(self.device)
+            .with_action("restoring its settings"))
     }
 
     async fn restore(

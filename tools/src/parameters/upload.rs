@@ -5,7 +5,7 @@ use ecaxis_esi::Dictionary;
 use super::{Parameter, items, name_of, type_of, writable_in_pre_op};
 use ecaxis_master::acyclic::DeviceRef;
 
-use ecaxis_master::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError};
+use ecaxis_master::mailbox::{CoeClient, MailboxTransport, NamedObject};
 use ecaxis_master::report::{Cause, Error};
 
 /// The values of a device.
@@ -48,8 +48,10 @@ pub async fn collect(
                 writable: writable_in_pre_op(item),
                 value,
             }),
-            Err(SdoError::Abort { code, .. }) => collected.refused.push((at, code)),
-            Err(error) => return Err(Cause::Sdo(error).at(device)),
+            Err(error) => match error.abort_code() {
+                Some(code) => collected.refused.push((at, code)),
+                None => return Err(Cause::Sdo(error).with_device(device)),
+            },
         }
     }
     Ok(collected)

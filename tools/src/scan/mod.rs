@@ -293,7 +293,7 @@ async fn measure_delays(
     for _ in 0..LATCHES {
         wire.write_all(esc::DC_RECEIVE_TIME, &[0; 4])
             .await
-            .map_err(|error| Error::from(Cause::Datagram(error)).during(STEP))?;
+            .map_err(|error| Error::from(Cause::Datagram(error)).with_action(STEP))?;
         let mut times = Vec::with_capacity(devices.len());
         for device in devices.iter() {
             times.push(if device.controller.has_receive_times() {
@@ -332,7 +332,7 @@ async fn explicit_id(wire: &DatagramClient, device: &Device) -> Result<Option<u1
     };
     if general.flags & General::IDENTIFICATION_AL_STATUS != 0 && !device.found.error {
         let id = al::read_explicit_id(wire, device.found.station).await;
-        return id.map_err(|error| Error::from(Cause::Datagram(error)).during(STEP));
+        return id.map_err(|error| Error::from(Cause::Datagram(error)).with_action(STEP));
     }
     if general.flags & General::IDENTIFICATION_ADDRESS != 0 {
         let mut bytes = [0; 2];
@@ -354,7 +354,7 @@ async fn ask(wire: &DatagramClient, device: &Device) -> Option<Result<CoeInfo, S
         .named(format!("position {}", device.position()));
     let answers = with_mailbox(wire, &at, sii, "asking it who it is", async |lent| {
         let answers = coe_info::ask(wire, &mut lent.coe, device).await;
-        answers.map_err(|error| Cause::Sdo(error).at(&at))
+        answers.map_err(|error| Cause::Sdo(error).with_device(&at))
     });
     Some(answers.await.map_err(|error| error.to_string()))
 }

@@ -78,7 +78,7 @@ struct LivenessSample {
 /// Samples all devices repeatedly for `time`. `heard`: foreign frames before the detection.
 ///
 /// # Errors
-/// [`Cause::Silent`] if a device leaves during the detection.
+/// [`Cause::Silent`](ecaxis_master::report::Cause::Silent) if a device leaves during the detection.
 pub async fn look(
     wire: &DatagramClient,
     found: &[EnumeratedDevice],

@@ -43,7 +43,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let name = config.as_ref().map(|config| config.name.as_str());
         firmware::examine(&wire, at, name).await
     })?;
-    let examined = found.map_err(|error| hints::firmware(&error, &nic))?;
+    let examined = found.map_err(|error| hints::failure(&error, &nic))?;
     match args.json {
         true => print_json(&show::as_json(&examined)),
         false => print(&show::info(&examined)),

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use ecaxis_esi::Object;
-use ecaxis_master::mailbox::{NamedObject, SdoError, object_name};
+use ecaxis_master::mailbox::{CoeCause, NamedObject, SdoError, Subject, object_name};
 use ecaxis_master::text::pluralize;
 use ecaxis_tools::document::format::hex_bytes;
 use ecaxis_tools::parameters::lookup::ObjectQuery;
@@ -78,11 +78,10 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
         }
         // A refused single value is an error; among others it is a row.
         match out.as_slice() {
-            [(at, .., Err(code))] => open.at.sdo_error(Err(SdoError::Abort {
+            [(at, .., Err(code))] => open.at.sdo_error(Err(SdoError {
                 station: open.at.device.station,
-                index: at.index,
-                sub: at.sub,
-                code: *code,
+                asked: Subject::Object(*at),
+                cause: CoeCause::Abort(*code),
             })),
             [_, _, ..] if to_file => {
                 Err(Failure::new(hints::WRONG, "a file takes one subindex")

@@ -11,107 +11,77 @@ use super::super::{DatagramError, Phase};
 /// A file transfer error. `station` is the SubDevice's configured address, `file` the requested
 /// name. The transfer has ended in every case, and the next one starts clean.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum FoeError {
+#[error("station {station:#06x}: {}", self.without_station())]
+pub struct FoeError {
+    pub station: u16,
+    pub file: String,
+    pub cause: FoeCause,
+}
+
+/// Why a file transfer failed. `packet` is the packet at which it failed; 0 is the request itself.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum FoeCause {
     /// The SubDevice sent ERROR.
-    #[error("station {station:#06x}: file `{file}`: was refused{} with {code:#06x}: {}{}", Context(*packet), foe_error_text(*code), DeviceText(text))]
+    #[error("was refused{} with {code:#06x}: {}{}", Context(*packet), foe_error_text(*code), DeviceText(text))]
     Refused {
-        station: u16,
-        file: String,
-        /// The packet at which the transfer failed; 0 is the request itself.
         packet: u32,
         code: u32,
         /// The SubDevice's own text.
         text: String,
     },
-    #[error("station {station:#06x}: file `{file}`: {phase} within {after:?}{}", Context(*packet))]
+    #[error("{phase} within {after:?}{}", Context(*packet))]
     Timeout {
-        station: u16,
-        file: String,
         packet: u32,
         phase: Phase,
         after: Duration,
     },
     /// The SubDevice answers BUSY for too long.
-    #[error("station {station:#06x}: file `{file}`: is busy for more than {after:?}{}, with {done} of {entire} done", Context(*packet))]
+    #[error("is busy for more than {after:?}{}, with {done} of {entire} done", Context(*packet))]
     Busy {
-        station: u16,
-        file: String,
         packet: u32,
         after: Duration,
         done: u16,
         entire: u16,
     },
     /// The SubDevice's mailbox rejected the message itself.
-    #[error("station {station:#06x}: file `{file}`: the mailbox refused the message with {code:#06x}: {}", mailbox_error_text(*code))]
-    Mailbox {
-        station: u16,
-        file: String,
-        code: u16,
-    },
-    #[error(
-        "station {station:#06x}: file `{file}`: packet {found} came where packet {expected} is due"
-    )]
-    Packet {
-        station: u16,
-        file: String,
-        expected: u32,
-        found: u32,
-    },
-    #[error("station {station:#06x}: file `{file}`: the answer{} makes no sense: {what}", Context(*packet))]
-    Malformed {
-        station: u16,
-        file: String,
-        packet: u32,
-        what: String,
-    },
+    #[error("the mailbox refused the message with {:#06x}: {}", .0, mailbox_error_text(*.0))]
+    Mailbox(u16),
+    #[error("packet {found} came where packet {expected} is due")]
+    Packet { expected: u32, found: u32 },
+    #[error("the answer{} makes no sense: {what}", Context(*packet))]
+    Malformed { packet: u32, what: String },
     /// The file to read is too long.
-    #[error("station {station:#06x}: file `{file}` has more than {most} bytes")]
-    TooLarge {
-        station: u16,
-        file: String,
-        most: usize,
-    },
+    #[error("has more than {most} bytes")]
+    TooLarge { most: usize },
     /// The name would be empty or truncated, or contains a zero byte.
-    #[error(
-        "station {station:#06x}: `{file}` is no name for a file here: 1 to {room} bytes without a zero byte"
-    )]
-    Name {
-        station: u16,
-        file: String,
-        room: usize,
-    },
+    #[error("is no name for a file here: 1 to {room} bytes without a zero byte")]
+    Name { room: usize },
     /// Frames come back, but this SubDevice processed none of them.
-    #[error("station {station:#06x}: file `{file}`: the device does not answer{}: it is off, or has lost its address", Context(*packet))]
-    Gone {
-        station: u16,
-        file: String,
-        packet: u32,
-    },
-    #[error(
-        "station {station:#06x}: file `{file}`: mailboxes of {out_len} bytes out and {in_len} bytes in cannot carry files"
-    )]
-    Layout {
-        station: u16,
-        file: String,
-        out_len: u16,
-        in_len: u16,
-    },
+    #[error("the device does not answer{}: it is off, or has lost its address", Context(*packet))]
+    Gone { packet: u32 },
+    #[error("mailboxes of {out_len} bytes out and {in_len} bytes in cannot carry files")]
+    Layout { out_len: u16, in_len: u16 },
     /// No frames come back.
-    #[error("station {station:#06x}: file `{file}`: {}{}", LostDatagram(source), Context(*packet))]
-    Wire {
-        station: u16,
-        file: String,
-        packet: u32,
-        source: DatagramError,
-    },
+    #[error("{}{}", LostDatagram(source), Context(*packet))]
+    Wire { packet: u32, source: DatagramError },
 }
 
 impl FoeError {
     /// Returns the SubDevice's error code, if there is one.
     pub fn code(&self) -> Option<u32> {
-        match self {
-            Self::Refused { code, .. } => Some(*code),
+        match self.cause {
+            FoeCause::Refused { code, .. } => Some(code),
             _ => None,
+        }
+    }
+
+    /// Returns the text without the station, for a reader who knows the device.
+    pub fn without_station(&self) -> impl fmt::Display {
+        let Self { file, cause, .. } = self;
+        match cause {
+            FoeCause::Name { .. } => format!("`{file}` {cause}"),
+            FoeCause::TooLarge { .. } => format!("file `{file}` {cause}"),
+            _ => format!("file `{file}`: {cause}"),
         }
     }
 }

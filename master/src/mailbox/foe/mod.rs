@@ -18,7 +18,7 @@ mod error;
 use ecaxis_ecat::mailbox::DecodeError;
 use ecaxis_ecat::mailbox::foe::Message;
 pub use ecaxis_ecat::mailbox::foe::room;
-pub use error::{FoeError, foe_error_text};
+pub use error::{FoeCause, FoeError, foe_error_text};
 
 /// The maximum number of old messages that are read before a transfer.
 const DRAIN: usize = 64;
@@ -187,11 +187,7 @@ impl FoeClient {
             .map_err(|trouble| transfer.trouble(&self.port, trouble).error)?;
         let room = room(self.port.layout.out_len);
         if !is_name(file, room) {
-            return Err(FoeError::Name {
-                station: transfer.station,
-                file: file.to_owned(),
-                room,
-            });
+            return Err(transfer.error(FoeCause::Name { room }));
         }
         if self.under_way {
             self.give_up(w, NOT_DEFINED).await;
@@ -310,14 +306,7 @@ impl FoeClient {
                 .await?;
             transfer.packet = due;
             if file.len() + part.len() > most {
-                return Err(FoeFailure {
-                    error: FoeError::TooLarge {
-                        station: transfer.station,
-                        file: transfer.file.to_owned(),
-                        most,
-                    },
-                    report: Some(DISK_FULL),
-                });
+                return Err(transfer.failure(FoeCause::TooLarge { most }, DISK_FULL));
             }
             file.extend_from_slice(&part);
             progress(FoeProgress::Bytes(file.len()));
@@ -360,17 +349,13 @@ impl FoeClient {
                     progress(FoeProgress::Busy { done, entire });
                     let busy = busy.get_or_insert_with(|| Deadline::after(w, self.busy));
                     if busy.passed(w) {
-                        return Err(FoeFailure {
-                            error: FoeError::Busy {
-                                station: transfer.station,
-                                file: transfer.file.to_owned(),
-                                packet: transfer.packet,
-                                after: self.busy,
-                                done,
-                                entire,
-                            },
-                            report: Some(NOT_DEFINED),
-                        });
+                        let cause = FoeCause::Busy {
+                            packet: transfer.packet,
+                            after: self.busy,
+                            done,
+                            entire,
+                        };
+                        return Err(transfer.failure(cause, NOT_DEFINED));
                     }
                     w.delay(BUSY_PAUSE).await;
                 }
@@ -432,89 +417,67 @@ enum Answer<T> {
 
 impl Transfer<'_> {
     fn trouble(&self, port: &Port, trouble: TransportError) -> FoeFailure {
-        let Self {
-            station, packet, ..
-        } = *self;
-        match trouble {
-            TransportError::Timeout(phase) => FoeFailure {
-                error: FoeError::Timeout {
-                    station,
-                    file: self.file.to_owned(),
+        let packet = self.packet;
+        let cause = match trouble {
+            TransportError::Timeout(phase) => {
+                let cause = FoeCause::Timeout {
                     packet,
                     phase,
                     after: match phase {
                         Phase::Request | Phase::Repeat => port.timeouts.request,
                         Phase::Answer | Phase::Transfer => port.timeouts.answer,
                     },
-                },
-                report: Some(NOT_DEFINED),
-            },
-            TransportError::Gone => FoeError::Gone {
-                station,
-                file: self.file.to_owned(),
-                packet,
+                };
+                return self.failure(cause, NOT_DEFINED);
             }
-            .into(),
-            TransportError::Wire(source) => FoeError::Wire {
-                station,
-                file: self.file.to_owned(),
-                packet,
-                source,
-            }
-            .into(),
-            TransportError::Layout => FoeError::Layout {
-                station,
-                file: self.file.to_owned(),
+            TransportError::Gone => FoeCause::Gone { packet },
+            TransportError::Wire(source) => FoeCause::Wire { packet, source },
+            TransportError::Layout => FoeCause::Layout {
                 out_len: port.layout.out_len,
                 in_len: port.layout.in_len,
-            }
-            .into(),
+            },
+        };
+        self.error(cause).into()
+    }
+
+    fn error(&self, cause: FoeCause) -> FoeError {
+        FoeError {
+            station: self.station,
+            file: self.file.to_owned(),
+            cause,
+        }
+    }
+
+    /// Returns the error with the code to report to the device.
+    fn failure(&self, cause: FoeCause, report: u32) -> FoeFailure {
+        FoeFailure {
+            error: self.error(cause),
+            report: Some(report),
         }
     }
 
     fn refused(&self, code: u32, text: String) -> FoeError {
-        FoeError::Refused {
-            station: self.station,
-            file: self.file.to_owned(),
+        self.error(FoeCause::Refused {
             packet: self.packet,
             code,
             text,
-        }
+        })
     }
 
     fn mailbox(&self, code: u16) -> FoeFailure {
-        FoeFailure {
-            error: FoeError::Mailbox {
-                station: self.station,
-                file: self.file.to_owned(),
-                code,
-            },
-            report: Some(NOT_DEFINED),
-        }
+        self.failure(FoeCause::Mailbox(code), NOT_DEFINED)
     }
 
     fn wrong(&self, expected: u32, found: u32) -> FoeFailure {
-        FoeFailure {
-            error: FoeError::Packet {
-                station: self.station,
-                file: self.file.to_owned(),
-                expected,
-                found,
-            },
-            report: Some(PACKET_NUMBER),
-        }
+        self.failure(FoeCause::Packet { expected, found }, PACKET_NUMBER)
     }
 
     fn malformed(&self, what: impl ToString) -> FoeFailure {
-        FoeFailure {
-            error: FoeError::Malformed {
-                station: self.station,
-                file: self.file.to_owned(),
-                packet: self.packet,
-                what: what.to_string(),
-            },
-            report: Some(ILLEGAL),
-        }
+        let cause = FoeCause::Malformed {
+            packet: self.packet,
+            what: what.to_string(),
+        };
+        self.failure(cause, ILLEGAL)
     }
 }
 

@@ -135,8 +135,8 @@ impl Supervisor {
             actual,
             unit,
         }
-        .at(self.device_of(axis))
-        .in_step(step)
+        .with_device(self.device_of(axis))
+        .with_step(step)
     }
 
     /// Converts a target and the reported value to the file's unit; positions of a modulo axis lie

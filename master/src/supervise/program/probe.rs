@@ -131,8 +131,8 @@ impl Supervisor {
                     input: search.probe.number(),
                     timeout_ms: ARM_TIMEOUT / 1_000_000,
                 }
-                .at(this.device_of(axis))
-                .in_step(step));
+                .with_device(this.device_of(axis))
+                .with_step(step));
             }
             Ok(false)
         })
@@ -151,8 +151,8 @@ impl Supervisor {
             target: place(target),
             unit: setup.map_or(String::new(), |setup| setup.unit.clone()),
         }
-        .at(self.device_of(axis))
-        .in_step(step)
+        .with_device(self.device_of(axis))
+        .with_step(step)
     }
 
     /// Reports what was captured and stores it for the summary.

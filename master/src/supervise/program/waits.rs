@@ -29,8 +29,8 @@ impl Supervisor {
                 && matches!(step.action, Action::Mode { .. })
             {
                 return Err(Cause::NotSwitched { mode }
-                    .at(this.device_of(axis))
-                    .in_step(step));
+                    .with_device(this.device_of(axis))
+                    .with_step(step));
             }
             if clock::now().saturating_sub(begun) > timeout {
                 return Err(Cause::StepTimeout {
@@ -38,8 +38,8 @@ impl Supervisor {
                     state: snapshot.axes[axis].state,
                     timeout_ms: timeout / 1_000_000,
                 }
-                .at(this.device_of(axis))
-                .in_step(step));
+                .with_device(this.device_of(axis))
+                .with_step(step));
             }
             Ok(false)
         })
@@ -103,8 +103,8 @@ impl Supervisor {
                             method: this.homing_method(axis),
                             error,
                         }
-                        .at(this.device_of(axis))
-                        .in_step(step));
+                        .with_device(this.device_of(axis))
+                        .with_step(step));
                     }
                     HomingStatus::Attained => status.switching.is_none() && status.ready,
                     HomingStatus::None | HomingStatus::Running => false,
@@ -147,7 +147,7 @@ impl Supervisor {
                     value: value(open.input),
                     timeout_ms: timeout / 1_000_000,
                 };
-                return Err(Error::from(cause).in_step(step));
+                return Err(Error::from(cause).with_step(step));
             }
         }
     }
