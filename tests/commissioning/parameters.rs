@@ -17,7 +17,7 @@ use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::mailbox::worker::EmergencySink;
 use ecaxis_master::mailbox::{CoeClient, Emergencies, FoeClient, MailboxTransport, ObjectList};
 use ecaxis_master::report::{Cause, Error};
-use ecaxis_master::rt::image::{plan, process_data};
+use ecaxis_master::rt::image::plan;
 use ecaxis_master::session::run_on_link;
 use ecaxis_master::session::simulated_bus;
 use ecaxis_sim::FirmwareHeader;
@@ -441,7 +441,7 @@ fn a_written_alias_applies_after_the_next_power_on() {
                 .await
                 .expect("found");
             assert_eq!(found.position, 0);
-            let image = plan(&process_data(&by_alias)).expect("a plan");
+            let image = plan(&by_alias.rt_config().devices).expect("a plan");
             let bus = bring_up(wire.main_device(), &by_alias, image, &mut |_| {}, &Deaf).await;
             let bus = bus.unwrap_or_else(|error| panic!("{error}"));
             let x = &bus.devices[0].at;

@@ -9,7 +9,7 @@ use std::sync::atomic::AtomicBool;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use ecaxis_master::config::Exchange;
+use ecaxis_master::config::ExchangeMode;
 use ecaxis_master::link::capture::{CapturingLink, Recorder, WriterMode};
 use ecaxis_master::link::{self, Link, SocketKind};
 use ecaxis_master::rt::spin::Spin;
@@ -44,7 +44,7 @@ fn setup(axes: usize, cycle_ns: u64) -> Setup {
         axes,
         cycle_ns,
         spin: Spin::For(0),
-        exchange: Exchange::SameCycle,
+        exchange: ExchangeMode::SameCycle,
     }
 }
 

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use ecaxis_master::clock::Clock;
-use ecaxis_master::config::{self, Bus, Exchange, Nic, duration};
+use ecaxis_master::config::{self, Bus, ExchangeMode, Nic, duration};
 use ecaxis_master::link::SocketKind;
 use ecaxis_master::rt::spin::Spin;
 use ecaxis_master::session::Observer;
@@ -53,7 +53,7 @@ pub(crate) struct Args {
     axes: u16,
     /// Exchange mode: same-cycle, or pipelined (answers one cycle later)
     #[arg(long, value_name = "HOW", value_parser = exchange)]
-    exchange: Option<Exchange>,
+    exchange: Option<ExchangeMode>,
     /// Link type: ring or packet
     #[arg(long, value_name = "HOW", value_parser = link)]
     link: Option<SocketKind>,
@@ -131,12 +131,12 @@ fn cycle(text: &str) -> Result<u64, String> {
     ))
 }
 
-fn exchange(text: &str) -> Result<Exchange, String> {
+fn exchange(text: &str) -> Result<ExchangeMode, String> {
     exchange_named(text).ok_or_else(|| "there are same-cycle and pipelined".to_owned())
 }
 
-fn exchange_named(text: &str) -> Option<Exchange> {
-    [Exchange::SameCycle, Exchange::Pipelined]
+fn exchange_named(text: &str) -> Option<ExchangeMode> {
+    [ExchangeMode::SameCycle, ExchangeMode::Pipelined]
         .into_iter()
         .find(|exchange| exchange_name(*exchange) == text)
 }

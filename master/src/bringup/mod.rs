@@ -299,7 +299,7 @@ async fn without_lrw(
     devices: &[BusDevice],
 ) -> Result<Option<ImagePlan>, Error> {
     const NO_LRW: u16 = 1 << 9;
-    let mut process_data = image::process_data(machine);
+    let mut process_data = machine.rt_config().devices;
     let mut more = false;
     for (device, data) in devices.iter().zip(&mut process_data) {
         let step = "reading what its controller can do";

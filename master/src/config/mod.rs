@@ -56,8 +56,8 @@ pub(crate) use device::further_axis;
 pub use drive_limits::LimitConflict;
 pub use drive_units::{AdoptedUnits, UnitProblem};
 pub use problem::{ConfigError, Problem, nearest};
-pub use program::{Action, Condition, GroupStopScope, Step, StopGroup, StopSetup, TableFile};
-pub use signal::{AxisRef, InputRef, NameError, NumericFormat, OutputRef, Signal};
+pub use program::{Action, Step, StopGroup, StopSetup, TableFile};
+pub use signal::{NameError, Signal};
 pub use startup::{Startup, StartupOptions};
 
 use ecaxis_esi as esi;
@@ -67,6 +67,11 @@ use raw::RawMachine;
 
 use crate::esi_library::RevisionMatch;
 use crate::file;
+pub use crate::rt::config::{Condition, ExchangeMode, GroupStopScope};
+use crate::rt::config::{GroupConfig, RtConfig};
+pub use crate::rt::controller::{AxisRef, InputRef, OutputRef};
+use crate::rt::image::ProcessData;
+pub use crate::rt::spin::Spin;
 
 /// The maximum number of SubDevices on a bus; a power of two, as ethercrab's group needs.
 pub(crate) const MAX_SUBDEVICES: usize = 512;
@@ -114,7 +119,7 @@ pub struct Bus {
     pub watchdog_ns: u64,
     /// The clock difference (0x092C) above which a SubDevice is reported.
     pub clock_window_ns: u64,
-    pub exchange: Exchange,
+    pub exchange: ExchangeMode,
     /// The way frames are exchanged with the network interface.
     pub link: SocketKind,
     /// Keys present in the file, each with its line; all others have defaults.
@@ -150,31 +155,11 @@ impl Default for Bus {
             enable_timeout_ns: 5_000_000_000,
             watchdog_ns: 100_000_000,
             clock_window_ns: 10_000,
-            exchange: Exchange::SameCycle,
+            exchange: ExchangeMode::SameCycle,
             link: SocketKind::default(),
             written: Vec::new(),
         }
     }
-}
-
-/// The cycle in which answers are evaluated.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Exchange {
-    /// The cycle that sent the frames; the thread waits for the answers.
-    #[default]
-    SameCycle,
-    /// The cycle after it: the answers have arrived by then, and the thread does not wait.
-    Pipelined,
-}
-
-/// How long before a release the real-time thread is awake.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Spin {
-    /// Adapts to the measured wake-up lateness.
-    #[default]
-    Auto,
-    /// A fixed time in ns; 0 means sleep only.
-    For(u64),
 }
 
 /// How frames are received from a network interface.
@@ -372,6 +357,38 @@ impl Machine {
         let mut groups = self.stop.groups.iter();
         let named = groups.position(|group| group.devices.contains(&device));
         named.map_or(0, |index| index + 1)
+    }
+
+    /// Returns the settings of the cycle.
+    #[must_use]
+    pub fn rt_config(&self) -> RtConfig {
+        let (bus, stop) = (&self.bus, &self.stop);
+        let devices = self.devices.iter().enumerate().map(|(index, device)| {
+            let layout = &device.selection.layout;
+            ProcessData {
+                out_len: layout.rx_bytes(),
+                in_len: layout.tx_bytes(),
+                group: self.group_of(index),
+                lrw: !device.device.use_lrd_lwr,
+                mailbox: device.device.mailbox_status_fmmu().is_some(),
+            }
+        });
+        let rest = GroupConfig::machine(stop.others);
+        let named = stop.groups.iter().map(|group| GroupConfig {
+            others: group.others,
+            outside: group.outside,
+        });
+        RtConfig {
+            cycle_ns: bus.cycle_ns,
+            clock_window_ns: bus.clock_window_ns,
+            spin: bus.spin,
+            exchange: bus.exchange,
+            lost_frames: bus.lost_frames,
+            devices: devices.collect(),
+            groups: std::iter::once(rest).chain(named).collect(),
+            bus_lost: stop.bus_lost,
+            emergency: stop.emergency.clone(),
+        }
     }
 }
 

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use ecaxis_axis::{Edge, StopMethod};
 
-use super::{Machine, duration};
+use super::{Condition, GroupStopScope, Machine, duration};
 use crate::text::rounded;
 
 /// One step of the program.
@@ -169,39 +169,11 @@ pub struct StopGroup {
     pub outside: GroupStopScope,
 }
 
-/// What the machine does when a group stops.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum GroupStopScope {
-    /// The machine stops as well, within the limits of its axes.
-    #[default]
-    Stop,
-    Continue,
-}
-
 /// A table of set-points and its file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TableFile {
     pub path: PathBuf,
     pub table: ecaxis_axis::setpoint::Table,
-}
-
-/// A condition on an input. All given bounds must hold.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Condition {
-    /// The index into [`Machine::inputs`].
-    pub input: usize,
-    pub equal: Option<f64>,
-    pub above: Option<f64>,
-    pub below: Option<f64>,
-}
-
-impl Condition {
-    #[must_use]
-    pub fn holds(&self, value: f64) -> bool {
-        self.equal.is_none_or(|n| value == n)
-            && self.above.is_none_or(|n| value > n)
-            && self.below.is_none_or(|n| value < n)
-    }
 }
 
 impl Machine {

@@ -8,7 +8,8 @@ use toml::Spanned;
 use super::problem::{Problems, suggestion};
 use super::raw::RawSignal;
 use super::steps::ResolvedDevice;
-use super::{DeviceConfig, Machine, further_axis};
+use super::{AxisRef, DeviceConfig, InputRef, Machine, OutputRef, further_axis};
+use crate::rt::image::NumericFormat;
 
 /// Process data that the program reads or sets.
 #[derive(Debug, Clone, PartialEq)]
@@ -18,15 +19,6 @@ pub struct Signal {
     /// The name with its device's name: `io.Input 3`.
     pub name: String,
     pub field: Field,
-}
-
-/// The number format of a signal's bits.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum NumericFormat {
-    Unsigned,
-    Signed,
-    /// IEEE 754, 32 bits.
-    Real,
 }
 
 impl Signal {
@@ -291,18 +283,6 @@ fn one(
     }
     Ok(signal)
 }
-
-/// A reference to an axis of a machine, for controllers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct AxisRef(pub(crate) usize);
-
-/// A reference to an input of a machine.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct InputRef(pub(crate) usize);
-
-/// A reference to an output of a machine.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct OutputRef(pub(crate) usize);
 
 /// Names that a controller resolves before the machine runs.
 impl Machine {

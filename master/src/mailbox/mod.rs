@@ -23,6 +23,7 @@ mod transfer;
 mod transport;
 pub mod worker;
 
+pub use crate::rt::exchange::MailboxStatus;
 pub use ecaxis_ecat::mailbox::{abort_text, mailbox_error_text};
 pub use ecaxis_ecat::object::{NamedObject, object_name};
 pub use emergency::{EMERGENCY_QUEUE, Emergencies, Emergency, Received};
@@ -62,15 +63,6 @@ pub trait MailboxTransport {
     fn stop(&self) -> &CancelToken {
         CancelToken::never()
     }
-}
-
-/// The status of a mailbox as read by the cycle.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct MailboxStatus {
-    /// The time on [`MailboxTransport::now`]'s clock at or after which the status was read.
-    pub at: u64,
-    /// True if a message waits in the mailbox.
-    pub full: bool,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

@@ -6,7 +6,18 @@ use super::axis::RtAxis;
 use super::bus_monitor::StopCause;
 use super::cycle::Signals;
 use super::reaction_group::{ReactionGroup, check_permitted};
-use crate::config::{AxisRef, InputRef, OutputRef};
+
+/// A reference to an axis of a machine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct AxisRef(pub(crate) usize);
+
+/// A reference to an input of a machine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct InputRef(pub(crate) usize);
+
+/// A reference to an output of a machine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct OutputRef(pub(crate) usize);
 
 /// User code that runs in the real-time thread once per cycle, after the inputs have arrived and
 /// before the outputs are computed.

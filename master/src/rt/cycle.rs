@@ -7,6 +7,7 @@ use ecaxis_axis::setpoint::Table;
 use super::axis::RtAxis;
 use super::bus_monitor::{BusMonitor, StopCause};
 use super::channel::{Event, PhaseStatus, RtEndpoint, Snapshot};
+use super::config::{Condition, RtConfig};
 use super::controller::{self, Controller};
 use super::event_log::LogEntryKind;
 use super::exchange::{CycleResult, DeviceAnswer, Exchange, SubDeviceDiagnostics, Window};
@@ -16,7 +17,7 @@ use super::image::SignalBits;
 use super::phase::Phase;
 use super::reaction_group::{GroupStatus, ReactionGroup};
 use super::setpoint_generator::GeneratorState;
-use super::spin::{Spin, SpinWindow};
+use super::spin::SpinWindow;
 use super::stats::Stats;
 
 mod axes;
@@ -27,7 +28,6 @@ mod panic;
 use panic::Plain;
 
 use crate::clock::{self, Clock, Nanos};
-use crate::config::{Condition, StopSetup};
 use crate::link::pdu_loop::PduLoop;
 use crate::link::{Link, MAX_FRAME};
 
@@ -38,21 +38,11 @@ pub struct Signals {
     pub outputs: Vec<SignalBits>,
 }
 
-/// The timing of the loop.
-#[derive(Debug, Clone, Copy)]
-pub struct Timing {
-    pub cycle_ns: u64,
-    /// DC offsets beyond this are reported.
-    pub clock_window_ns: u64,
-    /// The time spun before the release; the rest of the cycle is slept.
-    pub spin: Spin,
-}
-
 /// The state of the cycle.
 #[derive(Debug)]
 pub struct Engine {
     clock: Clock,
-    timing: Timing,
+    config: RtConfig,
     link: Box<dyn Link>,
     port: PduLoop,
     exchange: Exchange,
@@ -66,7 +56,6 @@ pub struct Engine {
     /// The controller panicked and is no longer called.
     panicked: bool,
     tables: Box<[Table]>,
-    stop_setup: StopSetup,
     finished: bool,
     phase: Option<Phase>,
     phase_error: i64,
@@ -101,19 +90,15 @@ pub struct Engine {
 #[derive(Debug)]
 pub struct EngineConfig {
     pub clock: Clock,
-    pub timing: Timing,
+    pub config: RtConfig,
     pub link: Box<dyn Link>,
     pub port: PduLoop,
     pub exchange: Exchange,
     pub axes: Vec<RtAxis>,
-    /// At least one.
-    pub groups: Vec<ReactionGroup>,
     pub signals: Signals,
     pub controller: Option<Box<dyn Controller>>,
     pub tables: Box<[Table]>,
-    pub stop: StopSetup,
     pub phase: Option<Phase>,
-    pub guard: BusMonitor,
     pub end: RtEndpoint,
 }
 
@@ -141,35 +126,44 @@ pub struct EngineReport {
 impl Engine {
     /// Creates an engine. The first cycle is due one cycle from now.
     #[must_use]
-    #[allow(clippy::disallowed_macros, reason = "runs before the loop")]
+    #[allow(
+        clippy::disallowed_methods,
+        clippy::disallowed_macros,
+        reason = "runs before the loop"
+    )]
     pub fn new(parts: EngineConfig) -> Self {
-        let started = clock::now() + parts.timing.cycle_ns;
+        let config = parts.config;
+        let started = clock::now() + config.cycle_ns;
+        let groups: Vec<_> = config.devices.iter().map(|device| device.group).collect();
         let clocks_off = vec![false; parts.exchange.diagnoses().len()];
         let mode = parts.exchange.mode();
         let history = FlightRecorder::new(parts.axes.len());
         Self {
             plain: Plain::new(&parts.axes),
             clock: parts.clock,
-            timing: parts.timing,
             main_devices: parts.link.main_devices(),
             window: started + flight_recorder::COUNTER_WINDOW,
             link: parts.link,
             port: parts.port,
             exchange: parts.exchange,
             axes: parts.axes,
-            groups: parts.groups,
+            groups: config
+                .groups
+                .iter()
+                .copied()
+                .map(ReactionGroup::new)
+                .collect(),
             inputs: vec![0.0; parts.signals.inputs.len()],
             signals: parts.signals,
             controller: parts.controller,
             panicked: false,
             tables: parts.tables,
-            stop_setup: parts.stop,
             finished: false,
             phase: parts.phase,
             phase_error: 0,
             al_status: None,
             clocks_off,
-            guard: parts.guard,
+            guard: BusMonitor::new(config.lost_frames, &groups),
             guarding: false,
             supervisor: heartbeat::Watch::default(),
             stats: Stats::default(),
@@ -178,7 +172,8 @@ impl Engine {
             next: started,
             woke: None,
             started,
-            margin: SpinWindow::new(parts.timing.spin, parts.timing.cycle_ns, mode),
+            margin: SpinWindow::new(config.spin, config.cycle_ns, mode),
+            config,
             answer: CycleResult::default(),
             events_lost: 0,
             orders_taken: 0,
@@ -198,7 +193,7 @@ impl Engine {
         self.stats.clear();
         let now = clock::now();
         while self.next <= now {
-            self.next += self.timing.cycle_ns;
+            self.next += self.config.cycle_ns;
         }
     }
 
@@ -229,7 +224,7 @@ impl Engine {
         let lateness = woke.saturating_sub(self.next);
         self.stats.lateness.record(lateness);
         self.stats.counters.cycles += 1;
-        if self.guarding && lateness > self.timing.cycle_ns / 4 {
+        if self.guarding && lateness > self.config.cycle_ns / 4 {
             self.log(LogEntryKind::WokeLate(lateness));
         }
 
@@ -246,7 +241,7 @@ impl Engine {
         if self.guarding {
             self.watch_bus();
             let heartbeat = &self.end.heartbeat;
-            if self.supervisor.is_silent(heartbeat, self.timing.cycle_ns) {
+            if self.supervisor.is_silent(heartbeat, self.config.cycle_ns) {
                 self.stop(None, StopCause::Unsupervised);
             }
         }
@@ -279,7 +274,7 @@ impl Engine {
     }
 
     fn observe(&mut self) {
-        let dt = self.timing.cycle_ns as f64 * 1e-9;
+        let dt = self.config.cycle_ns as f64 * 1e-9;
         let image = self.exchange.inputs();
         for slot in &mut self.axes {
             let answer = self.exchange.device_answers().get(slot.device);
@@ -301,7 +296,7 @@ impl Engine {
                 .get(c.input)
                 .is_none_or(|n| n.is_nan() || c.holds(*n))
         };
-        if self.guarding && self.stop_setup.emergency.iter().any(pressed) {
+        if self.guarding && self.config.emergency.iter().any(pressed) {
             self.stop(None, StopCause::EmergencyStop);
         }
     }
@@ -314,7 +309,7 @@ impl Engine {
         };
         let mut view = controller::CycleContext {
             number: self.stats.counters.cycles,
-            dt_s: self.timing.cycle_ns as f64 * 1e-9,
+            dt_s: self.config.cycle_ns as f64 * 1e-9,
             fresh: self.answer.inputs_fresh,
             guarded: self.guarding,
             axes: &mut self.axes,
@@ -396,13 +391,13 @@ impl Engine {
 
     /// Schedules the next cycle. Cycles already over are skipped, not sent in a burst.
     fn schedule_next_cycle(&mut self, adjust: i64) {
-        self.next = (self.next + self.timing.cycle_ns).saturating_add_signed(adjust);
+        self.next = (self.next + self.config.cycle_ns).saturating_add_signed(adjust);
         let now = clock::now();
         if now > self.next {
-            let missed = (now - self.next) / self.timing.cycle_ns + 1;
+            let missed = (now - self.next) / self.config.cycle_ns + 1;
             self.stats.counters.overruns += missed;
             self.log(LogEntryKind::Overrun(missed));
-            self.next += missed * self.timing.cycle_ns;
+            self.next += missed * self.config.cycle_ns;
         }
     }
 

@@ -16,11 +16,11 @@
 
 use std::sync::Arc;
 
+pub use super::config::ExchangeMode;
 use super::image::plan::frames as frames_of;
 use super::image::{Access, ImagePlan};
 use super::phase::ClockPlan;
 use crate::clock::Nanos;
-pub use crate::config::Exchange as ExchangeMode;
 use crate::link::pdu_loop::ETHERCAT;
 use crate::link::{Link, LinkError};
 
@@ -32,7 +32,7 @@ mod poll_schedule;
 mod result;
 mod slots;
 
-pub use bus_status::BusStatus;
+pub use bus_status::{BusStatus, MailboxStatus};
 pub use diagnostics::{DiagnosticRegister, ErrorCounters, SubDeviceDiagnostics, Window};
 use frame::{
     DATAGRAM_HEADER, DatagramSlot, FIRST_DATAGRAM, MAC_TAIL, WKC, clear_wkc, frame_number,

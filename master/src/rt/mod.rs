@@ -1,6 +1,7 @@
 //! The real-time side. MUST NOT BLOCK OR ALLOCATE: after its preparation, nothing here allocates,
 //! locks, logs, or waits for anything but the clock and the wire.
 //!
+//! - [`config`]: the settings of the cycle;
 //! - [`image`]: the layout of the process image;
 //! - [`exchange`]: the frames of a cycle, built once and refilled;
 //! - [`phase`]: keeps the release of frames in phase with SYNC0;
@@ -31,6 +32,7 @@
 pub mod axis;
 pub mod bus_monitor;
 pub mod channel;
+pub mod config;
 pub mod controller;
 pub mod cycle;
 pub mod event_log;

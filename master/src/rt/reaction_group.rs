@@ -6,8 +6,8 @@
 use ecaxis_axis::{Command, CommandError, StopMethod};
 
 use super::bus_monitor::StopCause;
+use super::config::{GroupConfig, GroupStopScope};
 use crate::clock::Nanos;
-use crate::config::{GroupStopScope, Machine};
 
 /// A stop in progress or completed.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,10 +24,7 @@ pub struct ActiveStop {
 /// Axes that stop together.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ReactionGroup {
-    /// How the other axes stop when one faults, trips, or can no longer follow.
-    others: StopMethod,
-    /// True if the machine continues without this group.
-    alone: bool,
+    config: GroupConfig,
     stop: Option<ActiveStop>,
     /// Stops so far during which the machine continued.
     pub stops: u32,
@@ -49,29 +46,10 @@ pub struct GroupStatus {
 }
 
 impl ReactionGroup {
-    /// Returns all groups of a machine.
     #[must_use]
-    #[allow(
-        clippy::disallowed_methods,
-        clippy::disallowed_macros,
-        reason = "runs before the loop"
-    )]
-    pub fn all(machine: &Machine) -> Vec<Self> {
-        let stop = &machine.stop;
-        let rest = Self::machine(stop.others);
-        let named = stop.groups.iter().map(|group| Self {
-            alone: group.outside == GroupStopScope::Continue,
-            ..Self::machine(group.others)
-        });
-        std::iter::once(rest).chain(named).collect()
-    }
-
-    /// Returns the group of a machine without groups.
-    #[must_use]
-    pub const fn machine(others: StopMethod) -> Self {
+    pub const fn new(config: GroupConfig) -> Self {
         Self {
-            others,
-            alone: false,
+            config,
             stop: None,
             stops: 0,
             found: None,
@@ -85,7 +63,7 @@ impl ReactionGroup {
 
     /// True if the machine continues when this group stops.
     pub(super) fn continues_without(&self) -> bool {
-        self.alone
+        self.config.outside == GroupStopScope::Continue
     }
 
     /// Begins a stop at `now`. Returns false if the group is already stopping. A failure during a
@@ -111,7 +89,7 @@ impl ReactionGroup {
         match cause {
             StopCause::DriveFault { .. }
             | StopCause::Trip { .. }
-            | StopCause::FollowLost { .. } => self.others,
+            | StopCause::FollowLost { .. } => self.config.others,
             _ => StopMethod::Ramp,
         }
     }

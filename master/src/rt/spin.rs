@@ -2,7 +2,16 @@
 
 use super::exchange::ExchangeMode;
 use crate::clock::Nanos;
-pub use crate::config::Spin;
+
+/// How long before a release the real-time thread is awake.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Spin {
+    /// Adapts to the measured wake-up lateness.
+    #[default]
+    Auto,
+    /// A fixed time in ns; 0 means sleep only.
+    For(u64),
+}
 
 /// Spinning begins at least this long before the release. It never begins earlier than `LONGEST` or
 /// a share of the cycle.

@@ -25,14 +25,12 @@ use crate::post_mortem::DeviceSnapshot;
 use crate::post_mortem::snapshot::{self, Depth};
 use crate::report::FailedStep;
 use crate::rt::axis::RtAxis;
-use crate::rt::bus_monitor::BusMonitor;
 use crate::rt::channel::channel;
 use crate::rt::controller::Controller;
-use crate::rt::cycle::{EngineConfig, Signals, Timing, first_snapshot};
+use crate::rt::cycle::{EngineConfig, Signals, first_snapshot};
 use crate::rt::exchange::{Exchange, ExchangeDevice};
 use crate::rt::image::{self, AxisBits, BitField, ImagePlan, NotMapped, SignalBits};
 use crate::rt::phase::Phase;
-use crate::rt::reaction_group::ReactionGroup;
 use crate::supervise::Supervisor;
 
 /// A segment in SafeOp with everything that the cycle needs.
@@ -106,12 +104,7 @@ impl RunBuilder<'_> {
                 let machine = &apply_drive_units(machine, &bus);
                 let (_, slots, axes, signals) = plan(machine)?;
                 let wire = DatagramClient::new(main_device);
-                let timing = Timing {
-                    cycle_ns: machine.bus.cycle_ns,
-                    clock_window_ns: machine.bus.clock_window_ns,
-                    spin: machine.bus.spin,
-                };
-                let groups = ReactionGroup::all(machine);
+                let config = machine.rt_config();
                 let clock = options.clock;
                 let members = bus.devices.iter().map(|device| ExchangeDevice {
                     station: device.at.station,
@@ -121,12 +114,12 @@ impl RunBuilder<'_> {
                 let members: Vec<_> = members.collect();
                 let (rt_end, outer) = channel(&first_snapshot(
                     &slots,
-                    groups.len(),
+                    config.groups.len(),
                     &signals,
                     members.len(),
                 ));
                 let mut exchange =
-                    Exchange::new(&bus.image, bus.dc.as_ref(), &members, machine.bus.exchange);
+                    Exchange::new(&bus.image, bus.dc.as_ref(), &members, config.exchange);
                 preset_outputs(machine, &bus, &mut exchange);
                 exchange.stage();
                 log.set_bus_status(exchange.bus_status());
@@ -136,18 +129,15 @@ impl RunBuilder<'_> {
                 let controlled = controller.is_some();
                 let parts = EngineConfig {
                     clock,
-                    timing,
+                    config,
                     link,
                     port,
                     exchange,
                     axes: slots,
-                    groups,
                     signals,
                     controller,
                     tables: machine.tables.iter().map(|t| t.table.clone()).collect(),
-                    stop: machine.stop.clone(),
                     phase: bus.dc.as_ref().map(Phase::new),
-                    guard: BusMonitor::new(machine.bus.lost_frames, &bus.image.groups),
                     end: rt_end,
                 };
                 let supervisor = Supervisor {
@@ -242,7 +232,7 @@ type CyclePlan = (ImagePlan, Vec<RtAxis>, Vec<usize>, Signals);
 /// Returns the process image and the axes with their offsets in it.
 fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
     let name = |index: usize| machine.devices[index].name.as_str();
-    let image = image::of(machine).map_err(|error| {
+    let image = image::of(&machine.rt_config()).map_err(|error| {
         let device = error.device;
         Cause::TooLarge(error).with_name(name(device))
     })?;

@@ -11,17 +11,16 @@ use ecaxis_esi::layout::{Field, Layout};
 
 use super::segment::{BenchSegment, DRIVE_BYTES, FIRST_STATION};
 use ecaxis_master::clock::{Clock, Nanos};
-use ecaxis_master::config::{self, StopSetup};
+use ecaxis_master::config;
 use ecaxis_master::link::Link;
 use ecaxis_master::link::pdu_loop::main_device;
 use ecaxis_master::rt::axis::RtAxis;
-use ecaxis_master::rt::bus_monitor::BusMonitor;
 use ecaxis_master::rt::channel::{HostEndpoint, RtCommand, channel};
-use ecaxis_master::rt::cycle::{EngineConfig, Signals, Timing, first_snapshot};
+use ecaxis_master::rt::config::{ExchangeMode, GroupConfig, RtConfig};
+use ecaxis_master::rt::cycle::{EngineConfig, Signals, first_snapshot};
 use ecaxis_master::rt::exchange::{Exchange, ExchangeDevice};
 use ecaxis_master::rt::image::{self, AxisBits, ImagePlan, ProcessData};
 use ecaxis_master::rt::phase::{ClockPlan, Phase};
-use ecaxis_master::rt::reaction_group::ReactionGroup;
 use ecaxis_master::rt::setpoint_generator::GeneratorRequest;
 use ecaxis_master::rt::spin::Spin;
 
@@ -99,15 +98,17 @@ fn layout() -> Layout {
     }
 }
 
+/// The process data of every drive.
+const DRIVE: ProcessData = ProcessData {
+    out_len: DRIVE_BYTES,
+    in_len: DRIVE_BYTES,
+    group: 0,
+    lrw: true,
+    mailbox: false,
+};
+
 fn plan(axes: usize) -> Result<ImagePlan, RigError> {
-    let drive = ProcessData {
-        out_len: DRIVE_BYTES,
-        in_len: DRIVE_BYTES,
-        group: 0,
-        lrw: true,
-        mailbox: false,
-    };
-    image::plan(&vec![drive; axes]).map_err(|_| RigError::TooMany(axes))
+    image::plan(&vec![DRIVE; axes]).map_err(|_| RigError::TooMany(axes))
 }
 
 /// Returns the bus for this number of axes.
@@ -129,7 +130,7 @@ pub struct Setup {
     pub axes: usize,
     pub cycle_ns: Nanos,
     pub spin: Spin,
-    pub exchange: config::Exchange,
+    pub exchange: ExchangeMode,
 }
 
 /// Returns the engine configuration and the host side of the cycle.
@@ -170,23 +171,26 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
     let (end, outer) = channel(&first_snapshot(&slots, 1, &signals, members.len()));
     let parts = EngineConfig {
         clock: Clock::Real,
-        timing: Timing {
+        config: RtConfig {
             cycle_ns,
             clock_window_ns: config::Bus::default().clock_window_ns,
             spin,
+            exchange,
+            // Losses are counted only; a stopped machine would end the measurement.
+            lost_frames: u32::MAX,
+            devices: vec![DRIVE; axes],
+            groups: vec![GroupConfig::machine(StopMethod::Ramp)],
+            bus_lost: StopMethod::QuickStop,
+            emergency: Vec::new(),
         },
         link,
         port: main_device(cycle_ns).1,
         exchange: Exchange::new(&plan, Some(&clock), &members, exchange),
         axes: slots,
-        groups: vec![ReactionGroup::machine(StopMethod::Ramp)],
         signals,
         controller: None,
         tables: Box::default(),
-        stop: StopSetup::default(),
         phase: Some(Phase::new(&clock)),
-        // Losses are counted only; a stopped machine would end the measurement.
-        guard: BusMonitor::new(u32::MAX, &plan.groups),
         end,
     };
     Ok((parts, outer))

@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::bus::{FaultInjection, ReplyDelay};
 use ecaxis_master::clock::Nanos;
 use ecaxis_master::config::duration::show as duration;
-use ecaxis_master::config::{Exchange, Machine, Nic};
+use ecaxis_master::config::{ExchangeMode, Machine, Nic};
 use ecaxis_master::link::SocketKind;
 use ecaxis_master::rt::spin::Spin;
 
@@ -22,7 +22,7 @@ pub struct Plan {
     pub target: Target,
     pub axes: usize,
     pub cycle_ns: Nanos,
-    pub exchange: Exchange,
+    pub exchange: ExchangeMode,
     pub link: SocketKind,
     pub spin: Spin,
     pub hold: ReplyDelay,
@@ -61,7 +61,7 @@ pub enum Baseline {
     /// The same cycle without spinning before the release.
     Sleep,
     /// The same cycle with another exchange.
-    Exchange(Exchange),
+    Exchange(ExchangeMode),
     /// The same cycle with another link.
     Link(SocketKind),
     /// A program that exchanges as many bytes on the same interface; see `benches/ethercrab`.
@@ -77,7 +77,7 @@ impl Plan {
 
     /// Returns the maximum delay of an answer in ns before its cycle is lost, for this exchange.
     #[must_use]
-    pub fn slack_ns(&self, exchange: Exchange) -> Nanos {
+    pub fn slack_ns(&self, exchange: ExchangeMode) -> Nanos {
         let hold = match self.hold {
             ReplyDelay::Fixed(hold) => hold,
             ReplyDelay::Wire => {
@@ -86,8 +86,8 @@ impl Plan {
             }
         };
         let time = match exchange {
-            Exchange::SameCycle => self.cycle_ns / 4 * 3,
-            Exchange::Pipelined => self.cycle_ns,
+            ExchangeMode::SameCycle => self.cycle_ns / 4 * 3,
+            ExchangeMode::Pipelined => self.cycle_ns,
         };
         time.saturating_sub(hold + SOFTWARE)
     }
@@ -129,9 +129,9 @@ impl Plan {
 
 /// Returns the name of an exchange as in the machine file and on the command line.
 #[must_use]
-pub fn exchange_name(exchange: Exchange) -> &'static str {
+pub fn exchange_name(exchange: ExchangeMode) -> &'static str {
     match exchange {
-        Exchange::SameCycle => "same-cycle",
-        Exchange::Pipelined => "pipelined",
+        ExchangeMode::SameCycle => "same-cycle",
+        ExchangeMode::Pipelined => "pipelined",
     }
 }

@@ -17,7 +17,7 @@ use super::wakeup::Cyclictest;
 use super::{caveats, machine};
 use crate::host::Fact;
 use crate::host::counters::CpuCounters;
-use ecaxis_master::config::Exchange;
+use ecaxis_master::config::ExchangeMode;
 use ecaxis_master::config::duration::show as duration;
 use ecaxis_master::link::{self, Link, OpenError, SocketKind};
 use ecaxis_master::rt::spin::Spin;
@@ -55,7 +55,7 @@ pub enum BenchError {
 enum VariantKind {
     Cycle {
         spin: Spin,
-        exchange: Exchange,
+        exchange: ExchangeMode,
         link: SocketKind,
     },
     Other(Baseline),
@@ -307,7 +307,7 @@ impl<'a> Fixture<'a> {
     fn cycle(
         &self,
         spin: Spin,
-        exchange: Exchange,
+        exchange: ExchangeMode,
         back_end: SocketKind,
         stop: &AtomicBool,
     ) -> Result<Option<Measured>, BenchError> {

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use ecaxis_master::config::{
-    self, Action, Bus, DeviceConfig, Exchange, Machine, Nic, Step, duration,
+    self, Action, Bus, DeviceConfig, ExchangeMode, Machine, Nic, Step, duration,
 };
 use ecaxis_master::link::SocketKind;
 use ecaxis_master::rt::exchange::MAX_POLL_DATAGRAM;
@@ -76,8 +76,8 @@ fn bus(machine: &Machine, out: &mut Document) {
     let meaning = "consecutive cycles without a valid answer stop the axes";
     row("lost_frames", &bus.lost_frames.to_string(), meaning);
     let (value, meaning) = match bus.exchange {
-        Exchange::SameCycle => ("same-cycle", "answers are waited for within the cycle"),
-        Exchange::Pipelined => (
+        ExchangeMode::SameCycle => ("same-cycle", "answers are waited for within the cycle"),
+        ExchangeMode::Pipelined => (
             "pipelined",
             "answers are read in the next cycle, without waiting",
         ),
@@ -225,7 +225,7 @@ fn frame_bytes(plan: &ImagePlan, clock: bool) -> Vec<usize> {
 }
 
 fn wire(machine: &Machine, out: &mut Document) {
-    let plan = match image::of(machine) {
+    let plan = match image::of(&machine.rt_config()) {
         Ok(plan) => plan,
         Err(e) => {
             out.heading("process image");
@@ -291,14 +291,14 @@ fn load(machine: &Machine, wire_ns: u64) -> (u64, &'static str) {
     let work = WORK_NS + AXIS_NS * u64::try_from(axes).unwrap_or(u64::MAX / AXIS_NS);
     let spin = match machine.bus.spin {
         Spin::Auto => SPIN_NS.min(match machine.bus.exchange {
-            Exchange::SameCycle => machine.bus.cycle_ns * 2 / 5,
-            Exchange::Pipelined => machine.bus.cycle_ns * 4 / 25,
+            ExchangeMode::SameCycle => machine.bus.cycle_ns * 2 / 5,
+            ExchangeMode::Pipelined => machine.bus.cycle_ns * 4 / 25,
         }),
         Spin::For(ns) => ns,
     };
     match machine.bus.exchange {
-        Exchange::SameCycle => (work + spin + wire_ns, "work, spinning, waiting for answers"),
-        Exchange::Pipelined => (work + spin, "work, spinning"),
+        ExchangeMode::SameCycle => (work + spin + wire_ns, "work, spinning, waiting for answers"),
+        ExchangeMode::Pipelined => (work + spin, "work, spinning"),
     }
 }
 

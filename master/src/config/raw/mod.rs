@@ -10,7 +10,7 @@ use super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Writte
 use super::gateway::RawNode;
 use super::problem::{Problems, Span};
 use super::travel::RawTrack;
-use super::{Exchange, GroupStopScope, SocketKind, Spin};
+use super::{ExchangeMode, GroupStopScope, SocketKind, Spin};
 
 mod axis;
 mod step;
@@ -46,9 +46,9 @@ const MS: Ns = 1_000_000;
 const S: Ns = 1000 * MS;
 
 const IDLE_MODES: [(&str, bool); 2] = [("sleep", false), ("awake", true)];
-const EXCHANGES: [(&str, Exchange); 2] = [
-    ("same-cycle", Exchange::SameCycle),
-    ("pipelined", Exchange::Pipelined),
+const EXCHANGES: [(&str, ExchangeMode); 2] = [
+    ("same-cycle", ExchangeMode::SameCycle),
+    ("pipelined", ExchangeMode::Pipelined),
 ];
 const LINKS: [(&str, SocketKind); 2] = [
     (SocketKind::Ring.name(), SocketKind::Ring),
@@ -70,7 +70,7 @@ table! { "[bus]",
         // The watchdog registers count 100 µs in 16 bits.
         watchdog: Key<Ns> [MS..=6553 * S + 500 * MS],
         clock_window: Key<Ns> [100..=S],
-        exchange: Key<Exchange> [EXCHANGES],
+        exchange: Key<ExchangeMode> [EXCHANGES],
         link: Key<SocketKind> [LINKS],
     }
 }

@@ -12,7 +12,7 @@ impl Engine {
     /// before.
     pub(super) fn handle_skipped_cycles(&mut self, woke: Nanos) {
         let before = self.woke.replace(woke).unwrap_or(woke);
-        let silent = woke.saturating_sub(before) / self.timing.cycle_ns;
+        let silent = woke.saturating_sub(before) / self.config.cycle_ns;
         if silent < 2 {
             return;
         }
@@ -60,7 +60,7 @@ impl Engine {
 
     /// Steps one axis. A cause that must stop its group is stored in the group.
     fn step_axis(&mut self, index: usize) {
-        let dt_s = self.timing.cycle_ns as f64 * 1e-9;
+        let dt_s = self.config.cycle_ns as f64 * 1e-9;
         let master = self.axes.get(index).and_then(|slot| {
             let (master, actual) = slot.feed.master()?;
             let status = self.axes.get(master)?.axis.status();

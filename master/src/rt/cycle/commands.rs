@@ -186,7 +186,7 @@ impl Engine {
                 .and_then(ReactionGroup::stop)
                 .is_some();
             if stopping && self.guarding && self.guard.device_lost(slot.device) {
-                slot.axis.stop_by(self.stop_setup.bus_lost);
+                slot.axis.stop_by(self.config.bus_lost);
             }
         }
     }

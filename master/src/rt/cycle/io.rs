@@ -31,7 +31,7 @@ impl Engine {
     /// mode, takes only the frames that have already arrived.
     pub(super) fn receive(&mut self, woke: Nanos) {
         let released = self.next;
-        let quarter = self.timing.cycle_ns / 4;
+        let quarter = self.config.cycle_ns / 4;
         // After a late wake-up the frames still get time to return.
         let deadline = (released + 3 * quarter).max(woke + quarter);
         loop {
@@ -111,7 +111,7 @@ impl Engine {
             return;
         };
         let amount = u64::from(difference_ns.unsigned_abs());
-        if amount > self.timing.clock_window_ns && !*off {
+        if amount > self.config.clock_window_ns && !*off {
             *off = true;
             let cycle = self.stats.counters.cycles;
             self.report(Event::ClockOff {
@@ -119,7 +119,7 @@ impl Engine {
                 device,
                 difference_ns,
             });
-        } else if amount <= self.timing.clock_window_ns / 2 {
+        } else if amount <= self.config.clock_window_ns / 2 {
             *off = false;
         }
     }

@@ -83,7 +83,7 @@ impl Engine {
             });
         if failed {
             self.plain.since = Some(clock::now());
-            self.next = self.next.max(due) + self.timing.cycle_ns;
+            self.next = self.next.max(due) + self.config.cycle_ns;
         }
     }
 
@@ -112,10 +112,10 @@ impl Engine {
             }
             engine.halted |= engine.end.orders.is_abandoned() && ended;
         });
-        self.next += self.timing.cycle_ns;
+        self.next += self.config.cycle_ns;
         let now = clock::now();
         while self.next <= now {
-            self.next += self.timing.cycle_ns;
+            self.next += self.config.cycle_ns;
         }
     }
 

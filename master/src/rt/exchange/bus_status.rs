@@ -4,12 +4,20 @@
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 
 use crate::clock::Nanos;
-use crate::mailbox::MailboxStatus;
 
 /// Bit 3 of a SyncManager's status.
 const MAILBOX_FULL: u8 = 0x08;
 /// No distributed clock has answered yet.
 const NO_CLOCK: i64 = i64::MIN;
+
+/// The status of a mailbox as read by the cycle.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MailboxStatus {
+    /// The time on the session's clock at or after which the status was read.
+    pub at: Nanos,
+    /// True if a message waits in the mailbox.
+    pub full: bool,
+}
 
 #[derive(Debug)]
 pub struct BusStatus {

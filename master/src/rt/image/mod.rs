@@ -4,13 +4,10 @@
 use ecaxis_esi::address;
 use ecaxis_esi::layout::{Field, Layout};
 
-use crate::config::NumericFormat;
-
 pub mod plan;
 
 pub use plan::{
     Access, DatagramPlan, DeviceRegion, ImagePlan, MailboxPlan, ProcessData, TooLarge, of, plan,
-    process_data,
 };
 
 /// The bits of one object in the image.
@@ -89,6 +86,15 @@ impl BitField {
             *byte = (*byte & keep) | ((bits >> (8 * i)) as u8);
         }
     }
+}
+
+/// The number format of a signal's bits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NumericFormat {
+    Unsigned,
+    Signed,
+    /// IEEE 754, 32 bits.
+    Real,
 }
 
 /// Bits that the program reads or sets as a number.

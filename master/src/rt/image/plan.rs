@@ -1,6 +1,6 @@
 //! The layout of the process image: the logical address, datagram and frame of each SubDevice.
 
-use crate::config::Machine;
+use crate::rt::config::RtConfig;
 
 /// First logical address of the process image.
 pub const LOGICAL_BASE: u32 = 0x0001_0000;
@@ -143,27 +143,10 @@ fn wire_ns(datagrams: &[DatagramPlan], devices: usize) -> u64 {
     80 * bytes as u64 + 1000 * devices as u64
 }
 
-/// Returns the process data of a machine's SubDevices according to their ESIs.
-#[allow(clippy::disallowed_methods, reason = "runs before the loop")]
-#[must_use]
-pub fn process_data(machine: &Machine) -> Vec<ProcessData> {
-    let each = machine.devices.iter().enumerate().map(|(index, device)| {
-        let layout = &device.selection.layout;
-        ProcessData {
-            out_len: layout.rx_bytes(),
-            in_len: layout.tx_bytes(),
-            group: machine.group_of(index),
-            lrw: !device.device.use_lrd_lwr,
-            mailbox: device.device.mailbox_status_fmmu().is_some(),
-        }
-    });
-    each.collect()
-}
-
-/// Returns the image of a machine according to its ESIs.
-pub fn of(machine: &Machine) -> Result<ImagePlan, TooLarge> {
-    let mut image = plan(&process_data(machine))?;
-    if wire_ns(&image.separate, machine.devices.len()) > machine.bus.cycle_ns / 2 {
+/// Returns the image of a machine according to its settings.
+pub fn of(config: &RtConfig) -> Result<ImagePlan, TooLarge> {
+    let mut image = plan(&config.devices)?;
+    if wire_ns(&image.separate, config.devices.len()) > config.cycle_ns / 2 {
         image.separate.clear();
     }
     Ok(image)

@@ -1,0 +1,84 @@
+//! The settings of the cycle, as plain data.
+
+use ecaxis_axis::StopMethod;
+
+use super::image::ProcessData;
+use super::spin::Spin;
+use crate::clock::Nanos;
+
+/// The settings of the cycle.
+#[derive(Debug, Clone)]
+pub struct RtConfig {
+    pub cycle_ns: Nanos,
+    /// DC offsets in ns beyond this are reported.
+    pub clock_window_ns: u64,
+    /// The time spun before the release; the rest of the cycle is slept.
+    pub spin: Spin,
+    pub exchange: ExchangeMode,
+    /// The number of consecutive cycles without a valid answer that stops the axes.
+    pub lost_frames: u32,
+    /// The process data of each SubDevice.
+    pub devices: Vec<ProcessData>,
+    /// The reaction groups; the first one holds all SubDevices without a named group.
+    pub groups: Vec<GroupConfig>,
+    /// The stop method of axes without valid inputs.
+    pub bus_lost: StopMethod,
+    /// The conditions for an emergency stop; one is enough.
+    pub emergency: Vec<Condition>,
+}
+
+/// The cycle in which answers are evaluated.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum ExchangeMode {
+    /// The cycle that sent the frames; the thread waits for the answers.
+    #[default]
+    SameCycle,
+    /// The cycle after it: the answers have arrived by then, and the thread does not wait.
+    Pipelined,
+}
+
+/// How a reaction group stops.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct GroupConfig {
+    /// The stop method of the other axes when one faults, trips, or can no longer follow.
+    pub others: StopMethod,
+    pub outside: GroupStopScope,
+}
+
+impl GroupConfig {
+    /// Returns the settings of the group whose stop is the stop of the machine.
+    #[must_use]
+    pub const fn machine(others: StopMethod) -> Self {
+        let outside = GroupStopScope::Stop;
+        Self { others, outside }
+    }
+}
+
+/// What the machine does when a group stops.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum GroupStopScope {
+    /// The machine stops as well, within the limits of its axes.
+    #[default]
+    Stop,
+    Continue,
+}
+
+/// A condition on an input. All given bounds must hold.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Condition {
+    /// The index of the input among those of the machine.
+    pub input: usize,
+    pub equal: Option<f64>,
+    pub above: Option<f64>,
+    pub below: Option<f64>,
+}
+
+impl Condition {
+    /// RT.
+    #[must_use]
+    pub fn holds(&self, value: f64) -> bool {
+        self.equal.is_none_or(|n| value == n)
+            && self.above.is_none_or(|n| value > n)
+            && self.below.is_none_or(|n| value < n)
+    }
+}
