@@ -7,6 +7,7 @@ extern crate alloc;
 pub mod al_status_code;
 pub mod data_type;
 pub mod datagram;
+pub mod index;
 pub mod mailbox;
 pub mod object;
 mod object_names;

@@ -4,6 +4,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_ecat::registers;
 use ethercrab::error::Error;
 use ethercrab::{Command, MainDevice, WrappedRead, WrappedWrite};
@@ -183,7 +184,7 @@ const MAX_STATUS_AGE_CYCLES: Nanos = 4;
 pub struct CyclicMailboxTransport {
     datagrams: DatagramClient,
     bus_status: Arc<BusStatus>,
-    member: usize,
+    member: DeviceIndex,
     old_ns: Nanos,
 }
 
@@ -199,7 +200,7 @@ impl CyclicMailboxTransport {
         let each = (0..members).map(|member| Self {
             datagrams,
             bus_status: Arc::clone(bus_status),
-            member,
+            member: DeviceIndex(member),
             old_ns: cycle_ns.saturating_mul(MAX_STATUS_AGE_CYCLES),
         });
         each.collect()

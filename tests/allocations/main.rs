@@ -10,6 +10,7 @@ use std::sync::mpsc::channel;
 use std::task::{Context, Poll, Waker};
 
 use ecaxis_axis::Command;
+use ecaxis_ecat::index::AxisIndex;
 use ecaxis_master::clock::{self, Clock, Nanos};
 use ecaxis_master::config::{AxisRef, Machine};
 use ecaxis_master::link::capture::{Recorder, WriterMode};
@@ -273,7 +274,7 @@ fn a_controller_is_called_without_an_allocation() {
     let x = machine.axis("x").expect("an axis");
     let controller = Box::new(Swing(x, 0.0));
     let (counted, remains, _) = metered(machine, &virtual_time(), Some(controller), 5_000);
-    assert!(remains.axes[0].axis.status().enabled);
+    assert!(remains.axes[AxisIndex(0)].axis.status().enabled);
     assert_eq!(counted, 0);
 }
 
@@ -303,7 +304,7 @@ fn skipped_cycles_allocate_nothing() {
     let (counted, remains, _) = metered(machine, &virtual_time(), Some(controller), 5_000);
     let counters = remains.stats.counters;
     assert!(counters.overruns > 200, "{counters:?}");
-    assert!(remains.axes[0].axis.status().enabled);
+    assert!(remains.axes[AxisIndex(0)].axis.status().enabled);
     assert_eq!(counted, 0);
 }
 

@@ -1,5 +1,6 @@
 //! The main function on the simulated bus in virtual time: from a machine file to moving axes.
 
+use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_master::acyclic::AlState;
 use ecaxis_master::bringup::Step;
 use ecaxis_master::session::{Options, Progress};
@@ -64,7 +65,7 @@ fn a_coupler_and_terminals_work_next_to_an_axis() {
 #[test]
 fn a_gateway_with_nodes_works_next_to_an_axis() {
     let machine = load("gateway.toml");
-    let gateway = machine.devices[0]
+    let gateway = machine.devices[DeviceIndex(0)]
         .sim
         .gateway
         .as_ref()
@@ -78,7 +79,7 @@ fn a_gateway_with_nodes_works_next_to_an_axis() {
         nodes,
         [(1, "EPOS 24/1"), (2, "EPOS 24/5"), (100, "EPOS 70/10")]
     );
-    assert!(machine.devices[1].sim.gateway.is_none());
+    assert!(machine.devices[DeviceIndex(1)].sim.gateway.is_none());
     let summary = run_well(machine, virtual_time());
     assert_eq!(summary.counters.wkc_errors, 0);
     assert_eq!(summary.axes[0].final_error_counts, Some(0), "{summary:?}");
@@ -169,7 +170,7 @@ fn the_vendor_startup_list_matches_the_application_notes() {
     };
     let text = axes(1).replace("esi/EPOS4.xml", &esi.display().to_string());
     let machine = machine(&text);
-    let list: Vec<_> = machine.devices[0]
+    let list: Vec<_> = machine.devices[DeviceIndex(0)]
         .selection
         .startup
         .iter()
@@ -229,7 +230,7 @@ fn startup_commands_wait_for_their_transition() {
     let text = axes(1).replace("esi/EPOS4.xml", &esi.display().to_string());
     let machine = machine(&text);
     let count = |late: bool| {
-        let list = &machine.devices[0].selection.startup;
+        let list = &machine.devices[DeviceIndex(0)].selection.startup;
         list.iter()
             .filter(|sdo| (sdo.transition == "SO") == late)
             .count()

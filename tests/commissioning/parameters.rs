@@ -5,6 +5,7 @@ mod cli;
 use std::sync::atomic::AtomicBool;
 use std::thread;
 
+use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_esi::Dictionary;
 use ecaxis_master::acyclic::eeprom::{Eeprom, EepromAccess};
 use ecaxis_master::acyclic::image::{with_alias, write};
@@ -156,7 +157,7 @@ fn large_with(change: impl FnOnce(String) -> String) -> (tempfile::TempDir, Mach
 #[test]
 fn a_small_mailbox_transfers_large_objects() {
     let (_folder, machine) = large();
-    let described = machine.devices[0].selection.dictionary.clone();
+    let described = machine.devices[DeviceIndex(0)].selection.dictionary.clone();
     let work = Box::new(move |link: &mut SimLink| {
         carried(link, async |wire| {
             with_device(&wire, 0, async |coe| {
@@ -206,7 +207,7 @@ fn frame_sized_mailboxes_transfer_everything() {
         assert!(long.contains(boot));
         long.replace(boot, "<BootStrap>0010ce050016ce05</BootStrap>")
     });
-    let identity = machine.devices[0].device.identity;
+    let identity = machine.devices[DeviceIndex(0)].device.identity;
     let header = FirmwareHeader {
         vendor: identity.vendor,
         product: identity.product,
@@ -316,7 +317,7 @@ async fn everything(wire: &DatagramClient, position: u16, dictionary: &Dictionar
 
 /// Changes every changeable setting, saves it in a file, and restores it to the other drive.
 fn from_one_to_the_other(machine: Machine) -> (usize, usize) {
-    let dictionary = machine.devices[0].selection.dictionary.clone();
+    let dictionary = machine.devices[DeviceIndex(0)].selection.dictionary.clone();
     let work = Box::new(move |link: &mut SimLink| {
         carried(link, async |wire| {
             let before = everything(&wire, 0, &dictionary).await;
@@ -444,7 +445,7 @@ fn a_written_alias_applies_after_the_next_power_on() {
             let image = plan(&by_alias.rt_config().devices).expect("a plan");
             let bus = bring_up(wire.main_device(), &by_alias, image, &mut |_| {}, &Deaf).await;
             let bus = bus.unwrap_or_else(|error| panic!("{error}"));
-            let x = &bus.devices[0].at;
+            let x = &bus.devices[DeviceIndex(0)].at;
             assert_eq!((x.name.as_str(), x.position), ("x", 0));
         });
     });

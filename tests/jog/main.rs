@@ -7,6 +7,7 @@ mod replaced_requests;
 mod terminal;
 
 use ecaxis_axis::{Mode, State, Trip};
+use ecaxis_ecat::index::AxisIndex;
 use ecaxis_master::supervise::jog::{
     Activity, HOLD_TO_RUN_TIMEOUT, JogEvent, MAX_MANUAL_SPEED, OperatorInput, Presence, Request,
     View,
@@ -26,10 +27,10 @@ fn once_enabled(
 ) -> impl FnMut(&View<'_>, f64) -> OperatorInput + Send + 'static {
     let mut ready = None;
     move |view, now| {
-        let axis = &view.snapshot.axes[0];
+        let axis = &view.snapshot.axes[AxisIndex(0)];
         if ready.is_none() && !axis.ready {
-            return match view.hands[0].doing {
-                Activity::Nothing => request(Request::Enable { axis: 0 }),
+            return match view.hands[AxisIndex(0)].doing {
+                Activity::Nothing => request(Request::Enable { axis: AxisIndex(0) }),
                 _ => here(),
             };
         }
@@ -67,7 +68,10 @@ fn a_released_axis_brakes() {
         machine(&axes(1)),
         virtual_time(),
         once_enabled(move |_, since| match since {
-            ..1.0 => Some(request(Request::Jog { axis: 0, velocity })),
+            ..1.0 => Some(request(Request::Jog {
+                axis: AxisIndex(0),
+                velocity,
+            })),
             ..3.0 => Some(here()),
             _ => None,
         }),
@@ -89,12 +93,12 @@ fn a_released_axis_brakes() {
     let news: Vec<_> = seen.iter().flat_map(|s| s.news.clone()).collect();
     let reported = [
         JogEvent::Done {
-            axis: 0,
+            axis: AxisIndex(0),
             what: Activity::Enabling,
         },
-        JogEvent::LetGo { axis: 0 },
+        JogEvent::LetGo { axis: AxisIndex(0) },
         JogEvent::Done {
-            axis: 0,
+            axis: AxisIndex(0),
             what: Activity::Stopping,
         },
     ];
@@ -109,11 +113,11 @@ fn an_absent_operator_starts_nothing_and_stops_all_motion() {
             virtual_time(),
             once_enabled(move |_, since| {
                 let jog = Request::Jog {
-                    axis: 0,
+                    axis: AxisIndex(0),
                     velocity: 5.0,
                 };
                 let go = Request::MoveTo {
-                    axis: 0,
+                    axis: AxisIndex(0),
                     position: 80.0,
                     speed: 0.2,
                 };
@@ -155,7 +159,7 @@ fn an_operator_who_leaves_in_motion_leaves_a_machine_at_rest() {
         virtual_time(),
         once_enabled(|_, since| match since {
             0.0 => Some(request(Request::MoveBy {
-                axis: 0,
+                axis: AxisIndex(0),
                 distance: 80.0,
                 speed: MAX_MANUAL_SPEED,
             })),
@@ -180,9 +184,12 @@ fn an_operator_who_leaves_in_motion_leaves_a_machine_at_rest() {
 
 #[test]
 fn jog_rejects_more_than_a_quarter_of_the_speed_limit() {
-    let jog = |velocity| Request::Jog { axis: 0, velocity };
+    let jog = |velocity| Request::Jog {
+        axis: AxisIndex(0),
+        velocity,
+    };
     let by = |speed| Request::MoveBy {
-        axis: 0,
+        axis: AxisIndex(0),
         distance: 1.0,
         speed,
     };
@@ -196,18 +203,18 @@ fn jog_rejects_more_than_a_quarter_of_the_speed_limit() {
         by(-0.1),
         by(f64::NAN),
         Request::MoveTo {
-            axis: 0,
+            axis: AxisIndex(0),
             position: 101.0,
             speed: 0.1,
         },
         Request::MoveTo {
-            axis: 0,
+            axis: AxisIndex(0),
             position: f64::NAN,
             speed: 0.1,
         },
-        Request::Home { axis: 0 },
+        Request::Home { axis: AxisIndex(0) },
         Request::SetMode {
-            axis: 0,
+            axis: AxisIndex(0),
             mode: Mode::Csv,
         },
     ];
@@ -240,12 +247,12 @@ fn a_rejected_request_keeps_the_dead_man_rule_active() {
                 // The second request is accepted before the rejection of the first is reported.
                 turn.requests = vec![
                     Request::MoveTo {
-                        axis: 0,
+                        axis: AxisIndex(0),
                         position: 1000.0,
                         speed: 0.1,
                     },
                     Request::Jog {
-                        axis: 0,
+                        axis: AxisIndex(0),
                         velocity: 5.0,
                     },
                 ];
@@ -271,7 +278,10 @@ fn jog_stays_within_the_range_while_the_key_is_held() {
         machine(&axes(1)),
         virtual_time(),
         once_enabled(move |_, since| match since {
-            ..12.0 => Some(request(Request::Jog { axis: 0, velocity })),
+            ..12.0 => Some(request(Request::Jog {
+                axis: AxisIndex(0),
+                velocity,
+            })),
             _ => None,
         }),
     );
@@ -295,20 +305,24 @@ fn a_fault_stops_all_axes_and_is_reset() {
             let status = &view.snapshot.axes;
             let idle = view.idle();
             let ready = status.iter().all(|axis| axis.ready);
-            if status[1].fault.is_some() && !reset && !status[0].enabled {
+            if status[AxisIndex(1)].fault.is_some() && !reset && !status[AxisIndex(0)].enabled {
                 reset = true;
-                return request(Request::Reset { axis: 1 });
+                return request(Request::Reset { axis: AxisIndex(1) });
             }
             if now > 6.0 {
                 return operator::gone();
             }
             let mut turn = here();
-            if idle && !ready && (!reset || status[1].fault.is_none()) {
-                turn.requests = (0..2).map(|axis| Request::Enable { axis }).collect();
+            if idle && !ready && (!reset || status[AxisIndex(1)].fault.is_none()) {
+                turn.requests = (0..2)
+                    .map(|axis| Request::Enable {
+                        axis: AxisIndex(axis),
+                    })
+                    .collect();
             } else if ready {
                 turn.requests = (0..2)
                     .map(|axis| Request::Jog {
-                        axis,
+                        axis: AxisIndex(axis),
                         velocity: if axis == 0 { 2.0 } else { -2.0 },
                     })
                     .collect();
@@ -343,12 +357,12 @@ fn an_emergency_stop_removes_power_and_requires_a_reset() {
             machine(&axes(2)),
             virtual_time(),
             once_enabled(move |view, since| {
-                let axis = &view.snapshot.axes[0];
+                let axis = &view.snapshot.axes[AxisIndex(0)];
                 let (next, turn) = match phase {
                     0 => (
                         1,
                         request(Request::MoveBy {
-                            axis: 0,
+                            axis: AxisIndex(0),
                             distance: 50.0,
                             speed: 0.2,
                         }),
@@ -356,19 +370,19 @@ fn an_emergency_stop_removes_power_and_requires_a_reset() {
                     1 if since > 0.5 => (2, request(Request::EmergencyStop)),
                     2 if since > 1.5 => {
                         assert!(!axis.enabled && axis.trip == Some(Trip::EmergencyStop));
-                        (3, request(Request::Enable { axis: 0 }))
+                        (3, request(Request::Enable { axis: AxisIndex(0) }))
                     }
                     3 if view.news.iter().any(JogEvent::is_failure) => {
                         assert!(!axis.enabled);
-                        let enable = Request::Reset { axis: 0 };
+                        let enable = Request::Reset { axis: AxisIndex(0) };
                         (if reset { 4 } else { 6 }, request(enable))
                     }
-                    4 if view.idle() => (5, request(Request::Enable { axis: 0 })),
+                    4 if view.idle() => (5, request(Request::Enable { axis: AxisIndex(0) })),
                     5 if axis.ready => (6, here()),
                     6 => return None,
                     same => (same, here()),
                 };
-                phase = if turn.requests == [Request::Reset { axis: 0 }] && !reset {
+                phase = if turn.requests == [Request::Reset { axis: AxisIndex(0) }] && !reset {
                     return None;
                 } else {
                     next
@@ -407,18 +421,18 @@ track = { negative_limit = -6.0, positive_limit = 6.0, home = [2.0, 2.5], index 
 #[test]
 fn jog_homes_an_axis_and_switches_its_mode() {
     let plan = [
-        Request::Home { axis: 0 },
+        Request::Home { axis: AxisIndex(0) },
         Request::MoveTo {
-            axis: 0,
+            axis: AxisIndex(0),
             position: 5.0,
             speed: 0.2,
         },
         Request::SetMode {
-            axis: 0,
+            axis: AxisIndex(0),
             mode: Mode::Csv,
         },
         Request::Jog {
-            axis: 0,
+            axis: AxisIndex(0),
             velocity: 2.0,
         },
     ];
@@ -455,7 +469,7 @@ fn homing_ends_without_an_operator() {
         virtual_time(),
         once_enabled(|_, since| {
             let mut turn = match since {
-                0.0 => request(Request::Home { axis: 0 }),
+                0.0 => request(Request::Home { axis: AxisIndex(0) }),
                 ..2.0 => here(),
                 _ => return None,
             };
@@ -513,30 +527,43 @@ fn random_requests_stay_within_the_limits() {
                     0..10 => {
                         let velocity = part * 2.0 * MAX_MANUAL_SPEED * VELOCITY;
                         last_jog[axis] = now;
-                        Request::Jog { axis, velocity }
+                        Request::Jog {
+                            axis: AxisIndex(axis),
+                            velocity,
+                        }
                     }
                     10 => Request::MoveBy {
-                        axis,
+                        axis: AxisIndex(axis),
                         distance: part * 20.0,
                         speed: part * 0.5,
                     },
                     11 => Request::MoveTo {
-                        axis,
+                        axis: AxisIndex(axis),
                         position: part * 150.0,
                         speed: part * 0.5,
                     },
-                    12..20 => Request::Enable { axis },
-                    20 => Request::Disable { axis },
-                    21 => Request::Stop { axis },
+                    12..20 => Request::Enable {
+                        axis: AxisIndex(axis),
+                    },
+                    20 => Request::Disable {
+                        axis: AxisIndex(axis),
+                    },
+                    21 => Request::Stop {
+                        axis: AxisIndex(axis),
+                    },
                     22 => Request::StopAll,
-                    23..30 => Request::Reset { axis },
+                    23..30 => Request::Reset {
+                        axis: AxisIndex(axis),
+                    },
                     30 if dice(20) == 0 => Request::EmergencyStop,
-                    31 => Request::Home { axis },
+                    31 => Request::Home {
+                        axis: AxisIndex(axis),
+                    },
                     32 => Request::SetMode {
-                        axis,
+                        axis: AxisIndex(axis),
                         mode: Mode::Csv,
                     },
-                    33 => Request::Enable { axis: 7 },
+                    33 => Request::Enable { axis: AxisIndex(7) },
                     _ => continue,
                 };
                 turn.requests.push(again);

@@ -55,7 +55,7 @@ impl<F: FnMut(&View<'_>, f64) -> OperatorInput + Send> Operator for Plan<F> {
         let time_s = (view.now - began) as f64 * 1e-9;
         self.seen.lock().expect("no panic").push(Seen {
             time_s: (view.snapshot.time.saturating_sub(began)) as f64 * 1e-9,
-            axes: view.snapshot.axes.clone(),
+            axes: view.snapshot.axes.to_vec(),
             news: view.news.to_vec(),
         });
         (self.plan)(view, time_s)

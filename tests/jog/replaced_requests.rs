@@ -2,6 +2,7 @@
 //! is reported.
 
 use ecaxis_axis::Mode;
+use ecaxis_ecat::index::AxisIndex;
 use ecaxis_master::supervise::jog::{Activity, JogEvent, OperatorInput, Presence, Request, View};
 
 use super::operator::{Seen, by_hand, gone, here, request};
@@ -18,11 +19,14 @@ fn replaced_by(file: &str, instead: Request, presence: Presence) -> (f64, Vec<Se
         once_enabled(move |view, since| {
             let velocity = 5.0;
             if since < LAST {
-                return Some(request(Request::Jog { axis: 0, velocity }));
+                return Some(request(Request::Jog {
+                    axis: AxisIndex(0),
+                    velocity,
+                }));
             }
             if !asked {
                 asked = true;
-                assert_eq!(view.snapshot.axes[0].target_velocity, velocity);
+                assert_eq!(view.snapshot.axes[AxisIndex(0)].target_velocity, velocity);
                 return Some(request(instead));
             }
             let mut turn = here();
@@ -43,23 +47,23 @@ fn replaced_by(file: &str, instead: Request, presence: Presence) -> (f64, Vec<Se
 fn a_request_that_replaces_a_jog_keeps_the_dead_man_rule_active() {
     let speed = 0.1;
     let others = [
-        Request::Enable { axis: 0 },
-        Request::Reset { axis: 0 },
+        Request::Enable { axis: AxisIndex(0) },
+        Request::Reset { axis: AxisIndex(0) },
         Request::SetMode {
-            axis: 0,
+            axis: AxisIndex(0),
             mode: Mode::Csv,
         },
         Request::MoveBy {
-            axis: 0,
+            axis: AxisIndex(0),
             distance: 1000.0,
             speed,
         },
         Request::MoveTo {
-            axis: 0,
+            axis: AxisIndex(0),
             position: 1000.0,
             speed,
         },
-        Request::Home { axis: 0 },
+        Request::Home { axis: AxisIndex(0) },
     ];
     // The second machine has a range but no homing and no other mode, so it rejects each request.
     for file in [VERSATILE, &axes(1)] {
@@ -84,7 +88,7 @@ fn a_request_that_replaces_a_jog_keeps_the_dead_man_rule_active() {
 #[test]
 fn a_move_continues_from_a_jog() {
     let instead = Request::MoveTo {
-        axis: 0,
+        axis: AxisIndex(0),
         position: 20.0,
         speed: 0.1,
     };
@@ -105,9 +109,9 @@ fn a_move_continues_from_a_jog() {
     }
 }
 
-fn both(request: impl Fn(usize) -> Request) -> OperatorInput {
+fn both(request: impl Fn(AxisIndex) -> Request) -> OperatorInput {
     OperatorInput {
-        requests: [0, 1].map(request).to_vec(),
+        requests: [0, 1].map(AxisIndex).map(request).to_vec(),
         ..OperatorInput::default()
     }
 }
@@ -119,7 +123,7 @@ fn both_enabled(
     let mut ready = None;
     move |view, now| {
         if ready.is_none() && !view.snapshot.axes.iter().all(|axis| axis.ready) {
-            return match view.hands[0].doing {
+            return match view.hands[AxisIndex(0)].doing {
                 Activity::Nothing if now < 0.01 => both(|axis| Request::Enable { axis }),
                 _ => here(),
             };
@@ -151,8 +155,7 @@ fn every_rejection_is_reported() {
     let news: Vec<JogEvent> = news
         .skip_while(|news| matches!(news, JogEvent::Done { .. }))
         .collect();
-    let refused =
-        |axis| matches!(&news[axis], JogEvent::Refused { axis: reported, .. } if *reported == axis);
+    let refused = |n: usize| matches!(&news[n], JogEvent::Refused { axis, .. } if axis.0 == n);
     assert!(news.len() == 2 && refused(0) && refused(1), "{news:?}");
 }
 

@@ -3,6 +3,7 @@
 
 use std::path::Path;
 
+use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::recordings::{FPRD, FPWR, LRW, datagrams};
 use ecaxis_test_support::{Heard, assert_contains, faults, recorded, run, virtual_time};
@@ -151,7 +152,7 @@ fn a_drive_limit_below_the_file_limit_causes_a_warning() {
     let limits =
         "position = [-20.0, 20.0], velocity = 1000.0, acceleration = 200.0, following_error = 0.5";
     let machine = bench.machine(&epos4("", limits));
-    let notes = machine.devices[0].selection.notes.join("\n");
+    let notes = machine.devices[DeviceIndex(0)].selection.notes.join("\n");
     assert!(notes.contains("0x6080:00 (Max motor speed)"), "{notes}");
     let (outcome, heard) = run(machine, virtual_time());
     outcome.result.expect("nothing moves");
@@ -221,7 +222,7 @@ fn offsets_and_outputs_of_a_second_axis_stay_zero() {
     bench.change("esi/EPOS4.xml", two_axes);
     let text = epos4(OFFSET_AND_SECOND_AXIS, LIMITS);
     let machine = bench.machine(&(text.clone() + "[[step]]\nmove = { x = 2.0 }\n"));
-    let notes = machine.devices[0].selection.notes.join("\n");
+    let notes = machine.devices[DeviceIndex(0)].selection.notes.join("\n");
     assert!(notes.contains("axis 2 of the drive"), "{notes}");
     let (options, path) = recorded(virtual_time(), bench.path());
     run(machine, options).0.result.expect("it moves");

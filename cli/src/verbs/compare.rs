@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_master::config::{self, Machine, Nic};
 use ecaxis_master::esi_library::{self, Library};
 use ecaxis_master::text::pluralize;
@@ -267,7 +268,7 @@ fn refused(file: &Path, error: &ApplyError) -> Failure {
 
 /// Formats the comparison as JSON. `complete`: all requested items were compared.
 fn as_json(machine: &Machine, comparison: &Comparison, scan: &Scan, complete: bool) -> Value {
-    let name = |index: usize| machine.devices.get(index).map(|d| d.name.clone());
+    let name = |index: DeviceIndex| machine.devices.get(index).map(|d| d.name.clone());
     let each: Vec<Value> = comparison
         .differences
         .iter()

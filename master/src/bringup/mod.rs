@@ -13,6 +13,7 @@
 
 use std::fmt;
 
+use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
@@ -71,7 +72,7 @@ pub struct BusDevice {
 #[derive(Debug)]
 pub struct Bus {
     /// In the order of the machine file.
-    pub devices: Vec<BusDevice>,
+    pub devices: IndexVec<DeviceIndex, BusDevice>,
     pub image: ImagePlan,
     pub dc: Option<ClockPlan>,
 }
@@ -234,6 +235,7 @@ pub async fn bring_up(
         device.report(listener);
     }
     let (image, dc) = set_up?;
+    let devices = devices.into();
     Ok(Bus { devices, image, dc })
 }
 
@@ -260,7 +262,7 @@ async fn set_up(
     }
 
     let regions = machine.devices.iter().zip(&*devices).zip(&image.regions);
-    for (index, ((config, device), region)) in regions.enumerate() {
+    for (index, ((config, device), region)) in (0..).map(DeviceIndex).zip(regions) {
         let status = image.mailboxes.as_ref().and_then(|m| m.logical_of(index));
         device::map_process_data(wire, config, device, *region, status).await?;
         watchdog::set(wire, &machine.bus, config, device, progress).await?;

@@ -3,6 +3,7 @@
 
 use std::path::Path;
 
+use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use toml::Spanned;
 
 use super::device::{self, EsiFiles};
@@ -58,7 +59,7 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
     if devices.iter().all(|device| position(device).is_some()) {
         devices.sort_by_key(position);
     }
-    let known: Vec<ResolvedDevice<'_>> = devices
+    let known: IndexVec<DeviceIndex, ResolvedDevice<'_>> = devices
         .iter()
         .zip(&names)
         .filter_map(|(device, (name, has_axis))| match device {
@@ -74,7 +75,7 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
     let repeat = raw.repeat.value().unwrap_or(1);
     let program = steps::check(raw.steps, raw.stop, &known, folder, cycle_s, repeat, p);
     let brakes = brake_outputs(&brakes, &known, &program.outputs, p);
-    let mut devices: Vec<DeviceConfig> = devices.into_iter().collect::<Option<_>>()?;
+    let mut devices: IndexVec<_, DeviceConfig> = devices.into_iter().collect::<Option<_>>()?;
     for (name, output) in brakes {
         let device = devices.iter_mut().find(|d| d.name == name);
         if let Some(axis) = device.and_then(|d| d.axis.as_mut()) {
@@ -100,7 +101,7 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
 /// that steps set.
 fn brake_outputs(
     brakes: &[(String, Spanned<String>)],
-    known: &[ResolvedDevice<'_>],
+    known: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
     set: &[Signal],
     p: &mut Problems<'_>,
 ) -> Vec<(String, Signal)> {

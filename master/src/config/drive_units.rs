@@ -4,6 +4,7 @@
 use ecaxis_axis::homing::ParameterError;
 use ecaxis_axis::scale::{DriveUnits, UnitMismatch, same_motor};
 use ecaxis_axis::{AccelerationUnit, Axis, ConfigError, Mode, Scale, VelocityUnit};
+use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_esi as esi;
 
 use super::{Action, AxisSetup, HomingSetup, Machine, Step, TorqueSetup, TorqueUnit, UnitSource};
@@ -275,7 +276,7 @@ impl AdoptedUnits {
 
 impl Machine {
     /// Applies the drive's units to an axis and to its steps.
-    pub(crate) fn adopt(&mut self, device: usize, adopted: &AdoptedUnits) {
+    pub(crate) fn adopt(&mut self, device: DeviceIndex, adopted: &AdoptedUnits) {
         scale_torques(&mut self.steps, device, adopted.torque_factor);
         let Some(config) = self.devices.get_mut(device) else {
             return;
@@ -290,7 +291,7 @@ impl Machine {
     }
 }
 
-fn scale_torques(steps: &mut [Step], device: usize, factor: f64) {
+fn scale_torques(steps: &mut [Step], device: DeviceIndex, factor: f64) {
     for step in steps {
         match &mut step.action {
             Action::Torque { targets, .. } => {

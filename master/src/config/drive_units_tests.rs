@@ -1,12 +1,16 @@
 use super::super::tests::{GOOD, with_esi};
 use super::*;
+use ecaxis_ecat::index::DeviceIndex;
 
 const MILLI_RPM: u32 = 0xfdb4_4700;
 const RPM: u32 = 0x00b4_4700;
 
 fn axis(keys: &str) -> AxisSetup {
     let text = GOOD.replace("unit = \"mm\"", keys);
-    with_esi(&text).unwrap().devices[0].axis.clone().unwrap()
+    with_esi(&text).unwrap().devices[DeviceIndex(0)]
+        .axis
+        .clone()
+        .unwrap()
 }
 
 fn offered() -> DriveUnits {
@@ -99,7 +103,7 @@ fn adopt_keeps_torques_in_nm() {
 fn adopt_rescales_program_and_homing() {
     let mut machine = with_esi(GOOD).unwrap();
     let torque = |targets: &[(usize, f64)]| Action::Torque {
-        targets: targets.to_vec(),
+        targets: targets.iter().map(|&(n, x)| (DeviceIndex(n), x)).collect(),
         ramp_ns: 0,
     };
     let step = |action| Step {
@@ -119,7 +123,7 @@ fn adopt_rescales_program_and_homing() {
         acceleration: Some(50.0),
         ..ecaxis_axis::Homing::by(37)
     };
-    let setup = machine.devices[0].axis.as_mut().unwrap();
+    let setup = machine.devices[DeviceIndex(0)].axis.as_mut().unwrap();
     let sdo = |(index, sub, value): (u16, u8, u32)| esi::StartupSdo {
         transition: "PS",
         index,
@@ -136,8 +140,11 @@ fn adopt_rescales_program_and_homing() {
         startup: startup.clone(),
         timeout_ns: 1,
     });
-    machine.devices[0].selection.startup.extend(startup);
-    let setup = machine.devices[0].axis.clone().unwrap();
+    machine.devices[DeviceIndex(0)]
+        .selection
+        .startup
+        .extend(startup);
+    let setup = machine.devices[DeviceIndex(0)].axis.clone().unwrap();
     let mut adopted = setup.adopt(&DriveUnits {
         velocity_unit: Some(RPM),
         acceleration_unit: Some(0x00c0_0300),
@@ -145,15 +152,15 @@ fn adopt_rescales_program_and_homing() {
     });
     assert_eq!(adopted.wrong, []);
     assert_eq!(adopted.taken.len(), 1, "{:?}", adopted.taken);
-    let changed = adopted.changed(&machine.devices[0].selection.startup);
+    let changed = adopted.changed(&machine.devices[DeviceIndex(0)].selection.startup);
     let values: Vec<_> = changed.iter().map(|s| (s.index, s.data.clone())).collect();
     let rpm = |n: u32| n.to_le_bytes().to_vec();
     assert_eq!(values, [(0x6099, rpm(60)), (0x609a, rpm(600))]);
     adopted.torque_factor = 0.25;
-    machine.adopt(0, &adopted);
+    machine.adopt(DeviceIndex(0), &adopted);
     assert!(
         adopted
-            .changed(&machine.devices[0].selection.startup)
+            .changed(&machine.devices[DeviceIndex(0)].selection.startup)
             .is_empty()
     );
     assert_eq!(machine.steps[0].action, torque(&[(0, 2.0), (1, 8.0)]));

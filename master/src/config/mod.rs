@@ -60,6 +60,7 @@ pub use program::{Action, Step, StopGroup, StopSetup, TableFile};
 pub use signal::{NameError, Signal};
 pub use startup::{Startup, StartupOptions};
 
+use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 use ecaxis_esi as esi;
 
 use fields::Read;
@@ -82,7 +83,7 @@ pub struct Machine {
     pub path: PathBuf,
     pub bus: Bus,
     /// The devices, in bus order if every device is located by position, otherwise in file order.
-    pub devices: Vec<DeviceConfig>,
+    pub devices: IndexVec<DeviceIndex, DeviceConfig>,
     pub steps: Vec<Step>,
     /// The signals that the steps read; `outputs` are those they set.
     pub inputs: Vec<Signal>,
@@ -343,27 +344,28 @@ pub enum UnitSource {
 impl Machine {
     /// Returns the group's name in the machine file; empty for group 0, which has no name.
     #[must_use]
-    pub fn group_name(&self, group: usize) -> &str {
+    pub fn group_name(&self, group: GroupIndex) -> &str {
         let named = group
+            .0
             .checked_sub(1)
             .and_then(|index| self.stop.groups.get(index));
         named.map_or("", |group| &group.name)
     }
 
-    /// Returns the group of a device: 0 without a named group, otherwise the index into
-    /// [`StopSetup::groups`] plus 1.
+    /// Returns the group of a device. The first group has no name; the others are those of
+    /// [`StopSetup::groups`].
     #[must_use]
-    pub fn group_of(&self, device: usize) -> usize {
+    pub fn group_of(&self, device: DeviceIndex) -> GroupIndex {
         let mut groups = self.stop.groups.iter();
         let named = groups.position(|group| group.devices.contains(&device));
-        named.map_or(0, |index| index + 1)
+        named.map_or(GroupIndex::MACHINE, |index| GroupIndex(index + 1))
     }
 
     /// Returns the settings of the cycle.
     #[must_use]
     pub fn rt_config(&self) -> RtConfig {
         let (bus, stop) = (&self.bus, &self.stop);
-        let devices = self.devices.iter().enumerate().map(|(index, device)| {
+        let devices = self.devices.enumerate().map(|(index, device)| {
             let layout = &device.selection.layout;
             ProcessData {
                 out_len: layout.rx_bytes(),

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use ecaxis_axis::{Edge, StopMethod};
+use ecaxis_ecat::index::DeviceIndex;
 
 use super::{Condition, GroupStopScope, Machine, duration};
 use crate::text::rounded;
@@ -17,34 +18,34 @@ pub struct Step {
     pub action: Action,
 }
 
-/// The action of a step. Axes are indices into [`Machine::devices`]. Targets are pairs of such an
-/// index and a value in user units.
+/// The action of a step. An axis is named by its device. Targets are pairs of a device and a value
+/// in user units.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Action {
     Enable {
-        axes: Vec<usize>,
+        axes: Vec<DeviceIndex>,
     },
     /// Decelerate, then remove power.
     Disable {
-        axes: Vec<usize>,
+        axes: Vec<DeviceIndex>,
     },
     /// Acknowledge trips and reset drive faults.
     Reset {
-        axes: Vec<usize>,
+        axes: Vec<DeviceIndex>,
     },
     /// Homing by the drive.
     Home {
-        axes: Vec<usize>,
+        axes: Vec<DeviceIndex>,
     },
     /// Decelerate and hold position.
     Stop {
-        axes: Vec<usize>,
+        axes: Vec<DeviceIndex>,
     },
     /// Move and wait until every axis is in target.
     Move {
         /// `true` if targets are relative to the position at the start of the step.
         relative: bool,
-        targets: Vec<(usize, f64)>,
+        targets: Vec<(DeviceIndex, f64)>,
         /// The fraction of each axis's velocity limit.
         speed: f64,
         /// The fraction of each axis's acceleration limit.
@@ -54,7 +55,7 @@ pub enum Action {
     },
     /// Move until the touch probe's input has an edge. The step fails without an edge.
     Probe {
-        axis: usize,
+        axis: DeviceIndex,
         probe: ecaxis_axis::Probe,
         edge: Edge,
         /// `true` if the end of the move is relative to the present position.
@@ -67,7 +68,7 @@ pub enum Action {
     /// Move all axes along a straight line, jerk-limited; they arrive in the same cycle.
     Line {
         relative: bool,
-        targets: Vec<(usize, f64)>,
+        targets: Vec<(DeviceIndex, f64)>,
         /// The fraction of each axis's velocity limit.
         speed: f64,
         /// The fraction of each axis's acceleration and jerk limits.
@@ -75,12 +76,12 @@ pub enum Action {
     },
     /// Move in a wave around the present position.
     Wave {
-        axis: usize,
+        axis: DeviceIndex,
         wave: ecaxis_axis::setpoint::Wave,
     },
     /// Move to the table's first position, then play the table.
     Table {
-        axis: usize,
+        axis: DeviceIndex,
         /// The index into [`Machine::tables`].
         table: usize,
         /// The fractions for the move to the first position, as in [`Action::Move`].
@@ -89,8 +90,8 @@ pub enum Action {
     },
     /// Make one axis follow another until its next motion.
     Gear {
-        axis: usize,
-        master: usize,
+        axis: DeviceIndex,
+        master: DeviceIndex,
         /// `true` to follow the master's actual position instead of its set-point.
         actual: bool,
         /// The number of follower units per master unit.
@@ -101,19 +102,19 @@ pub enum Action {
     },
     /// Reach the velocities and keep moving.
     Velocity {
-        targets: Vec<(usize, f64)>,
+        targets: Vec<(DeviceIndex, f64)>,
         /// The fraction of each axis's acceleration limit.
         ramp: f64,
     },
     /// Apply torques in percent of rated torque.
     Torque {
-        targets: Vec<(usize, f64)>,
+        targets: Vec<(DeviceIndex, f64)>,
         /// The time of the ramp to the new torque.
         ramp_ns: u64,
     },
     /// Switch modes of operation, even in motion.
     Mode {
-        targets: Vec<(usize, ecaxis_axis::Mode)>,
+        targets: Vec<(DeviceIndex, ecaxis_axis::Mode)>,
     },
     Dwell {
         ns: u64,
@@ -161,9 +162,8 @@ impl Default for StopSetup {
 #[derive(Debug, Clone, PartialEq)]
 pub struct StopGroup {
     pub name: String,
-    /// The indices into [`Machine::devices`], with and without an axis. A device is in one group
-    /// only.
-    pub devices: Vec<usize>,
+    /// Its devices, with and without an axis. A device is in one group only.
+    pub devices: Vec<DeviceIndex>,
     /// The stop method of its other axes after a fault or trip.
     pub others: StopMethod,
     pub outside: GroupStopScope,
@@ -321,7 +321,7 @@ impl Machine {
         format!("{name} {}", bounds.collect::<Vec<_>>().join(" and "))
     }
 
-    fn names(&self, axes: &[usize]) -> String {
+    fn names(&self, axes: &[DeviceIndex]) -> String {
         let names = axes.iter().filter_map(|&axis| self.devices.get(axis));
         names
             .map(|d| d.name.as_str())
@@ -329,7 +329,7 @@ impl Machine {
             .join(", ")
     }
 
-    fn targets(&self, targets: &[(usize, f64)], arrow: &str, suffix: &str) -> String {
+    fn targets(&self, targets: &[(DeviceIndex, f64)], arrow: &str, suffix: &str) -> String {
         let each = targets.iter().filter_map(|&(index, target)| {
             let device = self.devices.get(index)?;
             let axis = device.axis.as_ref()?;

@@ -1,5 +1,6 @@
 //! Process data by name: the bits of a device that a step reads or sets.
 
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_esi as esi;
 use ecaxis_esi::layout::Field;
 
@@ -14,8 +15,7 @@ use crate::rt::image::NumericFormat;
 /// Process data that the program reads or sets.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Signal {
-    /// The index into [`Machine::devices`].
-    pub device: usize,
+    pub device: DeviceIndex,
     /// The name with its device's name: `io.Input 3`.
     pub name: String,
     pub field: Field,
@@ -137,7 +137,7 @@ fn address(text: &str) -> Option<(u16, u8)> {
 /// Returns an output that no axis writes, from a text such as `io.Output 3`.
 pub(crate) fn output_of_text(
     text: &Spanned<String>,
-    devices: &[ResolvedDevice<'_>],
+    devices: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
     p: &mut Problems<'_>,
 ) -> Option<Signal> {
     let word = text.get_ref();
@@ -171,18 +171,20 @@ pub(crate) fn output_of_text(
 /// Returns an input of the machine, or an output that no axis writes.
 pub(crate) fn resolve(
     raw: &RawSignal,
-    devices: &[ResolvedDevice<'_>],
+    devices: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
     way: SignalDirection,
     p: &mut Problems<'_>,
 ) -> Option<Signal> {
     let names = devices.iter().map(|d| d.name);
-    let found = place(raw.device.get_ref(), names).and_then(|index| {
-        // An invalid device has already been reported.
-        let device = devices[index].device;
-        device
-            .map(|device| one(raw.name.get_ref(), way, index, device))
-            .transpose()
-    });
+    let found = place(raw.device.get_ref(), names)
+        .map(DeviceIndex)
+        .and_then(|index| {
+            // An invalid device has already been reported.
+            let device = devices[index].device;
+            device
+                .map(|device| one(raw.name.get_ref(), way, index, device))
+                .transpose()
+        });
     found.unwrap_or_else(|error| {
         let at = if error.device { &raw.device } else { &raw.name };
         p.add_hint(at.span(), error.message, error.hint);
@@ -205,7 +207,7 @@ fn place<'n>(
 fn one(
     wanted: &str,
     way: SignalDirection,
-    index: usize,
+    index: DeviceIndex,
     device: &DeviceConfig,
 ) -> Result<Signal, NameError> {
     let what = way.noun();
@@ -298,7 +300,7 @@ impl Machine {
             hint: suggestion(name, names, "axes"),
             ..error
         })?;
-        Ok(AxisRef(at))
+        Ok(AxisRef(AxisIndex(at)))
     }
 
     /// Returns an input by its device's name and its own name. Valid names are the entry's name in
@@ -333,7 +335,8 @@ impl Machine {
     }
 
     fn signal(&self, device: &str, name: &str, way: SignalDirection) -> Result<Signal, NameError> {
-        let index = place(device, self.devices.iter().map(|d| d.name.as_str()))?;
+        let names = self.devices.iter().map(|d| d.name.as_str());
+        let index = DeviceIndex(place(device, names)?);
         one(name, way, index, &self.devices[index])
     }
 }

@@ -266,6 +266,7 @@ impl Places {
 
 #[cfg(test)]
 mod tests {
+    use ecaxis_ecat::index::DeviceIndex;
     use ecaxis_sim::Uplink;
 
     use super::super::{ConfigError, Machine, Problem, parse};
@@ -316,7 +317,7 @@ mod tests {
             .map(|d| d.name.as_str())
             .collect();
         assert_eq!(order, ["c", "t", "x"]);
-        let coupler = &machine.devices[0].sim;
+        let coupler = &machine.devices[DeviceIndex(0)].sim;
         assert_eq!(coupler.drift_ppm, Some(-20.0));
         assert_eq!((coupler.offset_ns, coupler.jitter_ns), (3_000_000_000, 15));
         let bus = topology(&machine.devices).expect("good");

@@ -4,6 +4,7 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use toml::Spanned;
 
 mod follow;
@@ -65,7 +66,7 @@ pub(crate) struct Program {
 pub(crate) fn check(
     steps: Vec<RawStep>,
     stop: RawStop,
-    devices: &[ResolvedDevice<'_>],
+    devices: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
     folder: &Path,
     cycle_s: f64,
     repeat: u32,
@@ -100,7 +101,7 @@ pub(crate) fn check(
 }
 
 struct ProgramChecker<'c> {
-    devices: &'c [ResolvedDevice<'c>],
+    devices: &'c IndexVec<DeviceIndex, ResolvedDevice<'c>>,
     folder: &'c Path,
     cycle_s: f64,
     tables: Vec<TableFile>,
@@ -108,11 +109,11 @@ struct ProgramChecker<'c> {
     outputs: Vec<Signal>,
     count: usize,
     /// The modes to which previous steps have switched.
-    switched: Vec<(usize, Mode)>,
+    switched: Vec<(DeviceIndex, Mode)>,
     /// The number of the step being checked.
     number: String,
     /// The places of steps, and of axes named in them.
-    places: RefCell<BTreeMap<(String, Option<usize>), Span>>,
+    places: RefCell<BTreeMap<(String, Option<DeviceIndex>), Span>>,
 }
 
 impl ProgramChecker<'_> {
@@ -219,7 +220,7 @@ impl ProgramChecker<'_> {
             },
             RawAction::Mode(named) => {
                 let count = named.len();
-                let mut targets: Vec<(usize, Mode)> = named
+                let mut targets: Vec<(DeviceIndex, Mode)> = named
                     .into_iter()
                     .filter_map(|(name, mode)| self.mode(&name, &mode, p))
                     .collect();
@@ -257,16 +258,16 @@ impl ProgramChecker<'_> {
     }
 
     /// Returns `true` if `so` holds in any mode that the axis has in the program.
-    fn any_mode(&self, index: usize, so: impl Fn(Mode) -> bool) -> bool {
+    fn any_mode(&self, index: DeviceIndex, so: impl Fn(Mode) -> bool) -> bool {
         let own = self.devices[index].axis.ok().map(|axis| axis.config.mode);
         let switched = self.switched.iter().filter(|(axis, _)| *axis == index);
         switched.map(|(_, mode)| *mode).chain(own).any(so)
     }
 
     /// Returns the named axes of the machine; `None`: all.
-    fn axes(&self, names: RawAxes, p: &mut Problems<'_>) -> Option<Vec<usize>> {
+    fn axes(&self, names: RawAxes, p: &mut Problems<'_>) -> Option<Vec<DeviceIndex>> {
         let Some(names) = names else {
-            let axes = self.devices.iter().enumerate();
+            let axes = self.devices.enumerate();
             return Some(
                 axes.filter(|(_, d)| d.axis.is_ok())
                     .map(|(index, _)| index)
@@ -274,15 +275,24 @@ impl ProgramChecker<'_> {
             );
         };
         let count = names.len();
-        let axes: Vec<usize> = names
+        let axes: Vec<_> = names
             .iter()
             .filter_map(|name| self.axis(name, p).map(|(index, _)| index))
             .collect();
         (axes.len() == count).then_some(axes)
     }
 
-    fn axis(&self, name: &Spanned<String>, p: &mut Problems<'_>) -> Option<(usize, &AxisSetup)> {
-        let Some(index) = self.devices.iter().position(|d| d.name == name.get_ref()) else {
+    fn device(&self, name: &Spanned<String>) -> Option<DeviceIndex> {
+        let mut all = self.devices.enumerate();
+        all.find_map(|(index, device)| (device.name == name.get_ref()).then_some(index))
+    }
+
+    fn axis(
+        &self,
+        name: &Spanned<String>,
+        p: &mut Problems<'_>,
+    ) -> Option<(DeviceIndex, &AxisSetup)> {
+        let Some(index) = self.device(name) else {
             let axes = self.devices.iter().filter(|d| d.axis != Err(false));
             let hint = suggestion(name.get_ref(), axes.map(|d| d.name), "axes");
             let message = format!("no device is named `{}`", name.get_ref());

@@ -2,6 +2,8 @@ mod mistakes;
 
 use std::path::PathBuf;
 
+use ecaxis_ecat::index::DeviceIndex;
+
 use super::*;
 
 /// A drive with CSP and CSV but without CST, with 0x60C2 and one writable object.
@@ -131,12 +133,12 @@ fn config_parses_a_good_file() {
     };
     assert_eq!(machine.bus, expected);
     assert_eq!(machine.devices.len(), 2);
-    let x = &machine.devices[0];
+    let x = &machine.devices[DeviceIndex(0)];
     assert_eq!(
         (x.name.as_str(), x.at, x.line),
         ("x", Locator::Position(0), 7)
     );
-    assert!(Arc::ptr_eq(&x.esi, &machine.devices[1].esi));
+    assert!(Arc::ptr_eq(&x.esi, &machine.devices[DeviceIndex(1)].esi));
     let axis = x.axis.as_ref().unwrap();
     assert_eq!((axis.unit.as_str(), axis.mode), ("mm", esi::Mode::Csp));
     assert_eq!(
@@ -150,7 +152,7 @@ fn config_parses_a_good_file() {
         (0x6065, [0xc4, 9, 0, 0].as_slice())
     );
     assert_eq!(
-        machine.devices[1]
+        machine.devices[DeviceIndex(1)]
             .axis
             .as_ref()
             .unwrap()
@@ -165,13 +167,13 @@ fn config_parses_a_good_file() {
         [
             Action::Move {
                 relative: false,
-                targets: vec![(0, 50.0)],
+                targets: vec![(DeviceIndex(0), 50.0)],
                 speed: 0.5,
                 ramp: 0.3,
                 together: false,
             },
             Action::Velocity {
-                targets: vec![(1, 25.0)],
+                targets: vec![(DeviceIndex(1), 25.0)],
                 ramp: 1.0
             },
             Action::Dwell { ns: 500_000_000 },
@@ -185,10 +187,13 @@ fn config_parses_a_good_file() {
 fn axis_accepts_custom_units_and_records_the_velocity_unit_source() {
     for (text, shown) in [("custom:slots", "slots"), ("μm", "µm"), ("°", "°")] {
         let machine = with_esi(&GOOD.replace("\"mm\"", &format!("\"{text}\""))).unwrap();
-        assert_eq!(machine.devices[0].axis.as_ref().unwrap().unit, shown);
+        assert_eq!(
+            machine.devices[DeviceIndex(0)].axis.as_ref().unwrap().unit,
+            shown
+        );
     }
     let from = |text: &str| {
-        let axis = with_esi(text).unwrap().devices[0].axis.clone();
+        let axis = with_esi(text).unwrap().devices[DeviceIndex(0)].axis.clone();
         axis.unwrap().velocity_unit_from
     };
     assert_eq!(from(GOOD), UnitSource::Esi);
@@ -208,7 +213,10 @@ fn axis_scale_uses_gear_feed_and_modulo() {
             "[device.axis]\nencoder",
             &format!("[device.axis]\n{keys}\nencoder"),
         );
-        with_esi(&text).unwrap().devices[1].axis.clone().unwrap()
+        with_esi(&text).unwrap().devices[DeviceIndex(1)]
+            .axis
+            .clone()
+            .unwrap()
     };
     for (keys, per_turn) in [
         ("gear = [3, 1]", 1.0 / 3.0),
@@ -233,7 +241,10 @@ fn axis_converts_torques_in_nm_and_a() {
             &format!("{keys}\nsupervise = {{ torque = 0.05 }}"),
         );
         let text = text.replace("torque = 100.0", "torque = 0.1");
-        with_esi(&text).unwrap().devices[0].axis.clone().unwrap()
+        with_esi(&text).unwrap().devices[DeviceIndex(0)]
+            .axis
+            .clone()
+            .unwrap()
     };
     for (keys, limit, supervised, from) in [
         // This vendor's 0x6076 counts mNm.
@@ -284,12 +295,12 @@ fn devices_are_sorted_and_steps_keep_their_axes() {
         .replace("position = 1", "position = 9")
         .replace("position = 0", "position = 1");
     let machine = with_esi(&swapped.replace("position = 9", "position = 0")).unwrap();
-    assert_eq!(machine.devices[0].name, "v");
+    assert_eq!(machine.devices[DeviceIndex(0)].name, "v");
     assert_eq!(
         machine.steps[0].action,
         Action::Move {
             relative: false,
-            targets: vec![(1, 50.0)],
+            targets: vec![(DeviceIndex(1), 50.0)],
             speed: 0.5,
             ramp: 0.3,
             together: false,

@@ -140,6 +140,7 @@ impl Counts<'_, '_, '_> {
 mod tests {
     use std::path::PathBuf;
 
+    use ecaxis_ecat::index::DeviceIndex;
     use ecaxis_sim::Track;
 
     use super::super::{ConfigError, Machine, Problem, parse};
@@ -164,7 +165,7 @@ mod tests {
 
     fn track(axis: &str, track: &str) -> TrackSetup {
         match load(axis, track) {
-            Ok(machine) => machine.devices[0].sim.track,
+            Ok(machine) => machine.devices[DeviceIndex(0)].sim.track,
             Err(error) => panic!("{error}"),
         }
     }

@@ -12,6 +12,7 @@ use crate::rt::channel::Event;
 use crate::rt::event_log::{Entry, LogEntryKind};
 use crate::rt::exchange::ErrorCounters;
 use crate::rt::stats::Counters;
+use ecaxis_ecat::index::GroupIndex;
 
 const MS: Nanos = 1_000_000;
 
@@ -402,7 +403,7 @@ fn stopped_find_returns_the_stop_of_an_error() {
         100,
         LogEntryKind::Event(Event::GroupStopping {
             cycle: 100,
-            group: 1,
+            group: GroupIndex(1),
             cause,
         }),
     );
@@ -417,7 +418,7 @@ fn stopped_find_returns_the_stop_of_an_error() {
         (None, false, 500),
         (Some(2), true, 600),
     ] {
-        let found = Stopped::find(&notes, group, by_cycle).map(|stop| stop.cycle);
+        let found = Stopped::find(&notes, group.map(GroupIndex), by_cycle).map(|stop| stop.cycle);
         assert_eq!(found, Some(expected), "{group:?}, {by_cycle}");
     }
     assert_eq!(Stopped::find(&notes[..1], None, true), None);

@@ -1,5 +1,7 @@
 //! Everything that is known after a failed run, as plain data.
 
+use ecaxis_ecat::index::GroupIndex;
+
 use crate::acyclic::DeviceRef;
 use crate::clock::Nanos;
 use crate::link::LinkStats;
@@ -279,7 +281,7 @@ impl Stopped {
     /// Returns the stop to which an error belongs. This is the stop of `group`, otherwise the
     /// machine's first one. With `by_cycle`, stops on request do not count.
     #[must_use]
-    pub fn find(notes: &[Entry], group: Option<usize>, by_cycle: bool) -> Option<Self> {
+    pub fn find(notes: &[Entry], group: Option<GroupIndex>, by_cycle: bool) -> Option<Self> {
         let cause = |entry: &Entry| match entry.note {
             LogEntryKind::Event(Event::Stopping { cause, .. }) => Some(cause),
             _ => None,

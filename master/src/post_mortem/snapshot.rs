@@ -4,6 +4,7 @@
 
 use std::time::Duration;
 
+use ecaxis_ecat::index::GroupIndex;
 use ecaxis_ecat::registers;
 use serde::Serialize;
 
@@ -62,7 +63,7 @@ pub struct Witnessed {
     /// The snapshots of the SubDevices in segment order.
     pub looks: Vec<DeviceSnapshot>,
     /// The group that stopped while the machine continued.
-    pub group: Option<usize>,
+    pub group: Option<GroupIndex>,
 }
 
 impl Witnessed {

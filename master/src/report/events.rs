@@ -1,5 +1,6 @@
 //! Events of the cycle as text.
 
+use ecaxis_ecat::index::AxisIndex;
 use serde::Serialize;
 
 use crate::clock::Nanos;
@@ -63,12 +64,12 @@ fn describe_note(note: &LogEntryKind, machine: &Machine) -> String {
 }
 
 fn describe_event(event: Event, machine: &Machine) -> String {
-    let axis = |axis: usize| {
+    let axis = |axis: AxisIndex| {
         let mut axes = machine
             .devices
             .iter()
             .filter(|device| device.axis.is_some());
-        axes.nth(axis).map_or("?", |device| device.name.as_str())
+        axes.nth(axis.0).map_or("?", |device| device.name.as_str())
     };
     match event {
         Event::Refused {
@@ -100,7 +101,7 @@ fn describe_event(event: Event, machine: &Machine) -> String {
     }
 }
 
-fn describe_cause<'m>(cause: StopCause, axis: &impl Fn(usize) -> &'m str) -> String {
+fn describe_cause<'m>(cause: StopCause, axis: &impl Fn(AxisIndex) -> &'m str) -> String {
     match cause {
         StopCause::Requested => "stop: asked for".to_owned(),
         StopCause::DriveFault { axis: at } => {

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{Mode, State};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use serde::Serialize;
 
 use super::{EmergencyReport, Error};
@@ -143,7 +144,11 @@ pub struct AxisLine {
 
 impl Status {
     #[must_use]
-    pub fn new(machine: &Machine, axes: &[usize], snapshot: &Snapshot) -> Self {
+    pub fn new(
+        machine: &Machine,
+        axes: &IndexVec<AxisIndex, DeviceIndex>,
+        snapshot: &Snapshot,
+    ) -> Self {
         let axes = axes
             .iter()
             .zip(&snapshot.axes)

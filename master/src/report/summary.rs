@@ -2,6 +2,7 @@
 
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Mode, Scale};
+use ecaxis_ecat::index::{GroupIndex, IndexVec};
 use serde::Serialize;
 
 use crate::clock::{Clock, Nanos};
@@ -138,7 +139,7 @@ pub(crate) struct SummaryInputs {
     /// The time at which the first cycle was due.
     pub started: Nanos,
     /// The time at which each group of axes began to stop.
-    pub stops: Vec<Option<Nanos>>,
+    pub stops: IndexVec<GroupIndex, Option<Nanos>>,
 }
 
 /// A group of axes that stopped while the machine continued.

@@ -1,6 +1,7 @@
 //! One axis in the cycle, between its process data and its set-point generator.
 
 use ecaxis_axis::{Axis, AxisStatus, Command, CommandError, Inputs, Outputs};
+use ecaxis_ecat::index::{DeviceIndex, GroupIndex};
 
 use super::image::{AxisBits, SignalBits};
 use super::setpoint_generator::SetpointGenerator;
@@ -11,12 +12,10 @@ use crate::clock::Nanos;
 pub struct RtAxis {
     pub axis: Axis,
     pub bits: AxisBits,
-    /// Index of its SubDevice.
-    pub device: usize,
+    pub device: DeviceIndex,
     /// The output that opens its brake; it may be on any device.
     pub brake: Option<SignalBits>,
-    /// Index of its reaction group.
-    pub group: usize,
+    pub group: GroupIndex,
     pub feed: SetpointGenerator,
     /// Largest following error while enabled, and the status of the last enabled cycle.
     pub largest_following_error: f64,
@@ -33,7 +32,7 @@ pub struct RtAxis {
 
 impl RtAxis {
     #[must_use]
-    pub fn new(axis: Axis, bits: AxisBits, device: usize, group: usize) -> Self {
+    pub fn new(axis: Axis, bits: AxisBits, device: DeviceIndex, group: GroupIndex) -> Self {
         Self {
             axis,
             bits,

@@ -1,5 +1,7 @@
 //! Counts bad cycles and decides when they stop the machine or a group.
 
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
+
 use super::exchange::{CycleResult, DeviceAnswer, GroupResult};
 
 /// AL status that every SubDevice must show while the machine runs.
@@ -14,10 +16,10 @@ pub enum StopCause {
     /// A stop was requested.
     Requested,
     /// The drive of this axis reported a fault.
-    DriveFault { axis: usize },
+    DriveFault { axis: AxisIndex },
     /// The axis stopped itself.
     Trip {
-        axis: usize,
+        axis: AxisIndex,
         trip: ecaxis_axis::Trip,
     },
     /// This number of cycles in a row had no valid answer.
@@ -29,7 +31,7 @@ pub enum StopCause {
     /// An emergency stop condition of the machine file is true.
     EmergencyStop,
     /// The axis can no longer follow its master or its set-point source.
-    FollowLost { axis: usize },
+    FollowLost { axis: AxisIndex },
     /// The user's controller panicked.
     Controller,
     /// The cycle itself panicked.
@@ -37,7 +39,7 @@ pub enum StopCause {
     /// The supervisor thread no longer runs.
     Unsupervised,
     /// The drive of this axis keeps power although it was commanded to remove it.
-    Powered { axis: usize },
+    Powered { axis: AxisIndex },
     /// At least one SubDevice is no longer in Op.
     LeftOp { al_status: u8 },
 }
@@ -66,9 +68,9 @@ impl StopCause {
 #[derive(Debug, Clone)]
 pub struct BusMonitor {
     lost_frames: u32,
-    groups: Vec<GroupCounters>,
+    groups: IndexVec<GroupIndex, GroupCounters>,
     /// For each device, the cycles in which its own answer was missing.
-    missing: Vec<u32>,
+    missing: IndexVec<DeviceIndex, u32>,
     /// Cycles in which AL status was wrong and no group's working counter identified the device.
     al: u32,
     /// Cycles in which fewer SubDevices answered than the working counters explain.
@@ -92,17 +94,17 @@ impl BusMonitor {
     /// the group of each SubDevice.
     #[must_use]
     #[allow(clippy::disallowed_macros, reason = "runs before the loop")]
-    pub fn new(lost_frames: u32, groups: &[usize]) -> Self {
+    pub fn new(lost_frames: u32, groups: &[GroupIndex]) -> Self {
         // The first group exists even without SubDevices.
-        let count = groups.iter().max().map_or(1, |last| last + 1);
-        let mut watches = vec![GroupCounters::default(); count];
+        let count = groups.iter().max().map_or(1, |last| last.0 + 1);
+        let mut watches = IndexVec::from(vec![GroupCounters::default(); count]);
         for &group in groups {
             watches[group].devices = watches[group].devices.saturating_add(1);
         }
         Self {
             lost_frames: lost_frames.max(1),
             groups: watches,
-            missing: vec![0; groups.len()],
+            missing: vec![0; groups.len()].into(),
             al: 0,
             absent: 0,
             al_status: OP,
@@ -177,7 +179,7 @@ impl BusMonitor {
 
     /// Returns the cause to stop a group.
     #[must_use]
-    pub fn lost(&self, group: usize) -> Option<StopCause> {
+    pub fn lost(&self, group: GroupIndex) -> Option<StopCause> {
         let watch = self.groups.get(group)?;
         if watch.bad >= self.lost_frames {
             return Some(StopCause::BusLost {
@@ -192,7 +194,7 @@ impl BusMonitor {
 
     /// True once the device has been missing for too long: it may not receive its outputs.
     #[must_use]
-    pub fn device_lost(&self, device: usize) -> bool {
+    pub fn device_lost(&self, device: DeviceIndex) -> bool {
         self.missing
             .get(device)
             .is_some_and(|missing| *missing >= self.lost_frames)
@@ -220,12 +222,12 @@ mod tests {
 
     #[test]
     fn bus_monitor_tolerates_fewer_bad_cycles_than_the_limit() {
-        let mut guard = BusMonitor::new(3, &[0, 0]);
+        let mut guard = BusMonitor::new(3, &[GroupIndex(0); 2]);
         for _ in 0..10 {
             for result in [GONE, GONE, GOOD] {
                 let back = result.answered.then_some((OP, 2));
                 guard.update(&answer(back), &[result], &[]);
-                assert_eq!((guard.lost(0), guard.left_op()), (None, None));
+                assert_eq!((guard.lost(GroupIndex(0)), guard.left_op()), (None, None));
             }
         }
         guard.update(&answer(None), &[GONE], &[]);
@@ -236,7 +238,10 @@ mod tests {
             last_wkc: (0, 3),
             answered: false,
         };
-        assert_eq!((guard.lost(0), guard.left_op()), (Some(lost), None));
+        assert_eq!(
+            (guard.lost(GroupIndex(0)), guard.left_op()),
+            (Some(lost), None)
+        );
     }
 
     /// A device outside Op stops the machine after two cycles, an absent one after the limit of
@@ -244,14 +249,14 @@ mod tests {
     #[test]
     fn a_device_that_leaves_op_stops_the_machine() {
         for (al, cycles) in [((0x1c, 2), AL_CYCLES), ((OP, 1), 5)] {
-            let mut guard = BusMonitor::new(5, &[0, 0]);
+            let mut guard = BusMonitor::new(5, &[GroupIndex(0); 2]);
             for _ in 1..cycles {
                 guard.update(&answer(Some(al)), &[GOOD], &[]);
                 assert_eq!(guard.left_op(), None);
             }
             guard.update(&answer(Some(al)), &[GOOD], &[]);
             let left = Some(StopCause::LeftOp { al_status: al.0 });
-            assert_eq!((guard.lost(0), guard.left_op()), (None, left));
+            assert_eq!((guard.lost(GroupIndex(0)), guard.left_op()), (None, left));
             guard.update(&good(), &[GOOD], &[]);
             assert_eq!(guard.left_op(), None);
         }
@@ -259,7 +264,7 @@ mod tests {
 
     #[test]
     fn device_is_lost_only_by_its_own_answers() {
-        let mut guard = BusMonitor::new(2, &[0, 0, 0]);
+        let mut guard = BusMonitor::new(2, &[GroupIndex(0); 3]);
         for unknown in [DeviceAnswer::Unknown; 5] {
             guard.update(
                 &good(),
@@ -267,10 +272,10 @@ mod tests {
                 &[unknown, DeviceAnswer::Missing, DeviceAnswer::Fresh],
             );
         }
-        let lost = [0, 1, 2].map(|device| guard.device_lost(device));
+        let lost = [0, 1, 2].map(|device| guard.device_lost(DeviceIndex(device)));
         assert_eq!(lost, [false, true, false]);
         guard.update(&good(), &[GOOD], &[DeviceAnswer::Fresh; 3]);
-        assert!(!guard.device_lost(1));
+        assert!(!guard.device_lost(DeviceIndex(1)));
     }
 
     /// Devices 0, 1 and 2 are in groups 0, 1 and 2. The wrong working counter identifies whose AL
@@ -287,24 +292,24 @@ mod tests {
             ((OP, 1), [GOOD, BAD, BAD], [None, None, None], None),
             ((OP, 3), [GOOD, BAD, GOOD], [None, None, None], None),
         ] {
-            let mut guard = BusMonitor::new(10, &[0, 1, 2]);
+            let mut guard = BusMonitor::new(10, &[0, 1, 2].map(GroupIndex));
             for _ in 0..AL_CYCLES {
                 guard.update(&answer(Some(al)), &results, &[]);
             }
-            let found = [0, 1, 2].map(|group| guard.lost(group));
+            let found = [0, 1, 2].map(|group| guard.lost(GroupIndex(group)));
             assert_eq!((found, guard.left_op()), (groups, machine), "{al:?}");
         }
     }
 
     #[test]
     fn a_group_without_its_process_data_is_lost_alone() {
-        let mut guard = BusMonitor::new(2, &[1]);
+        let mut guard = BusMonitor::new(2, &[GroupIndex(1)]);
         for _ in 0..2 {
             guard.update(&answer(Some((OP, 1))), &[GOOD, BAD], &[]);
         }
-        assert_eq!(guard.lost(0), None);
+        assert_eq!(guard.lost(GroupIndex(0)), None);
         assert!(matches!(
-            guard.lost(1),
+            guard.lost(GroupIndex(1)),
             Some(StopCause::BusLost {
                 cycles: 2,
                 last_wkc: (0, 3),

@@ -1,6 +1,7 @@
 //! The only paths into and out of the real-time thread: bounded and wait-free.
 
 use ecaxis_axis::{AxisStatus, Command, CommandError};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 
 use super::bus_monitor::StopCause;
 use super::exchange::SubDeviceDiagnostics;
@@ -25,12 +26,12 @@ const EVENTS: usize = 256;
 )]
 pub enum RtCommand {
     Axis {
-        axis: usize,
+        axis: AxisIndex,
         command: Command,
     },
     /// Starts set-point generation for an axis.
     Feed {
-        axis: usize,
+        axis: AxisIndex,
         start: GeneratorRequest,
     },
     /// Sets an output that no axis drives; `output` is an index into
@@ -48,7 +49,7 @@ pub enum RtCommand {
     Stop,
     /// Reports a drive's error code that was read outside the cycle.
     ErrorCode {
-        axis: usize,
+        axis: AxisIndex,
         code: u16,
     },
     /// Ends the loop after this cycle.
@@ -60,7 +61,7 @@ pub enum RtCommand {
 pub enum Event {
     Refused {
         cycle: u64,
-        axis: usize,
+        axis: AxisIndex,
         reason: CommandError,
     },
     /// The machine begins to stop.
@@ -71,13 +72,13 @@ pub enum Event {
     /// A group begins to stop; the machine continues.
     GroupStopping {
         cycle: u64,
-        group: usize,
+        group: GroupIndex,
         cause: StopCause,
     },
     /// A stopped group was reset and may be enabled again.
     GroupReleased {
         cycle: u64,
-        group: usize,
+        group: GroupIndex,
     },
     PhaseLocked {
         cycle: u64,
@@ -88,7 +89,7 @@ pub enum Event {
     /// The clock of a SubDevice differs from the reference clock by more than the window.
     ClockOff {
         cycle: u64,
-        device: usize,
+        device: DeviceIndex,
         /// Own clock minus reference.
         difference_ns: i32,
     },
@@ -103,22 +104,21 @@ pub struct Snapshot {
     pub phase: Option<PhaseStatus>,
     pub inputs_fresh: bool,
     pub al_status: Option<(u8, u16)>,
-    pub axes: Vec<AxisStatus>,
-    pub feeds: Vec<GeneratorState>,
+    pub axes: IndexVec<AxisIndex, AxisStatus>,
+    pub feeds: IndexVec<AxisIndex, GeneratorState>,
     /// The program's input signals, in the order of [`super::cycle::Signals::inputs`]. Each value
     /// is from the last cycle in which it was fresh.
     pub inputs: Vec<f64>,
     /// The controller has called `finish`.
     pub finished: bool,
-    pub diagnoses: Vec<SubDeviceDiagnostics>,
+    pub diagnoses: IndexVec<DeviceIndex, SubDeviceDiagnostics>,
     /// The first cause, once the machine is stopping.
     pub stopping: Option<StopCause>,
     /// A failure during a requested stop.
     pub failure: Option<StopCause>,
     /// True once the stop has ended for every axis: the cycle can do nothing more.
     pub stop_ended: bool,
-    /// The first entry is the group of all axes without a group of their own.
-    pub groups: Vec<GroupStatus>,
+    pub groups: IndexVec<GroupIndex, GroupStatus>,
     /// Events dropped because the queue was full.
     pub events_lost: u64,
     /// Commands taken so far.

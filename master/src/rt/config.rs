@@ -1,6 +1,7 @@
 //! The settings of the cycle, as plain data.
 
 use ecaxis_axis::StopMethod;
+use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 
 use super::image::ProcessData;
 use super::spin::Spin;
@@ -18,9 +19,9 @@ pub struct RtConfig {
     /// The number of consecutive cycles without a valid answer that stops the axes.
     pub lost_frames: u32,
     /// The process data of each SubDevice.
-    pub devices: Vec<ProcessData>,
+    pub devices: IndexVec<DeviceIndex, ProcessData>,
     /// The reaction groups; the first one holds all SubDevices without a named group.
-    pub groups: Vec<GroupConfig>,
+    pub groups: IndexVec<GroupIndex, GroupConfig>,
     /// The stop method of axes without valid inputs.
     pub bus_lost: StopMethod,
     /// The conditions for an emergency stop; one is enough.

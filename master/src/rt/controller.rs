@@ -1,6 +1,7 @@
 //! User-supplied control loops inside the cycle.
 
 use ecaxis_axis::{AxisStatus, Command, CommandError};
+use ecaxis_ecat::index::{AxisIndex, GroupIndex, IndexVec};
 
 use super::axis::RtAxis;
 use super::bus_monitor::StopCause;
@@ -9,7 +10,7 @@ use super::reaction_group::{ReactionGroup, check_permitted};
 
 /// A reference to an axis of a machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct AxisRef(pub(crate) usize);
+pub struct AxisRef(pub(crate) AxisIndex);
 
 /// A reference to an input of a machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -47,8 +48,8 @@ pub struct CycleContext<'a> {
     pub(super) dt_s: f64,
     pub(super) fresh: bool,
     pub(super) guarded: bool,
-    pub(super) axes: &'a mut [RtAxis],
-    pub(super) groups: &'a mut [ReactionGroup],
+    pub(super) axes: &'a mut IndexVec<AxisIndex, RtAxis>,
+    pub(super) groups: &'a mut IndexVec<GroupIndex, ReactionGroup>,
     pub(super) inputs: &'a [f64],
     pub(super) signals: &'a Signals,
     pub(super) outputs: &'a mut [u8],

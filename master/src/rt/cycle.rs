@@ -3,6 +3,7 @@
 use std::panic::AssertUnwindSafe;
 
 use ecaxis_axis::setpoint::Table;
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 
 use super::axis::RtAxis;
 use super::bus_monitor::{BusMonitor, StopCause};
@@ -46,9 +47,9 @@ pub struct Engine {
     link: Box<dyn Link>,
     port: PduLoop,
     exchange: Exchange,
-    axes: Vec<RtAxis>,
+    axes: IndexVec<AxisIndex, RtAxis>,
     /// The first group is the machine's: all axes without a group.
-    groups: Vec<ReactionGroup>,
+    groups: IndexVec<GroupIndex, ReactionGroup>,
     signals: Signals,
     /// Each value is from the last cycle in which its group was fresh.
     inputs: Vec<f64>,
@@ -62,7 +63,7 @@ pub struct Engine {
     /// The AL status as last logged.
     al_status: Option<(u8, u16)>,
     /// For each SubDevice, true while its clock is reported as off.
-    clocks_off: Vec<bool>,
+    clocks_off: IndexVec<DeviceIndex, bool>,
     guard: BusMonitor,
     guarding: bool,
     supervisor: heartbeat::Watch,
@@ -94,7 +95,7 @@ pub struct EngineConfig {
     pub link: Box<dyn Link>,
     pub port: PduLoop,
     pub exchange: Exchange,
-    pub axes: Vec<RtAxis>,
+    pub axes: IndexVec<AxisIndex, RtAxis>,
     pub signals: Signals,
     pub controller: Option<Box<dyn Controller>>,
     pub tables: Box<[Table]>,
@@ -107,20 +108,20 @@ pub struct EngineConfig {
 pub struct EngineReport {
     pub link: Box<dyn Link>,
     pub port: PduLoop,
-    pub axes: Vec<RtAxis>,
+    pub axes: IndexVec<AxisIndex, RtAxis>,
     pub stats: Stats,
     /// The spin time before a release, at the end of the run.
     pub spin_ns: Nanos,
-    /// The results of the diagnostic slot, in the order of the exchange's members.
-    pub diagnoses: Vec<SubDeviceDiagnostics>,
+    /// The results of the diagnostic slot.
+    pub diagnoses: IndexVec<DeviceIndex, SubDeviceDiagnostics>,
     /// The error counters of the members around the stop.
-    pub windows: Vec<Window>,
+    pub windows: IndexVec<DeviceIndex, Window>,
     /// Due time of the first cycle.
     pub started: Nanos,
     /// The cycles around the stop.
     pub history: FlightRecorder,
     /// For each group, the time since which it has been stopping.
-    pub stops: Vec<Option<Nanos>>,
+    pub stops: IndexVec<GroupIndex, Option<Nanos>>,
 }
 
 impl Engine {
@@ -135,7 +136,7 @@ impl Engine {
         let config = parts.config;
         let started = clock::now() + config.cycle_ns;
         let groups: Vec<_> = config.devices.iter().map(|device| device.group).collect();
-        let clocks_off = vec![false; parts.exchange.diagnoses().len()];
+        let clocks_off = vec![false; parts.exchange.diagnoses().len()].into();
         let mode = parts.exchange.mode();
         let history = FlightRecorder::new(parts.axes.len());
         Self {
@@ -206,8 +207,8 @@ impl Engine {
             axes: self.axes,
             stats: self.stats,
             spin_ns: self.margin.get(),
-            diagnoses: self.exchange.diagnoses().to_vec(),
-            windows: self.exchange.windows().to_vec(),
+            diagnoses: self.exchange.diagnoses().clone(),
+            windows: self.exchange.windows().clone(),
             started: self.started,
             history: self.history,
             stops: self
@@ -263,7 +264,7 @@ impl Engine {
             self.exchange.device_answers(),
         );
         self.guard.update(&self.answer, groups, devices);
-        for group in 0..self.groups.len() {
+        for group in self.groups.indices() {
             if let Some(cause) = self.guard.lost(group) {
                 self.stop(Some(group), cause);
             }
@@ -434,14 +435,14 @@ pub fn first_snapshot(
         inputs_fresh: false,
         al_status: None,
         axes: axes.iter().map(|slot| slot.axis.status()).collect(),
-        feeds: vec![GeneratorState::None; axes.len()],
+        feeds: vec![GeneratorState::None; axes.len()].into(),
         inputs: vec![0.0; signals.inputs.len()],
         finished: false,
-        diagnoses: vec![SubDeviceDiagnostics::default(); devices],
+        diagnoses: vec![SubDeviceDiagnostics::default(); devices].into(),
         stopping: None,
         failure: None,
         stop_ended: false,
-        groups: vec![GroupStatus::default(); groups],
+        groups: vec![GroupStatus::default(); groups].into(),
         events_lost: 0,
         orders_taken: 0,
     }

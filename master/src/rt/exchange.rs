@@ -16,6 +16,8 @@
 
 use std::sync::Arc;
 
+use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
+
 pub use super::config::ExchangeMode;
 use super::image::plan::frames as frames_of;
 use super::image::{Access, ImagePlan};
@@ -63,22 +65,21 @@ pub struct Exchange {
     /// True while devices are in Op: a wrong counter then means that a device is missing.
     op_expected: bool,
     /// The devices in the order of their data in the image.
-    order: Vec<usize>,
-    device_answers: Vec<DeviceAnswer>,
+    order: Vec<DeviceIndex>,
+    device_answers: IndexVec<DeviceIndex, DeviceAnswer>,
     /// For each device, true if a late answer has arrived since the last cycle.
-    late: Vec<bool>,
-    /// Index of the reference clock among the members.
-    reference: usize,
+    late: IndexVec<DeviceIndex, bool>,
+    /// The reference clock.
+    reference: DeviceIndex,
     /// The value to which a clock is set if the reference before it does not answer: almost its own
     /// time.
     expected_time: u64,
     cycle_ns: u64,
     bus_status: Arc<BusStatus>,
-    group_results: Vec<GroupResult>,
-    diagnoses: Vec<SubDeviceDiagnostics>,
-    windows: Vec<Window>,
-    /// The group of each member.
-    groups: Vec<usize>,
+    group_results: IndexVec<GroupIndex, GroupResult>,
+    diagnoses: IndexVec<DeviceIndex, SubDeviceDiagnostics>,
+    windows: IndexVec<DeviceIndex, Window>,
+    groups: IndexVec<DeviceIndex, GroupIndex>,
     schedule: PollSchedule,
     cycle: u32,
     outputs: Vec<u8>,
@@ -100,7 +101,7 @@ impl Exchange {
         members: &[ExchangeDevice],
         mode: ExchangeMode,
     ) -> Self {
-        let mut order: Vec<usize> = (0..plan.regions.len()).collect();
+        let mut order: Vec<_> = plan.regions.indices().collect();
         order.retain(|&device| plan.regions[device].is_some());
         order.sort_by_key(|&device| plan.regions[device].map_or(0, |region| region.offset));
         let mut datagrams = vec![&plan.datagrams];
@@ -122,8 +123,8 @@ impl Exchange {
             frame_sets.push(FrameSet::new(frames));
         }
         // The first group exists even without members.
-        let groups = plan.groups.iter().max().map_or(1, |last| last + 1);
-        let mut group_results = vec![GroupResult::default(); groups];
+        let groups = plan.groups.iter().max().map_or(1, |last| last.0 + 1);
+        let mut group_results = IndexVec::from(vec![GroupResult::default(); groups]);
         for (member, &group) in members.iter().zip(&plan.groups) {
             group_results[group].clocks += u16::from(member.clock);
         }
@@ -143,15 +144,15 @@ impl Exchange {
             separate_cycles: 0,
             op_expected: false,
             order,
-            device_answers: vec![DeviceAnswer::Unknown; members.len()],
-            late: vec![false; members.len()],
-            reference: reference.unwrap_or(0),
+            device_answers: vec![DeviceAnswer::Unknown; members.len()].into(),
+            late: vec![false; members.len()].into(),
+            reference: DeviceIndex(reference.unwrap_or(0)),
             expected_time: 0,
             cycle_ns: clock.map_or(0, |clock| clock.cycle_ns),
             bus_status: Arc::new(BusStatus::new(members.len())),
             group_results,
-            diagnoses: vec![SubDeviceDiagnostics::default(); members.len()],
-            windows: vec![Window::default(); members.len()],
+            diagnoses: vec![SubDeviceDiagnostics::default(); members.len()].into(),
+            windows: vec![Window::default(); members.len()].into(),
             groups: plan.groups.clone(),
             schedule: PollSchedule::new(members, plan.mailboxes.as_ref()),
             cycle: 0,
@@ -185,21 +186,21 @@ impl Exchange {
 
     /// Returns the result of each group's process data as of the last [`Exchange::evaluate`].
     #[must_use]
-    pub fn group_results(&self) -> &[GroupResult] {
+    pub fn group_results(&self) -> &IndexVec<GroupIndex, GroupResult> {
         &self.group_results
     }
 
     /// Returns what the answers show about each device as of the last [`Exchange::evaluate`], in
     /// the order of the members.
     #[must_use]
-    pub fn device_answers(&self) -> &[DeviceAnswer] {
+    pub fn device_answers(&self) -> &IndexVec<DeviceIndex, DeviceAnswer> {
         &self.device_answers
     }
 
     /// True if a late answer to an earlier cycle's frame has arrived since the last cycle, and this
     /// device processed that frame.
     #[must_use]
-    pub fn came_late(&self, device: usize) -> bool {
+    pub fn came_late(&self, device: DeviceIndex) -> bool {
         self.late.get(device).copied().unwrap_or(false)
     }
 
@@ -212,13 +213,13 @@ impl Exchange {
 
     /// Returns the results of the diagnostic slot, in the order of the members.
     #[must_use]
-    pub fn diagnoses(&self) -> &[SubDeviceDiagnostics] {
+    pub fn diagnoses(&self) -> &IndexVec<DeviceIndex, SubDeviceDiagnostics> {
         &self.diagnoses
     }
 
     /// Returns the error counters around the stop, in the order of the members.
     #[must_use]
-    pub fn windows(&self) -> &[Window] {
+    pub fn windows(&self) -> &IndexVec<DeviceIndex, Window> {
         &self.windows
     }
 
@@ -231,7 +232,7 @@ impl Exchange {
 
     /// Freezes the windows of a group at its stop; they end with the next read. `None`: all groups.
     /// RT: O(members).
-    pub fn stop_windows(&mut self, group: Option<usize>) {
+    pub fn stop_windows(&mut self, group: Option<GroupIndex>) {
         for (window, own) in self.windows.iter_mut().zip(&self.groups) {
             if group.is_none_or(|group| group == *own) {
                 window.stop();
@@ -240,7 +241,7 @@ impl Exchange {
     }
 
     /// Restarts the windows of a group that was reset. RT: O(members).
-    pub fn release_windows(&mut self, group: usize) {
+    pub fn release_windows(&mut self, group: GroupIndex) {
         let members = self.windows.iter_mut().zip(&self.diagnoses);
         for ((window, found), own) in members.zip(&self.groups) {
             if group == *own {
@@ -257,7 +258,7 @@ impl Exchange {
 
     /// Returns the device and the clock difference that the answers of this cycle contain.
     #[must_use]
-    pub fn clock_read(&self) -> Option<(usize, i32)> {
+    pub fn clock_read(&self) -> Option<(DeviceIndex, i32)> {
         let frame_set = self.frame_sets.get(self.due())?;
         let PollTarget::Registers { device, block } = frame_set.poll?.target else {
             return None;

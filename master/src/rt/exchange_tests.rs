@@ -2,6 +2,7 @@ use super::*;
 use crate::link::MAX_FRAME;
 use crate::rt::image::{ProcessData, plan};
 use ecaxis_ecat::datagram::Command;
+use ecaxis_ecat::index::{DeviceIndex, GroupIndex};
 use proptest::prelude::*;
 
 use super::frame::FIRST_DATAGRAM;
@@ -51,7 +52,7 @@ fn axis(group: usize) -> ProcessData {
     ProcessData {
         out_len: 12,
         in_len: 12,
-        group,
+        group: GroupIndex(group),
         lrw: true,
         mailbox: false,
     }
@@ -240,7 +241,7 @@ fn diagnostic_slot_reads_all_registers_of_all_devices() {
         let PollTarget::Registers { device, block } = poll.target else {
             panic!("no device has a mailbox");
         };
-        seen.push((device, block as usize));
+        seen.push((device.0, block as usize));
         let frame = reflect(&mut exchange, 0, 1);
         exchange.receive(&frame);
         exchange.evaluate();
@@ -250,7 +251,7 @@ fn diagnostic_slot_reads_all_registers_of_all_devices() {
         .flat_map(|p| [(0, p), (1, p)])
         .collect();
     assert_eq!(seen, expected);
-    let found = exchange.diagnoses()[1];
+    let found = exchange.diagnoses()[DeviceIndex(1)];
     assert!(found.answers);
     assert_eq!((found.al_status, found.al_code), (1, 0x0101));
     assert_eq!(found.clock_difference, 0x0101_0101);
@@ -281,7 +282,11 @@ fn mailbox_status_is_read_every_other_cycle_at_the_cost_of_a_diagnostic_read() {
         exchange.evaluate();
         exchange.stage();
         // Eight mailboxes in the second cycle, three in the fourth.
-        let seen = |n: usize| bus_status.mailbox(n).is_some_and(|seen| seen.full);
+        let seen = |n: usize| {
+            bus_status
+                .mailbox(DeviceIndex(n))
+                .is_some_and(|seen| seen.full)
+        };
         assert_eq!((seen(0), seen(7)), (cycle >= 1, cycle >= 1), "{cycle}");
         assert_eq!((seen(8), seen(10)), (cycle >= 3, cycle >= 3), "{cycle}");
     }
@@ -350,7 +355,7 @@ fn each_group_has_its_own_working_counter() {
 #[test]
 fn system_time_comes_only_from_the_reference_clock() {
     let mut exchange = grouped(&[0, 1]);
-    exchange.group_results[1].clocks = 1;
+    exchange.group_results[GroupIndex(1)].clocks = 1;
     let mut answer = |wkc: u8, fresh: bool| {
         exchange.stage();
         let mut frame = reflect(&mut exchange, 0, 1);
@@ -377,7 +382,7 @@ fn lost_frame_affects_only_its_groups() {
     exchange.receive(&frame);
     let answer = exchange.evaluate();
     assert!(!answer.complete && !answer.inputs_fresh);
-    let [rest, second] = exchange.group_results() else {
+    let [rest, second] = **exchange.group_results() else {
         panic!("two groups")
     };
     assert!(rest.fresh && !second.answered && !second.fresh);
@@ -432,7 +437,7 @@ fn missing_device_does_not_change_the_answers_of_others() {
             assert_eq!(exchange.receive(&frame), Received::Current);
             exchange.evaluate();
             if cycle > 1 {
-                assert_eq!(exchange.device_answers(), [DeviceAnswer::Fresh; 3]);
+                assert_eq!(**exchange.device_answers(), [DeviceAnswer::Fresh; 3]);
             }
             exchange.stage();
         }
@@ -445,20 +450,20 @@ fn late_answer_proves_delivery_but_an_old_one_does_not() {
     let mut exchange = axes(2);
     let first = reflect(&mut exchange, 0, 1);
     exchange.evaluate();
-    assert_eq!(exchange.device_answers(), [DeviceAnswer::Missing; 2]);
+    assert_eq!(**exchange.device_answers(), [DeviceAnswer::Missing; 2]);
     exchange.stage();
-    assert!(!exchange.came_late(0));
+    assert!(!exchange.came_late(DeviceIndex(0)));
     assert_eq!(exchange.receive(&first), Received::Late);
-    assert!(exchange.came_late(0) && exchange.came_late(1));
+    assert!(exchange.came_late(DeviceIndex(0)) && exchange.came_late(DeviceIndex(1)));
     exchange.stage();
-    assert!(!exchange.came_late(0), "it is of one cycle");
+    assert!(!exchange.came_late(DeviceIndex(0)), "it is of one cycle");
     // An answer of a device that did not process it, or of another frame.
     let mut without = reflect(&mut exchange, 0, 1);
     let wkc = exchange.layouts[0].process_data[0].slot.data().end;
     without[wkc] = 3;
     exchange.stage();
     assert_eq!(exchange.receive(&without), Received::Late);
-    assert!(!exchange.came_late(0));
+    assert!(!exchange.came_late(DeviceIndex(0)));
     for cut in 0..first.len() {
         exchange.receive(&first[..cut]);
     }
@@ -466,7 +471,7 @@ fn late_answer_proves_delivery_but_an_old_one_does_not() {
         exchange.stage();
     }
     assert_eq!(exchange.receive(&first), Received::Late);
-    assert!(!exchange.came_late(0), "too old");
+    assert!(!exchange.came_late(DeviceIndex(0)), "too old");
 }
 
 /// The number of a cycle is longer than the index of a datagram.

@@ -4,6 +4,7 @@
 //! stops, and vice versa.
 
 use ecaxis_axis::{Command, CommandError, StopMethod};
+use ecaxis_ecat::index::{GroupIndex, IndexVec};
 
 use super::bus_monitor::StopCause;
 use super::config::{GroupConfig, GroupStopScope};
@@ -121,8 +122,8 @@ fn stops(command: Command) -> bool {
 
 /// Checks whether an axis of a group may receive a command. RT.
 pub(super) fn check_permitted(
-    groups: &mut [ReactionGroup],
-    group: usize,
+    groups: &mut IndexVec<GroupIndex, ReactionGroup>,
+    group: GroupIndex,
     command: Command,
 ) -> Result<(), CommandError> {
     let machine_stops = groups.first().is_some_and(|rest| rest.stop.is_some());

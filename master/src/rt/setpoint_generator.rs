@@ -10,6 +10,7 @@ use ecaxis_axis::setpoint::{
     Gear, GearConfig, JerkLimited, Motion, Playback, PositionWave, Setpoint, SetpointError, Table,
 };
 use ecaxis_axis::{Axis, AxisStatus, CommandError, HomingStatus};
+use ecaxis_ecat::index::AxisIndex;
 
 /// A request to start following a set-point source.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -26,7 +27,7 @@ pub enum GeneratorRequest {
     },
     /// The motion of another axis.
     Gear {
-        master: usize,
+        master: AxisIndex,
         /// True for the master's reported position, false for its set-point.
         actual: bool,
         config: GearConfig,
@@ -44,7 +45,7 @@ enum Source {
         playback: Playback,
     },
     Gear {
-        master: usize,
+        master: AxisIndex,
         actual: bool,
         gear: Gear,
     },
@@ -199,7 +200,7 @@ impl SetpointGenerator {
 
     /// Returns the index of the followed axis, and whether its reported values are followed.
     #[must_use]
-    pub fn master(&self) -> Option<(usize, bool)> {
+    pub fn master(&self) -> Option<(AxisIndex, bool)> {
         match self.source {
             Some(Source::Gear { master, actual, .. }) => Some((master, actual)),
             _ => None,

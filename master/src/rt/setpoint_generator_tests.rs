@@ -1,6 +1,7 @@
 use ecaxis_axis::group::{Line, LineAxis};
 use ecaxis_axis::setpoint::{GearInMode, MotionLimits};
 use ecaxis_axis::{AxisConfig, Command, Inputs, Limits, Mode, Outputs, Scale};
+use ecaxis_ecat::index::AxisIndex;
 
 use super::*;
 
@@ -135,7 +136,7 @@ fn six_axes_on_lines_there_and_back_arrive_in_the_same_cycle() {
 fn a_gear_follows_within_the_same_cycle_and_ends_with_a_command() {
     let (mut master, mut follower) = (Rig::new(250.0), Rig::new(250.0));
     let start = GeneratorRequest::Gear {
-        master: 0,
+        master: AxisIndex(0),
         actual: false,
         config: GearConfig {
             ratio: -0.5,

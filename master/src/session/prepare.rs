@@ -7,6 +7,7 @@ use std::sync::mpsc::Sender;
 use std::time::Duration;
 
 use ecaxis_axis::Axis;
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
 use ethercrab::{Command as Datagram, MainDevice};
 
@@ -156,12 +157,12 @@ impl RunBuilder<'_> {
                     controlled,
                     operator: None,
                     seen: Vec::new(),
+                    limited: vec![false; axes.len()].into(),
                     axes,
                     orders_given: 0,
                     refused: VecDeque::new(),
                     captures: Vec::new(),
                     stopped: Vec::new(),
-                    limited: Vec::new(),
                     last_status: clock::now(),
                     witnessed: None,
                 };
@@ -219,7 +220,7 @@ fn mailbox_workers(
 /// Returns the machine with its axes in the drives' own units.
 fn apply_drive_units(machine: &Machine, bus: &Bus) -> Arc<Machine> {
     let mut machine = machine.clone();
-    for (device, found) in bus.devices.iter().enumerate() {
+    for (device, found) in bus.devices.enumerate() {
         if let Some(adopted) = &found.adopted {
             machine.adopt(device, adopted);
         }
@@ -227,18 +228,23 @@ fn apply_drive_units(machine: &Machine, bus: &Bus) -> Arc<Machine> {
     Arc::new(machine)
 }
 
-type CyclePlan = (ImagePlan, Vec<RtAxis>, Vec<usize>, Signals);
+type CyclePlan = (
+    ImagePlan,
+    IndexVec<AxisIndex, RtAxis>,
+    IndexVec<AxisIndex, DeviceIndex>,
+    Signals,
+);
 
 /// Returns the process image and the axes with their offsets in it.
 fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
-    let name = |index: usize| machine.devices[index].name.as_str();
+    let name = |index: DeviceIndex| machine.devices[index].name.as_str();
     let image = image::of(&machine.rt_config()).map_err(|error| {
         let device = error.device;
         Cause::TooLarge(error).with_name(name(device))
     })?;
     let mut slots = Vec::new();
     let mut axes = Vec::new();
-    for (index, (device, region)) in machine.devices.iter().zip(&image.regions).enumerate() {
+    for ((index, device), region) in machine.devices.enumerate().zip(&image.regions) {
         let (Some(setup), Some(region)) = (&device.axis, region) else {
             continue;
         };
@@ -281,7 +287,7 @@ fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
         let brake = setup.and_then(|setup| setup.brake_output.clone());
         slot.brake = all(brake.as_slice(), true)?.pop();
     }
-    Ok((image, slots, axes, signals))
+    Ok((image, slots.into(), axes.into(), signals))
 }
 
 /// Sets the outputs that no axis drives to the values that their drives hold.

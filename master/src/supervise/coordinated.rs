@@ -6,6 +6,7 @@ use ecaxis_axis::setpoint::{
     SetpointError, Wave,
 };
 use ecaxis_axis::{Command, Limits};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 
 use super::Supervisor;
 use super::program::{Settling, TargetKind};
@@ -24,7 +25,7 @@ const WHOLE: f64 = 1.0 - 1e-9;
 
 impl Supervisor {
     /// Returns the limits of a device's axis.
-    pub(super) fn limits(&self, device: usize) -> Limits {
+    pub(super) fn limits(&self, device: DeviceIndex) -> Limits {
         let axis = self.machine.devices[device].axis.as_ref();
         // The configuration check ensures that steps name only devices with an axis.
         axis.map_or(
@@ -47,11 +48,11 @@ impl Supervisor {
         step: &Step,
         start: Nanos,
         relative: bool,
-        targets: &[(usize, f64)],
+        targets: &[(DeviceIndex, f64)],
         part: [f64; 2],
     ) -> Result<(), Error> {
         let places = self.targets(targets);
-        let axes: Vec<usize> = places.iter().map(|&(axis, _)| axis).collect();
+        let axes: Vec<_> = places.iter().map(|&(axis, _)| axis).collect();
         self.settle(&axes, start).await?;
         let snapshot = self.poll_and_query().await?;
         let mut line_axes = Vec::with_capacity(axes.len());
@@ -85,7 +86,7 @@ impl Supervisor {
         step: &Step,
         start: Nanos,
         relative: bool,
-        targets: &[(usize, f64)],
+        targets: &[(DeviceIndex, f64)],
         part: [f64; 2],
     ) -> Result<(), Error> {
         let axes = self.places(
@@ -125,7 +126,7 @@ impl Supervisor {
 
     /// Returns fractions of the velocity limit, and of the acceleration and jerk limits of a
     /// device's axis.
-    fn part_of(&self, device: usize, part: [f64; 2]) -> MotionLimits {
+    fn part_of(&self, device: DeviceIndex, part: [f64; 2]) -> MotionLimits {
         let [speed, ramp] = part.map(|part| part * WHOLE);
         let limits = self.limits(device);
         MotionLimits {
@@ -140,7 +141,7 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        devices: [usize; 2],
+        devices: [DeviceIndex; 2],
         actual: bool,
         config: GearConfig,
     ) -> Result<(), Error> {
@@ -164,7 +165,7 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        device: usize,
+        device: DeviceIndex,
         wave: Wave,
     ) -> Result<(), Error> {
         let axes = self.places(&[device]);
@@ -188,7 +189,8 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        [device, table]: [usize; 2],
+        device: DeviceIndex,
+        table: usize,
         [speed, ramp]: [f64; 2],
     ) -> Result<(), Error> {
         let axes = self.places(&[device]);
@@ -224,7 +226,7 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        feeds: &[(usize, GeneratorRequest)],
+        feeds: &[(AxisIndex, GeneratorRequest)],
         until: GeneratorState,
     ) -> Result<(), Error> {
         let orders = feeds
@@ -254,7 +256,7 @@ impl Supervisor {
             if !done {
                 let waited = clock::now().saturating_sub(begun);
                 if until == GeneratorState::Engaged && waited > ENGAGE_TIMEOUT {
-                    let axis = feeds.first().map_or(0, |&(axis, _)| axis);
+                    let axis = feeds.first().map(|&(axis, _)| axis).unwrap_or_default();
                     return Err(this.refusal(step, axis, &"it does not catch up"));
                 }
                 settling = Settling::default();

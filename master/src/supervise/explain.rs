@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecaxis_axis::{AxisStatus, State, Trip};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex};
 
 use super::{Supervisor, diagnosis_history};
 use crate::acyclic::al;
@@ -30,7 +31,7 @@ impl Supervisor {
     pub(super) async fn explain_stop(
         &mut self,
         cause: StopCause,
-        group: Option<usize>,
+        group: Option<GroupIndex>,
         snapshot: &Snapshot,
     ) -> Error {
         let axis = cause.axis();
@@ -110,8 +111,8 @@ impl Supervisor {
 
     /// Returns the first SubDevice of a group, or of all, that does not answer or is not in Op.
     /// Skips groups already stopped.
-    async fn find_missing(&mut self, group: Option<usize>) -> Option<Error> {
-        for (index, device) in self.bus.addresses().into_iter().enumerate() {
+    async fn find_missing(&mut self, group: Option<GroupIndex>) -> Option<Error> {
+        for (index, device) in (0..).map(DeviceIndex).zip(self.bus.addresses()) {
             let own = self.machine.group_of(index);
             if group.is_some_and(|group| group != own) || self.is_stopped(own) {
                 continue;
@@ -131,8 +132,8 @@ impl Supervisor {
     /// Returns the error that stopped the group whose axis this one may have followed.
     async fn cause_of_others(
         &mut self,
-        axis: usize,
-        group: Option<usize>,
+        axis: AxisIndex,
+        group: Option<GroupIndex>,
         snapshot: &Snapshot,
     ) -> Option<Arc<Error>> {
         // The other group may have stopped in the same cycle, so its stop is reported first. Boxed
@@ -148,7 +149,7 @@ impl Supervisor {
 
     pub(super) async fn not_enabled(
         &mut self,
-        axis: usize,
+        axis: AxisIndex,
         status: AxisStatus,
         timeout: Nanos,
     ) -> Error {
@@ -164,7 +165,7 @@ impl Supervisor {
     }
 
     /// Reports a fault from before this run; enabling clears it.
-    pub(super) async fn report_preexisting_fault(&mut self, axis: usize) {
+    pub(super) async fn report_preexisting_fault(&mut self, axis: AxisIndex) {
         let name = self.axis_name(axis);
         let code = self.error_code(axis).await.unwrap_or(0);
         let text = ecaxis_axis::cia402::describe(code).text;
@@ -174,7 +175,7 @@ impl Supervisor {
     }
 
     /// Reads the error code (0x603F) over CoE.
-    async fn error_code(&mut self, axis: usize) -> Option<u16> {
+    async fn error_code(&mut self, axis: AxisIndex) -> Option<u16> {
         match self.upload(axis, ERROR_CODE).await?.as_slice() {
             &[low, high] => Some(u16::from_le_bytes([low, high])),
             _ => None,
@@ -182,7 +183,7 @@ impl Supervisor {
     }
 
     /// Reads an object of an axis's device. Returns `None` after a timeout.
-    async fn upload(&mut self, axis: usize, index: u16) -> Option<Vec<u8>> {
+    async fn upload(&mut self, axis: AxisIndex, index: u16) -> Option<Vec<u8>> {
         let mailbox = self.mailboxes.urgent(*self.axes.get(axis)?)?;
         clock::timeout(ASK_TIMEOUT, mailbox.upload(index, 0))
             .await?
@@ -242,14 +243,18 @@ impl Supervisor {
     }
 
     /// Returns the limits of an axis's drive that the machine file exceeds.
-    fn exceeded_limits(&self, axis: usize) -> Vec<LimitConflict> {
+    fn exceeded_limits(&self, axis: AxisIndex) -> Vec<LimitConflict> {
         let device = self.axes.get(axis).and_then(|&at| self.bus.devices.get(at));
         device.map_or(Vec::new(), |device| device.limits.clone())
     }
 
     /// Returns the failed device's own report. Best effort: the machine stops meanwhile.
-    async fn drive_report(&mut self, axis: usize, since: Nanos) -> Box<DriveReport> {
-        let device = self.axes.get(axis).copied().unwrap_or(usize::MAX);
+    async fn drive_report(&mut self, axis: AxisIndex, since: Nanos) -> Box<DriveReport> {
+        let device = self
+            .axes
+            .get(axis)
+            .copied()
+            .unwrap_or(DeviceIndex(usize::MAX));
         let mut history = Vec::new();
         if let (Some(mailbox), Some(config)) = (
             self.mailboxes.urgent(device),
@@ -268,7 +273,7 @@ impl Supervisor {
 
     /// Checks the mode of each axis over CoE if 0x6061 is not in its process data. Otherwise the
     /// cycle checks it.
-    pub(super) async fn confirm_modes(&mut self, axes: &[usize]) -> Result<(), Error> {
+    pub(super) async fn confirm_modes(&mut self, axes: &[AxisIndex]) -> Result<(), Error> {
         for &axis in axes {
             let device = &self.machine.devices[self.axes[axis]];
             let Some(setup) = &device.axis else { continue };

@@ -3,6 +3,8 @@
 
 use std::sync::Arc;
 
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex};
+
 use super::Supervisor;
 use crate::config::{Action, Step};
 use crate::post_mortem::Witnessed;
@@ -15,8 +17,7 @@ use crate::rt::reaction_group::GroupStatus;
 /// A stop of a group during which the machine continued.
 #[derive(Debug, Clone)]
 pub struct StoppedGroup {
-    /// The group index, as in [`crate::config::Machine::group_of`].
-    pub group: usize,
+    pub group: GroupIndex,
     /// The number of the stop within its group, from 1.
     pub number: u32,
     pub cause: Arc<Error>,
@@ -25,21 +26,21 @@ pub struct StoppedGroup {
 }
 
 impl Supervisor {
-    pub(super) fn group_of(&self, axis: usize) -> usize {
+    pub(super) fn group_of(&self, axis: AxisIndex) -> GroupIndex {
         let device = self.axes.get(axis);
-        device.map_or(0, |&device| self.machine.group_of(device))
+        device.map_or(GroupIndex::MACHINE, |&device| self.machine.group_of(device))
     }
 
-    pub(super) fn group_name(&self, group: usize) -> String {
+    pub(super) fn group_name(&self, group: GroupIndex) -> String {
         self.machine.group_name(group).to_owned()
     }
 
     /// Returns `true` if the machine continues without this group.
-    pub(super) fn is_stopped(&self, group: usize) -> bool {
+    pub(super) fn is_stopped(&self, group: GroupIndex) -> bool {
         self.stop_of(group).is_some()
     }
 
-    fn stop_of(&self, group: usize) -> Option<&StoppedGroup> {
+    fn stop_of(&self, group: GroupIndex) -> Option<&StoppedGroup> {
         let last = self.stopped.iter().rev().find(|s| s.group == group);
         last.filter(|stop| !stop.released)
     }
@@ -48,7 +49,7 @@ impl Supervisor {
     pub(super) async fn report_stopped_groups(&mut self, snapshot: &Snapshot) {
         // Followers come last: the stop of the group they followed explains theirs.
         let follows = |now: &GroupStatus| matches!(now.stopped, Some(StopCause::FollowLost { .. }));
-        let groups = snapshot.groups.iter().enumerate();
+        let groups = snapshot.groups.enumerate();
         let mut groups: Vec<_> = groups.collect();
         groups.sort_by_key(|(_, now)| follows(now));
         for (group, now) in groups {
@@ -102,7 +103,7 @@ impl Supervisor {
     pub(super) fn ensure_not_stopped(
         &self,
         step: Option<&Step>,
-        axes: &[usize],
+        axes: &[AxisIndex],
     ) -> Result<(), Error> {
         let stopped = axes.iter().find_map(|&axis| {
             let stop = self.stop_of(self.group_of(axis))?;
@@ -125,8 +126,9 @@ impl Supervisor {
 
 /// Returns the devices of the axes that a step needs to run. Resetting and disabling work in a
 /// stopped group.
-pub(super) fn needed(action: &Action) -> Vec<usize> {
-    let targets = |targets: &[(usize, f64)]| targets.iter().map(|&(device, _)| device).collect();
+pub(super) fn needed(action: &Action) -> Vec<DeviceIndex> {
+    let targets =
+        |targets: &[(DeviceIndex, f64)]| targets.iter().map(|&(device, _)| device).collect();
     match action {
         Action::Enable { axes } | Action::Home { axes } | Action::Stop { axes } => axes.clone(),
         Action::Move { targets: t, .. }

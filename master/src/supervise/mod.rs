@@ -11,6 +11,7 @@ use std::sync::mpsc::Sender;
 use std::time::Duration;
 
 use ecaxis_axis::{Command, CommandError};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 
 use crate::acyclic::{AlState, DeviceRef, al};
 use crate::bringup::{Bus, clocks};
@@ -73,19 +74,19 @@ pub struct Supervisor {
     /// The operator that replaces the program.
     pub operator: Option<Box<dyn jog::Operator>>,
     /// Axes whose faults and trips the operator has seen.
-    pub seen: Vec<usize>,
-    /// Indices into the machine's devices, one per axis of the cycle.
-    pub axes: Vec<usize>,
+    pub seen: Vec<AxisIndex>,
+    /// The device of each axis of the cycle.
+    pub axes: IndexVec<AxisIndex, DeviceIndex>,
     /// The number of commands sent to the cycle so far.
     pub orders_given: u64,
     /// Commands that axes refused, in order. If too many, the first ones and the last one.
-    pub refused: VecDeque<(usize, CommandError)>,
+    pub refused: VecDeque<(AxisIndex, CommandError)>,
     /// The probing results, one per step.
     pub captures: Vec<ProbeCapture>,
     /// The stops of groups during which the machine continued, in the order of their reports.
     pub stopped: Vec<StoppedGroup>,
     /// `true` for axes whose drive has reported an internal limit.
-    pub limited: Vec<bool>,
+    pub limited: IndexVec<AxisIndex, bool>,
     /// The time of the last status report.
     pub last_status: Nanos,
     /// The state of the bus at the failure.
@@ -163,7 +164,7 @@ impl Supervisor {
             return self.run_operator(operator.as_mut()).await;
         }
         if !enables(&self.machine.steps) {
-            let all: Vec<usize> = (0..self.axes.len()).collect();
+            let all: Vec<_> = self.axes.indices().collect();
             self.enable_axes(None, &all).await?;
         }
         self.run_program(ended).await
@@ -224,7 +225,11 @@ impl Supervisor {
             .map(|(device, found)| (device.at.clone(), found.clock_difference))
     }
 
-    async fn enable_axes(&mut self, step: Option<&Step>, axes: &[usize]) -> Result<(), Error> {
+    async fn enable_axes(
+        &mut self,
+        step: Option<&Step>,
+        axes: &[AxisIndex],
+    ) -> Result<(), Error> {
         let snapshot = self.poll_and_query().await?;
         let mut orders = Vec::with_capacity(2 * axes.len());
         self.ensure_not_stopped(step, axes)?;
@@ -249,7 +254,7 @@ impl Supervisor {
                 }
                 .with_device(self.device_of(axis)));
             }
-            let status = |axis: usize| snapshot.axes.get(axis).copied();
+            let status = |axis: AxisIndex| snapshot.axes.get(axis).copied();
             let late = axes
                 .iter()
                 .find_map(|&axis| Some((axis, status(axis)?)).filter(|(_, s)| !s.ready));
@@ -278,7 +283,7 @@ impl Supervisor {
     }
 
     /// Returns the longest brake release time in ns; the drive is enabled during this time.
-    fn longest_release(&self, axes: &[usize]) -> Nanos {
+    fn longest_release(&self, axes: &[AxisIndex]) -> Nanos {
         let devices = axes.iter().filter_map(|&axis| self.axes.get(axis));
         let brakes = devices.filter_map(|&device| {
             let axis = self.machine.devices.get(device)?.axis.as_ref()?;
@@ -324,8 +329,7 @@ impl Supervisor {
 
     /// Reports Statusword bit 11 (internal limit active) once for each axis.
     fn report_limits(&mut self, snapshot: &Snapshot) {
-        self.limited.resize(snapshot.axes.len(), false);
-        for (axis, status) in snapshot.axes.iter().enumerate() {
+        for (axis, status) in snapshot.axes.enumerate() {
             if status.internal_limit && status.enabled && !self.limited[axis] {
                 self.limited[axis] = true;
                 let device = self.device_of(axis);
@@ -378,10 +382,10 @@ impl Supervisor {
             self.witness(error).await;
         }
         self.pass_events_on();
-        let stopped = |device: usize| self.is_stopped(self.machine.group_of(device));
-        let devices = self.bus.addresses().into_iter().enumerate();
+        let stopped = |device: DeviceIndex| self.is_stopped(self.machine.group_of(device));
+        let devices = (0..).map(DeviceIndex).zip(self.bus.addresses());
         let (stopped, others): (Vec<_>, Vec<_>) = devices.partition(|(device, _)| stopped(*device));
-        let addresses = |devices: Vec<(usize, DeviceRef)>| -> Vec<DeviceRef> {
+        let addresses = |devices: Vec<(DeviceIndex, DeviceRef)>| -> Vec<DeviceRef> {
             devices.into_iter().map(|(_, at)| at).collect()
         };
         let (stopped, others) = (addresses(stopped), addresses(others));
@@ -444,7 +448,7 @@ impl Supervisor {
             return Err(self.explain_stop(failure, None, &snapshot).await);
         }
         // Axes of a stopped group may not answer; their group's stop has been reported.
-        let mut axes = snapshot.axes.iter().enumerate();
+        let mut axes = snapshot.axes.enumerate();
         let powered = axes.find(|(axis, status)| {
             status.state.has_power() && !self.is_stopped(self.group_of(*axis))
         });
@@ -480,7 +484,7 @@ impl Supervisor {
         let _ = self.progress.send(progress);
     }
 
-    fn device_of(&self, axis: usize) -> DeviceRef {
+    fn device_of(&self, axis: AxisIndex) -> DeviceRef {
         self.axes
             .get(axis)
             .and_then(|&device| self.bus.devices.get(device))
@@ -494,7 +498,7 @@ impl Supervisor {
             )
     }
 
-    fn axis_name(&self, axis: usize) -> String {
+    fn axis_name(&self, axis: AxisIndex) -> String {
         self.device_of(axis).name
     }
 }

@@ -14,6 +14,7 @@ use std::pin::Pin;
 use ecaxis_axis::setpoint::{GearConfig, GearInMode};
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Command};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 
 use super::groups::needed;
 use super::{ProgramOutcome, Supervisor};
@@ -93,7 +94,7 @@ impl Supervisor {
         ended: &mut ProgramOutcome,
     ) -> Result<(), Error> {
         let start = clock::now();
-        let all: Vec<usize> = (0..self.axes.len()).collect();
+        let all: Vec<_> = self.axes.indices().collect();
         self.enable_axes(None, &all).await?;
         while !self.over(start) {
             if self.poll_and_query().await?.finished {
@@ -165,30 +166,30 @@ impl Supervisor {
                 self.command(axes.iter().map(|&axis| (axis, Command::Disable)))
                     .await;
                 // The state of an axis without process data is unknown.
-                let groups: Vec<_> = (0..self.axes.len()).map(|a| self.group_of(a)).collect();
-                let lost = |s: &Snapshot, axis: usize| {
+                let groups = self.groups();
+                let lost = |s: &Snapshot, axis: AxisIndex| {
                     let group = s.groups.get(groups[axis]);
                     group.is_some_and(|group| group.stopped.is_some() && !group.fresh)
                 };
-                let done = |s: &Snapshot, axis: usize| !s.axes[axis].enabled || lost(s, axis);
+                let done = |s: &Snapshot, axis: AxisIndex| !s.axes[axis].enabled || lost(s, axis);
                 self.until(step, start, done, &axes).await
             }
             Action::Reset { axes } => {
                 let axes = self.places(axes);
                 self.command(axes.iter().map(|&axis| (axis, Command::ResetFault)))
                     .await;
-                let of: Vec<_> = (0..self.axes.len()).map(|a| self.group_of(a)).collect();
+                let of = self.groups();
                 // A stopped group first comes to rest, then returns, unless faults of its other
                 // axes prevent this.
-                let coming = |s: &Snapshot, group: usize| {
+                let coming = |s: &Snapshot, group: GroupIndex| {
                     let sound = |axis: &AxisStatus| axis.fault.is_none() && axis.trip.is_none();
                     let mut own = s.axes.iter().zip(&of).filter(|(_, of)| **of == group);
                     let state = &s.groups[group];
                     let kept = !state.powered && !own.all(|(axis, _)| sound(axis));
                     state.stopped.is_some() && state.fresh && !kept
                 };
-                let done = |s: &Snapshot, axis: usize| {
-                    let group = of.get(axis).copied().unwrap_or(0);
+                let done = |s: &Snapshot, axis: AxisIndex| {
+                    let group = of[axis];
                     !s.axes[axis].resetting && !coming(s, group)
                 };
                 self.until(step, start, done, &axes).await
@@ -250,10 +251,7 @@ impl Supervisor {
                 table,
                 speed,
                 ramp,
-            } => {
-                self.play(step, start, [*axis, *table], [*speed, *ramp])
-                    .await
-            }
+            } => self.play(step, start, *axis, *table, [*speed, *ramp]).await,
             Action::Gear {
                 axis,
                 master,
@@ -317,27 +315,38 @@ impl Supervisor {
     }
 
     /// Returns the axis indices of devices.
-    pub(super) fn places(&self, devices: &[usize]) -> Vec<usize> {
-        let places = devices
-            .iter()
-            .filter_map(|device| self.axes.iter().position(|d| d == device));
+    pub(super) fn places(&self, devices: &[DeviceIndex]) -> Vec<AxisIndex> {
+        let places = devices.iter().filter_map(|&device| self.axis_of(device));
         places.collect()
     }
 
-    pub(super) fn targets(&self, targets: &[(usize, f64)]) -> Vec<(usize, f64)> {
-        let places = targets.iter().filter_map(|&(device, target)| {
-            Some((self.axes.iter().position(|&d| d == device)?, target))
-        });
-        places.collect()
+    /// Returns targets of devices as targets of their axes.
+    pub(super) fn targets<T: Copy>(&self, targets: &[(DeviceIndex, T)]) -> Vec<(AxisIndex, T)> {
+        let targets = targets.iter();
+        let targets = targets.filter_map(|&(device, target)| Some((self.axis_of(device)?, target)));
+        targets.collect()
     }
 
-    pub(super) fn setup(&self, axis: usize) -> Option<&AxisSetup> {
+    fn axis_of(&self, device: DeviceIndex) -> Option<AxisIndex> {
+        let mut axes = self.axes.enumerate();
+        axes.find_map(|(axis, own)| (*own == device).then_some(axis))
+    }
+
+    /// Returns the group of each axis.
+    fn groups(&self) -> IndexVec<AxisIndex, GroupIndex> {
+        let devices = self.axes.iter();
+        devices
+            .map(|&device| self.machine.group_of(device))
+            .collect()
+    }
+
+    pub(super) fn setup(&self, axis: AxisIndex) -> Option<&AxisSetup> {
         let device = self.machine.devices.get(*self.axes.get(axis)?)?;
         device.axis.as_ref()
     }
 
     /// Returns the position for a target; on a modulo axis the one that its direction leads to.
-    pub(super) fn resolve_target(&self, axis: usize, from: f64, target: f64) -> f64 {
+    pub(super) fn resolve_target(&self, axis: AxisIndex, from: f64, target: f64) -> f64 {
         let Some(setup) = self.setup(axis) else {
             return target;
         };
@@ -347,7 +356,7 @@ impl Supervisor {
     }
 
     /// Sends all commands in the same cycle.
-    pub(super) async fn command(&mut self, commands: impl Iterator<Item = (usize, Command)>) {
+    pub(super) async fn command(&mut self, commands: impl Iterator<Item = (AxisIndex, Command)>) {
         let orders = commands.map(|(axis, command)| RtCommand::Axis { axis, command });
         self.orders(&orders.collect::<Vec<_>>()).await;
     }
@@ -392,7 +401,7 @@ impl Supervisor {
         }
     }
 
-    pub(super) fn refusal(&self, step: &Step, axis: usize, reason: &dyn Display) -> Error {
+    pub(super) fn refusal(&self, step: &Step, axis: AxisIndex, reason: &dyn Display) -> Error {
         Cause::Refused {
             reason: reason.to_string(),
             by_axis: None,

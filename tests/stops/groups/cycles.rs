@@ -4,6 +4,7 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 
 use ecaxis_axis::{AxisStatus, Command, CommandError, State};
+use ecaxis_ecat::index::AxisIndex;
 use ecaxis_master::config::{AxisRef, Machine};
 use ecaxis_master::rt::bus_monitor::StopCause;
 use ecaxis_master::rt::controller::{Controller, CycleContext};
@@ -75,7 +76,7 @@ fn a_controller_sees_the_stop_and_resets_the_group() {
             2000 => {
                 assert!(matches!(
                     machine.stopped(y),
-                    Some(StopCause::DriveFault { axis: 1 })
+                    Some(StopCause::DriveFault { axis: AxisIndex(1) })
                 ));
                 assert_eq!(machine.stopped(z), None);
                 assert_eq!(

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use ecaxis_axis::setpoint::{Motion, PositionWave, SetpointError, Shape, Wave};
 use ecaxis_axis::{Axis, AxisConfig, Command, Limits, Mode, Scale, StopMethod};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex};
 use ecaxis_esi::layout::{Field, Layout};
 
 use super::segment::{BenchSegment, DRIVE_BYTES, FIRST_STATION};
@@ -102,7 +103,7 @@ fn layout() -> Layout {
 const DRIVE: ProcessData = ProcessData {
     out_len: DRIVE_BYTES,
     in_len: DRIVE_BYTES,
-    group: 0,
+    group: GroupIndex::MACHINE,
     lrw: true,
     mailbox: false,
 };
@@ -149,9 +150,10 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
     let scale = Scale::new(COUNTS_PER_TURN, 1.0)?;
     let config = AxisConfig::new(Mode::Csp, scale, LIMITS);
     let mut slots = Vec::with_capacity(axes);
-    for region in plan.regions.iter().flatten() {
+    for (device, region) in (0..).map(DeviceIndex).zip(plan.regions.iter().flatten()) {
         let bits = AxisBits::new(&layout, region)?;
-        slots.push(RtAxis::new(Axis::new(config)?, bits, slots.len(), 0));
+        let axis = Axis::new(config)?;
+        slots.push(RtAxis::new(axis, bits, device, GroupIndex::MACHINE));
     }
     let devices = u16::try_from(axes).unwrap_or(u16::MAX);
     let members: Vec<ExchangeDevice> = (0..devices)
@@ -178,15 +180,15 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
             exchange,
             // Losses are counted only; a stopped machine would end the measurement.
             lost_frames: u32::MAX,
-            devices: vec![DRIVE; axes],
-            groups: vec![GroupConfig::machine(StopMethod::Ramp)],
+            devices: vec![DRIVE; axes].into(),
+            groups: vec![GroupConfig::machine(StopMethod::Ramp)].into(),
             bus_lost: StopMethod::QuickStop,
             emergency: Vec::new(),
         },
         link,
         port: main_device(cycle_ns).1,
         exchange: Exchange::new(&plan, Some(&clock), &members, exchange),
-        axes: slots,
+        axes: slots.into(),
         signals,
         controller: None,
         tables: Box::default(),
@@ -213,7 +215,7 @@ pub fn set_in_motion(
     if !locked {
         return Ok(false);
     }
-    for axis in 0..setup.axes {
+    for axis in (0..setup.axes).map(AxisIndex) {
         order(
             outer,
             RtCommand::Axis {
@@ -230,7 +232,7 @@ pub fn set_in_motion(
     }
     let dt_s = setup.cycle_ns as f64 * 1e-9;
     let wave = Wave::new(Shape::Sine, AMPLITUDE, FREQUENCY, PERIODS, dt_s)?;
-    for axis in 0..setup.axes {
+    for axis in (0..setup.axes).map(AxisIndex) {
         let at = outer.snapshots.read().axes[axis].target_position;
         let wave = PositionWave::new(wave, Motion::at(at), LIMITS.motion(), None, dt_s)?;
         order(

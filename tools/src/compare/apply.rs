@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use ecaxis_ecat::index::DeviceIndex;
 use toml_edit::{Array, ArrayOfTables, DocumentMut, Item, Table, TableLike, Value};
 
 use super::{Comparison, Difference};
@@ -80,7 +81,7 @@ pub fn apply(
         }
     }
     let sections = added(machine, actual, place, &new)?;
-    for (index, config) in machine.devices.iter().enumerate() {
+    for (index, config) in machine.devices.enumerate() {
         let Some(position) = actual.comparison.places.get(index).copied().flatten() else {
             continue;
         };
@@ -211,7 +212,7 @@ fn change(
     place: OutputPath<'_>,
     difference: &Difference,
 ) -> Result<(), ApplyError> {
-    let name = |index: usize| machine.devices.get(index).map(|d| d.name.as_str());
+    let name = |index: DeviceIndex| machine.devices.get(index).map(|d| d.name.as_str());
     match difference {
         Difference::Alias {
             device: index,

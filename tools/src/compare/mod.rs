@@ -7,6 +7,7 @@
 
 use std::fmt;
 
+use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use ecaxis_esi::{Mode, address};
 
 use crate::scan::{Device, Scan};
@@ -23,46 +24,50 @@ pub use parameters::parameters;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Difference {
     /// No device on the bus matches this one.
-    Missing { device: usize },
+    Missing { device: DeviceIndex },
     /// The file does not contain this device.
     Added { position: u16 },
     /// Two devices are in each other's position.
     Swapped {
-        devices: [usize; 2],
+        devices: [DeviceIndex; 2],
         positions: [u16; 2],
     },
     /// The device is in another position; those in between may have moved as well.
-    Moved { device: usize, from: u16, to: u16 },
+    Moved {
+        device: DeviceIndex,
+        from: u16,
+        to: u16,
+    },
     /// A revision that the device's `identity` does not accept.
     Revision {
-        device: usize,
+        device: DeviceIndex,
         position: u16,
         expected: u32,
         found: u32,
     },
     /// The device has another alias or device identification.
     Alias {
-        device: usize,
+        device: DeviceIndex,
         position: u16,
         expected: Locator,
         found: u16,
     },
     Serial {
-        device: usize,
+        device: DeviceIndex,
         position: u16,
         expected: u32,
         found: u32,
     },
     /// Module names by slot.
     Modules {
-        device: usize,
+        device: DeviceIndex,
         position: u16,
         expected: Vec<String>,
         found: Vec<String>,
     },
     /// A start-up SDO value and the value in the device.
     Parameter {
-        device: usize,
+        device: DeviceIndex,
         position: u16,
         index: u16,
         sub: u8,
@@ -77,7 +82,7 @@ pub enum Difference {
 pub struct Comparison {
     pub differences: Vec<Difference>,
     /// The bus position of each file device.
-    pub places: Vec<Option<u16>>,
+    pub places: Positions,
     /// Items that could not be compared.
     pub unknown: Vec<String>,
 }
@@ -86,7 +91,7 @@ pub struct Comparison {
 #[must_use]
 pub fn compare(machine: &Machine, scan: &Scan) -> Comparison {
     let mut comparison = Comparison {
-        places: vec![None; machine.devices.len()],
+        places: vec![None; machine.devices.len()].into(),
         ..Comparison::default()
     };
     let mut free: Vec<bool> = vec![true; scan.devices.len()];
@@ -95,7 +100,7 @@ pub fn compare(machine: &Machine, scan: &Scan) -> Comparison {
     by_order(machine, scan, &mut comparison.places, &mut free);
     match_moved(machine, scan, &mut comparison, &mut free);
 
-    let missing = comparison.places.iter().enumerate();
+    let missing = comparison.places.enumerate();
     let missing = missing.filter(|(_, place)| place.is_none());
     comparison
         .differences
@@ -105,7 +110,7 @@ pub fn compare(machine: &Machine, scan: &Scan) -> Comparison {
         comparison.differences.push(Difference::Added { position });
     }
     order(machine, &mut comparison);
-    for (index, config) in machine.devices.iter().enumerate() {
+    for (index, config) in machine.devices.enumerate() {
         let place = comparison.places.get(index).copied().flatten();
         if let Some(device) = place.and_then(|at| scan.devices.get(usize::from(at))) {
             compare_device(index, config, device, scan.asked, &mut comparison);
@@ -121,7 +126,8 @@ fn is_product(config: &DeviceConfig, device: &Device) -> bool {
         .is_some_and(|i| (i.vendor, i.product) == (ours.vendor, ours.product))
 }
 
-type Positions = [Option<u16>];
+/// The bus position of each device of a machine file.
+type Positions = IndexVec<DeviceIndex, Option<u16>>;
 
 /// Assigns devices by serial number, which is always unique.
 fn by_serial(machine: &Machine, scan: &Scan, places: &mut Positions, free: &mut [bool]) {
@@ -166,9 +172,8 @@ fn assign(
 /// Assigns devices by the longest common subsequence, so that a missing or added device only shifts
 /// the others.
 fn by_order(machine: &Machine, scan: &Scan, places: &mut Positions, free: &mut [bool]) {
-    let mut expected: Vec<(u16, usize)> = machine
+    let mut expected: Vec<(u16, DeviceIndex)> = machine
         .devices
-        .iter()
         .enumerate()
         .filter_map(|(index, config)| match config.at {
             Locator::Position(position) => Some((position, index)),
@@ -202,7 +207,7 @@ fn by_order(machine: &Machine, scan: &Scan, places: &mut Positions, free: &mut [
 fn match_moved(machine: &Machine, scan: &Scan, comparison: &mut Comparison, free: &mut [bool]) {
     let before = comparison.places.clone();
     assign(machine, scan, &mut comparison.places, free, |_, _| true);
-    for (index, config) in machine.devices.iter().enumerate() {
+    for (index, config) in machine.devices.enumerate() {
         let now = comparison.places.get(index).copied().flatten();
         let (Some(None), Some(position)) = (before.get(index), now) else {
             continue;
@@ -224,12 +229,11 @@ fn match_moved(machine: &Machine, scan: &Scan, comparison: &mut Comparison, free
 
 /// Reports devices that are located by position and have another order.
 fn order(machine: &Machine, comparison: &mut Comparison) {
-    let mut all: Vec<(u16, u16, usize)> = machine
+    let mut all: Vec<(u16, u16, DeviceIndex)> = machine
         .devices
-        .iter()
-        .zip(&comparison.places)
         .enumerate()
-        .filter_map(|(index, (config, place))| match config.at {
+        .zip(&comparison.places)
+        .filter_map(|((index, config), place)| match config.at {
             Locator::Position(position) => Some((position, (*place)?, index)),
             _ => None,
         })
@@ -267,7 +271,7 @@ fn order(machine: &Machine, comparison: &mut Comparison) {
 
 /// Compares a device that was found.
 fn compare_device(
-    index: usize,
+    index: DeviceIndex,
     config: &DeviceConfig,
     device: &Device,
     asked: bool,
@@ -300,7 +304,7 @@ fn compare_device(
 
 /// Compares the modules, unless the mode selects the module.
 fn modules(
-    index: usize,
+    index: DeviceIndex,
     config: &DeviceConfig,
     device: &Device,
     asked: bool,
@@ -376,7 +380,7 @@ impl Difference {
 
     /// Returns the indices of the devices in the file and their positions on the bus.
     #[must_use]
-    pub fn location(&self) -> (Vec<usize>, Vec<u16>) {
+    pub fn location(&self) -> (Vec<DeviceIndex>, Vec<u16>) {
         match self {
             Self::Missing { device } => (vec![*device], vec![]),
             Self::Added { position } => (vec![], vec![*position]),
@@ -418,12 +422,12 @@ struct DifferenceDisplay<'a> {
 }
 
 impl DifferenceDisplay<'_> {
-    fn name(&self, device: usize) -> &str {
+    fn name(&self, device: DeviceIndex) -> &str {
         let device = self.machine.devices.get(device);
         device.map_or("?", |device| device.name.as_str())
     }
 
-    fn kind(&self, device: usize) -> String {
+    fn kind(&self, device: DeviceIndex) -> String {
         let device = self.machine.devices.get(device);
         device.map_or_else(String::new, |d| d.device.type_name.clone())
     }

@@ -26,7 +26,7 @@ pub async fn parameters(
     scan: &Scan,
     comparison: &mut Comparison,
 ) {
-    for (index, config) in machine.devices.iter().enumerate() {
+    for (index, config) in machine.devices.enumerate() {
         let sdos: Vec<&StartupSdo> = config
             .selection
             .startup

@@ -1,6 +1,7 @@
 //! The stop reactions of the machine and its axis groups in `ecaxis explain`.
 
 use ecaxis_axis::StopMethod;
+use ecaxis_ecat::index::GroupIndex;
 use ecaxis_master::config::{GroupStopScope, Machine};
 
 use ecaxis_tools::cells;
@@ -33,19 +34,19 @@ pub(super) fn stop(machine: &Machine, out: &mut Document) {
         return;
     }
     let mut table = Table::new("group|axes|devices|others|outside");
-    let names = |axes: bool, group: usize| {
-        let devices = machine.devices.iter().enumerate();
+    let names = |axes: bool, group: GroupIndex| {
+        let devices = machine.devices.enumerate();
         let own = devices.filter(|(device, _)| machine.group_of(*device) == group);
         let kind = own.filter(|(_, device)| device.axis.is_some() == axes);
         let names: Vec<_> = kind.map(|(_, device)| device.name.as_str()).collect();
         names.join(" ")
     };
-    for (index, group) in stop.groups.iter().enumerate() {
+    for (index, group) in (1..).map(GroupIndex).zip(&stop.groups) {
         let outside = match group.outside {
             GroupStopScope::Stop => "stops",
             GroupStopScope::Continue => "continues",
         };
-        let (axes, devices) = (names(true, index + 1), names(false, index + 1));
+        let (axes, devices) = (names(true, index), names(false, index));
         table.row(cells![
             group.name,
             axes,
@@ -54,7 +55,10 @@ pub(super) fn stop(machine: &Machine, out: &mut Document) {
             outside
         ]);
     }
-    let (axes, devices) = (names(true, 0), names(false, 0));
+    let (axes, devices) = (
+        names(true, GroupIndex::MACHINE),
+        names(false, GroupIndex::MACHINE),
+    );
     table.row(cells![
         "(the rest)",
         axes,

@@ -1,5 +1,6 @@
 use super::*;
 use crate::render::pdo_table::{short_name, value};
+use ecaxis_ecat::index::GroupIndex;
 
 #[test]
 fn frame_bytes_match_a_manual_count() {
@@ -7,7 +8,7 @@ fn frame_bytes_match_a_manual_count() {
         let axis = image::ProcessData {
             out_len: 12,
             in_len: 12,
-            group: 0,
+            group: GroupIndex(0),
             lrw: true,
             mailbox: false,
         };

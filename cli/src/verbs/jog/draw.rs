@@ -97,8 +97,8 @@ impl Screen<'_> {
             "axis", "state", "mode", "position", "velocity", "torque"
         );
         // The selected axis is always visible.
-        let first = (self.ui.selected + 1).saturating_sub(room);
-        let shown = panel.axes.iter().enumerate().skip(first).take(room);
+        let first = (self.ui.selected.0 + 1).saturating_sub(room);
+        let shown = panel.axes.enumerate().skip(first).take(room);
         let mut rows = vec![vec![(FAINT, head)]];
         rows.extend(shown.map(|(index, axis)| {
             let chosen = index == self.ui.selected;

@@ -2,6 +2,7 @@
 
 use super::super::panel::tests::panel;
 use super::*;
+use ecaxis_ecat::index::AxisIndex;
 
 fn drawn(panel: &Panel, messages: &Messages, size: (usize, usize)) -> Vec<String> {
     let ui = Ui::default();
@@ -20,7 +21,7 @@ fn drawn(panel: &Panel, messages: &Messages, size: (usize, usize)) -> Vec<String
 #[test]
 fn screen_draws_all_rows() {
     let mut panel = panel(2);
-    panel.axes[1].trouble = Some("drive fault 0x8611: following error".to_owned());
+    panel.axes[AxisIndex(1)].trouble = Some("drive fault 0x8611: following error".to_owned());
     let mut messages = Messages::default();
     messages.show("bus in Op".to_owned(), false);
     for _ in 0..3 {

@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 
 use ecaxis_axis::Mode;
+use ecaxis_ecat::index::AxisIndex;
 use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config::{Machine, duration, nearest};
 use ecaxis_master::session::{self, Observer, Options, Progress};
@@ -312,9 +313,9 @@ fn parse(line: &str, view: &View<'_>, speed: f64) -> Result<Line, String> {
         return Ok(Line::Nothing);
     };
     let axis = |name: &str| {
-        let mut axes = 0..view.axes.len();
+        let mut axes = view.axes.indices();
         axes.find(|&axis| view.name(axis) == name).ok_or_else(|| {
-            let all = (0..view.axes.len()).map(|axis| view.name(axis));
+            let all = view.axes.indices().map(|axis| view.name(axis));
             match nearest(name, all.clone()) {
                 Some(near) => format!("no axis is named `{name}`; did you mean `{near}`?"),
                 None => format!(
@@ -325,11 +326,11 @@ fn parse(line: &str, view: &View<'_>, speed: f64) -> Result<Line, String> {
         })
     };
     // Without names, the command applies to all axes.
-    let each = |request: fn(usize) -> Request| -> Result<Line, String> {
-        let named: Result<Vec<usize>, String> = rest.iter().map(|name| axis(name)).collect();
+    let each = |request: fn(AxisIndex) -> Request| -> Result<Line, String> {
+        let named: Result<Vec<AxisIndex>, String> = rest.iter().map(|name| axis(name)).collect();
         let mut axes = named?;
         if axes.is_empty() {
-            axes = (0..view.axes.len()).collect();
+            axes = view.axes.indices().collect();
         }
         Ok(Line::For(axes.into_iter().map(request).collect()))
     };

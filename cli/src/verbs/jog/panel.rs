@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, HomingStatus, Mode, State};
+use ecaxis_ecat::index::{AxisIndex, IndexVec};
 use ecaxis_master::config::{AxisSetup, TorqueUnit};
 use ecaxis_master::supervise::jog::{Activity, View};
 use serde::Serialize;
@@ -19,7 +20,7 @@ pub(super) struct Panel {
     pub lost_frames: u64,
     pub wkc_errors: u64,
     pub locked: Option<bool>,
-    pub axes: Vec<AxisPanel>,
+    pub axes: IndexVec<AxisIndex, AxisPanel>,
 }
 
 /// One axis; values in user units.
@@ -57,15 +58,13 @@ pub(super) struct Limits {
 impl Panel {
     pub fn new(view: &View<'_>, began: u64) -> Self {
         let snapshot = view.snapshot;
-        let axes = view.axes.iter().enumerate();
-        let axes = axes.filter_map(|(axis, &device)| {
-            let device = view.machine.devices.get(device)?;
+        let axes = view.axes.enumerate();
+        let axes = axes.filter_map(|(axis, &index)| {
+            let device = view.machine.devices.get(index)?;
             let setup = device.axis.as_ref()?;
             let status = snapshot.axes.get(axis)?;
             let doing = view.hands.get(axis).map(|hand| hand.doing);
-            let group = snapshot
-                .groups
-                .get(view.machine.group_of(*view.axes.get(axis)?));
+            let group = snapshot.groups.get(view.machine.group_of(index));
             let stopped = group.is_some_and(|group| group.stopped.is_some());
             let doing = doing.unwrap_or_default();
             Some(AxisPanel::new(&device.name, setup, status, doing, stopped))

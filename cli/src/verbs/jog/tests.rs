@@ -1,5 +1,6 @@
 //! Requests older than the hold-to-run time-out are dropped, except stops.
 
+use ecaxis_ecat::index::AxisIndex;
 use ecaxis_master::supervise::jog::Request;
 
 use super::*;
@@ -35,23 +36,33 @@ fn stale_requests_are_dropped_except_stops() {
     let (axis, speed) = (0, 0.1);
     let wanted = [
         Request::Jog {
-            axis,
+            axis: AxisIndex(axis),
             velocity: 5.0,
         },
         Request::MoveBy {
-            axis,
+            axis: AxisIndex(axis),
             distance: 1.0,
             speed,
         },
-        Request::Home { axis },
-        Request::Enable { axis },
-        Request::Reset { axis },
+        Request::Home {
+            axis: AxisIndex(axis),
+        },
+        Request::Enable {
+            axis: AxisIndex(axis),
+        },
+        Request::Reset {
+            axis: AxisIndex(axis),
+        },
     ];
     let stops = [
-        Request::Stop { axis },
+        Request::Stop {
+            axis: AxisIndex(axis),
+        },
         Request::StopAll,
         Request::EmergencyStop,
-        Request::Disable { axis },
+        Request::Disable {
+            axis: AxisIndex(axis),
+        },
     ];
     for (age, passed) in [(0, true), (200, true), (400, false), (5_000, false)] {
         let (asks, mut hands) = hands();

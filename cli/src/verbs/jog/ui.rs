@@ -1,5 +1,6 @@
 //! Keys → requests. Independent of terminal and clock.
 
+use ecaxis_ecat::index::AxisIndex;
 use ecaxis_master::supervise::jog::{Activity, HOLD_TO_RUN_TIMEOUT, MAX_MANUAL_SPEED, Request};
 
 use super::keys::Key;
@@ -33,7 +34,7 @@ struct HeldKey {
 
 #[derive(Debug)]
 pub(super) struct Ui {
-    pub selected: usize,
+    pub selected: AxisIndex,
     speed: usize,
     /// The power of ten by which the user enlarged the step.
     decades: i32,
@@ -45,7 +46,7 @@ pub(super) struct Ui {
 impl Default for Ui {
     fn default() -> Self {
         Self {
-            selected: 0,
+            selected: AxisIndex(0),
             speed: FIRST_SPEED,
             decades: 0,
             typed: None,
@@ -137,20 +138,19 @@ impl Ui {
             };
         }
         self.held = None;
-        let all = |request: fn(usize) -> Request| {
-            (0..panel.axes.len())
-                .map(|axis| UiAction::For(request(axis)))
-                .collect()
+        let all = |request: fn(AxisIndex) -> Request| {
+            let axes = panel.axes.indices();
+            axes.map(|axis| UiAction::For(request(axis))).collect()
         };
         let enable = |axis| Request::Enable { axis };
         let disable = |axis| Request::Disable { axis };
         let axis_request = match key {
             Key::Up => {
-                self.selected = selected.saturating_sub(1);
+                self.selected = AxisIndex(selected.0.saturating_sub(1));
                 return stop_if_moving(panel);
             }
             Key::Down => {
-                self.selected = (selected + 1) % panel.axes.len().max(1);
+                self.selected = AxisIndex((selected.0 + 1) % panel.axes.len().max(1));
                 return stop_if_moving(panel);
             }
             Key::Char('-') => {
@@ -224,7 +224,7 @@ impl Ui {
 /// Switching to another axis stops the current one, because its motion is no longer in view.
 fn stop_if_moving(panel: &Panel) -> Vec<UiAction> {
     let jogs = |axis: &AxisPanel| matches!(axis.doing, Activity::Jogging { .. });
-    let jogging = panel.axes.iter().enumerate().filter(|(_, axis)| jogs(axis));
+    let jogging = panel.axes.enumerate().filter(|(_, axis)| jogs(axis));
     jogging
         .map(|(axis, _)| UiAction::For(Request::Stop { axis }))
         .collect()

@@ -2,6 +2,7 @@
 
 use super::super::panel::tests::panel;
 use super::*;
+use ecaxis_ecat::index::AxisIndex;
 
 fn request(asks: &[UiAction]) -> Option<Request> {
     match asks {
@@ -22,7 +23,12 @@ fn single_key_press_moves_nothing() {
 #[test]
 fn held_key_jogs_until_released() {
     let (mut ui, panel) = (Ui::default(), panel(2));
-    let jog = |velocity| Some(Request::Jog { axis: 0, velocity });
+    let jog = |velocity| {
+        Some(Request::Jog {
+            axis: AxisIndex(0),
+            velocity,
+        })
+    };
     let mut press = |key, now| request(&ui.key(key, now, Some(&panel)));
     assert_eq!(press(Key::Right, 0), None);
     // The keyboard's initial delay, then it repeats: 5 % of 100.
@@ -92,7 +98,7 @@ fn ui_accepts_typed_positions() {
     };
     let there = |position| {
         [UiAction::For(Request::MoveTo {
-            axis: 0,
+            axis: AxisIndex(0),
             position,
             speed: SPEEDS[FIRST_SPEED],
         })]
@@ -116,15 +122,15 @@ fn commands_address_the_selected_axis() {
     let (mut ui, panel) = (Ui::default(), panel(3));
     ui.key(Key::Down, 0, Some(&panel));
     for (key, expected) in [
-        ('e', Request::Enable { axis: 1 }),
-        ('d', Request::Disable { axis: 1 }),
-        ('h', Request::Home { axis: 1 }),
-        ('r', Request::Reset { axis: 1 }),
+        ('e', Request::Enable { axis: AxisIndex(1) }),
+        ('d', Request::Disable { axis: AxisIndex(1) }),
+        ('h', Request::Home { axis: AxisIndex(1) }),
+        ('r', Request::Reset { axis: AxisIndex(1) }),
         ('x', Request::EmergencyStop),
         (
             '.',
             Request::MoveBy {
-                axis: 1,
+                axis: AxisIndex(1),
                 distance: 1.0,
                 speed: SPEEDS[FIRST_SPEED],
             },
@@ -143,18 +149,18 @@ fn commands_address_the_selected_axis() {
     // The selection wraps at both ends.
     for expected in [2, 0, 1] {
         ui.key(Key::Down, 0, Some(&panel));
-        assert_eq!(ui.selected, expected);
+        assert_eq!(ui.selected, AxisIndex(expected));
     }
     for expected in [0, 0] {
         ui.key(Key::Up, 0, Some(&panel));
-        assert_eq!(ui.selected, expected);
+        assert_eq!(ui.selected, AxisIndex(expected));
     }
 }
 
 #[test]
 fn selecting_another_axis_stops_the_first() {
     let (mut ui, mut panel) = (Ui::default(), panel(2));
-    panel.axes[0].doing = Activity::Jogging { velocity: 1.0 };
+    panel.axes[AxisIndex(0)].doing = Activity::Jogging { velocity: 1.0 };
     let asks = ui.key(Key::Down, 0, Some(&panel));
-    assert_eq!(request(&asks), Some(Request::Stop { axis: 0 }));
+    assert_eq!(request(&asks), Some(Request::Stop { axis: AxisIndex(0) }));
 }

@@ -1,6 +1,7 @@
 //! Steps that change how an axis handles targets: homing, modes of operation.
 
 use ecaxis_axis::Mode;
+use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_esi as esi;
 use toml::Spanned;
 
@@ -11,13 +12,13 @@ use crate::config::raw::RawAxes;
 
 impl ProgramChecker<'_> {
     pub(super) fn home(&self, names: RawAxes, at: &Span, p: &mut Problems<'_>) -> Option<Action> {
-        let homes = |index: &usize| {
+        let homes = |index: &DeviceIndex| {
             let axis = self.devices[*index].axis.ok();
             axis.is_some_and(|axis| axis.homing.is_some())
         };
         let Some(named) = &names else {
             let all = self.axes(None, p)?;
-            let axes: Vec<usize> = all.into_iter().filter(homes).collect();
+            let axes: Vec<_> = all.into_iter().filter(homes).collect();
             if axes.is_empty() {
                 let hint = "add `homing = { method = 37 }` to a [device.axis]";
                 p.add_hint(at.clone(), "no axis says how it finds home", hint);
@@ -27,7 +28,7 @@ impl ProgramChecker<'_> {
         };
         let mut ok = true;
         for name in named {
-            if let Some(index) = self.devices.iter().position(|d| d.name == name.get_ref())
+            if let Some(index) = self.device(name)
                 && self.devices[index].axis.is_ok()
                 && !homes(&index)
             {
@@ -46,7 +47,7 @@ impl ProgramChecker<'_> {
         name: &Spanned<String>,
         mode: &Spanned<String>,
         p: &mut Problems<'_>,
-    ) -> Option<(usize, Mode)> {
+    ) -> Option<(DeviceIndex, Mode)> {
         let (index, axis) = self.axis(name, p)?;
         let offered: Vec<esi::Mode> = esi::Mode::ALL
             .into_iter()

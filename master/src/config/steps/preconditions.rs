@@ -5,6 +5,7 @@
 //! after all steps before it.
 
 use ecaxis_axis::Mode;
+use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 
 use super::ProgramChecker;
 use super::target::TargetKind;
@@ -59,7 +60,7 @@ struct Precondition {
 
 struct ProgramState<'w, 'c, 'p, 's> {
     checker: &'w ProgramChecker<'c>,
-    axes: Vec<Option<State>>,
+    axes: IndexVec<DeviceIndex, Option<State>>,
     visits: u32,
     /// `true` if a step is being repeated.
     again: bool,
@@ -236,7 +237,7 @@ impl ProgramState<'_, '_, '_, '_> {
         }
     }
 
-    fn switch(&mut self, step: &Step, axis: usize, mode: Mode) {
+    fn switch(&mut self, step: &Step, axis: DeviceIndex, mode: Mode) {
         let powered = self.state(axis).is_some_and(|s| s.power);
         if powered {
             let need = Precondition {
@@ -266,7 +267,7 @@ impl ProgramState<'_, '_, '_, '_> {
         what: TargetKind,
         rest: bool,
         relative: bool,
-        targets: &[(usize, f64)],
+        targets: &[(DeviceIndex, f64)],
     ) {
         for &(axis, target) in targets {
             self.need(
@@ -309,7 +310,7 @@ impl ProgramState<'_, '_, '_, '_> {
     }
 
     /// Handles a step that sets every set-point of an axis. `back`: it ends where it began.
-    fn follow_setpoints(&mut self, step: &Step, verb: &'static str, axis: usize, back: bool) {
+    fn follow_setpoints(&mut self, step: &Step, verb: &'static str, axis: DeviceIndex, back: bool) {
         self.need(step, axis, Precondition::of(verb, TargetKind::SetPoint));
         self.each(&[axis], |state| {
             let position = state.position.filter(|_| back);
@@ -318,7 +319,7 @@ impl ProgramState<'_, '_, '_, '_> {
         });
     }
 
-    fn each(&mut self, axes: &[usize], change: impl Fn(&mut State)) {
+    fn each(&mut self, axes: &[DeviceIndex], change: impl Fn(&mut State)) {
         for &axis in axes {
             if let Some(Some(state)) = self.axes.get_mut(axis) {
                 change(state);
@@ -326,19 +327,19 @@ impl ProgramState<'_, '_, '_, '_> {
         }
     }
 
-    fn state(&self, axis: usize) -> Option<&State> {
+    fn state(&self, axis: DeviceIndex) -> Option<&State> {
         self.axes.get(axis)?.as_ref()
     }
 
-    fn axis(&self, axis: usize) -> Option<&AxisSetup> {
+    fn axis(&self, axis: DeviceIndex) -> Option<&AxisSetup> {
         self.checker.devices.get(axis)?.axis.ok()
     }
 
-    fn limits(&self, axis: usize) -> Option<[f64; 2]> {
+    fn limits(&self, axis: DeviceIndex) -> Option<[f64; 2]> {
         self.axis(axis)?.config.limits.position
     }
 
-    fn name(&self, axis: usize) -> &str {
+    fn name(&self, axis: DeviceIndex) -> &str {
         self.checker.devices.get(axis).map_or("", |d| d.name)
     }
 
@@ -351,7 +352,7 @@ impl ProgramState<'_, '_, '_, '_> {
     }
 
     /// Rejects the step if the axis cannot run it.
-    fn need(&mut self, step: &Step, axis: usize, need: Precondition) {
+    fn need(&mut self, step: &Step, axis: DeviceIndex, need: Precondition) {
         let (Some(state), Some(setup)) = (self.state(axis), self.axis(axis)) else {
             return;
         };
@@ -398,7 +399,7 @@ impl ProgramState<'_, '_, '_, '_> {
         self.refuse(step, axis, message, hint);
     }
 
-    fn refuse(&mut self, step: &Step, axis: usize, message: String, hint: String) {
+    fn refuse(&mut self, step: &Step, axis: DeviceIndex, message: String, hint: String) {
         let Some(Some(state)) = self.axes.get_mut(axis) else {
             return;
         };
@@ -431,7 +432,7 @@ impl State {
 
 impl ProgramChecker<'_> {
     /// Returns the place of the axis's name in a step, otherwise of the step.
-    fn place(&self, number: &str, axis: usize) -> Span {
+    fn place(&self, number: &str, axis: DeviceIndex) -> Span {
         let places = self.places.borrow();
         let of = |axis| places.get(&(number.to_owned(), axis)).cloned();
         of(Some(axis)).or_else(|| of(None)).unwrap_or_default()

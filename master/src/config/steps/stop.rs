@@ -1,5 +1,6 @@
 //! `[stop]`: how the machine stops, and which axes stop together.
 
+use ecaxis_ecat::index::DeviceIndex;
 use toml::Spanned;
 
 use super::ProgramChecker;
@@ -80,7 +81,7 @@ impl ProgramChecker<'_> {
             }
         }
         for name in raw.devices.iter().flat_map(|names| &names.0) {
-            let Some(device) = self.devices.iter().position(|d| d.name == name.get_ref()) else {
+            let Some(device) = self.device(name) else {
                 let hint = suggestion(
                     name.get_ref(),
                     self.devices.iter().map(|d| d.name),
@@ -108,7 +109,7 @@ impl ProgramChecker<'_> {
         &self,
         group: &mut StopGroup,
         name: &Spanned<String>,
-        device: usize,
+        device: DeviceIndex,
         groups: &[StopGroup],
         p: &mut Problems<'_>,
     ) {

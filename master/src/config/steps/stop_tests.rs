@@ -1,5 +1,6 @@
 use crate::config::tests::{GOOD, with_esi};
 use ecaxis_axis::StopMethod;
+use ecaxis_ecat::index::DeviceIndex;
 
 use crate::config::{ConfigError, GroupStopScope, StopGroup};
 
@@ -7,11 +8,17 @@ use crate::config::{ConfigError, GroupStopScope, StopGroup};
 fn stop_groups_are_parsed_with_their_defaults() {
     let machine = with_esi(GOOD).unwrap();
     assert!(machine.stop.groups.is_empty());
-    assert_eq!([0, 1].map(|device| machine.group_of(device)), [0, 0]);
+    assert_eq!(
+        [0, 1].map(|device| machine.group_of(DeviceIndex(device)).0),
+        [0, 0]
+    );
     let two = "\n[stop]\nothers = \"no-power\"\n[[stop.group]]\nname = \"g\"\naxes = [\"v\"]\noutside = \"continue\"\n\
         [[stop.group]]\nname = \"h\"\naxes = [\"x\"]\nothers = \"quick-stop\"\n";
     let machine = with_esi(&format!("{GOOD}{two}")).unwrap();
-    assert_eq!([0, 1].map(|device| machine.group_of(device)), [2, 1]);
+    assert_eq!(
+        [0, 1].map(|device| machine.group_of(DeviceIndex(device)).0),
+        [2, 1]
+    );
     let group = |name: &str, device, others, outside| StopGroup {
         name: name.to_owned(),
         devices: vec![device],
@@ -21,8 +28,18 @@ fn stop_groups_are_parsed_with_their_defaults() {
     assert_eq!(
         machine.stop.groups,
         [
-            group("g", 1, StopMethod::DisableVoltage, GroupStopScope::Continue),
-            group("h", 0, StopMethod::QuickStop, GroupStopScope::Stop),
+            group(
+                "g",
+                DeviceIndex(1),
+                StopMethod::DisableVoltage,
+                GroupStopScope::Continue
+            ),
+            group(
+                "h",
+                DeviceIndex(0),
+                StopMethod::QuickStop,
+                GroupStopScope::Stop
+            ),
         ]
     );
 }

@@ -1,5 +1,6 @@
 //! Checks that targets are within limits and possible in one of the axis's modes.
 
+use ecaxis_ecat::index::DeviceIndex;
 use toml::Spanned;
 
 use super::ProgramChecker;
@@ -16,7 +17,7 @@ impl ProgramChecker<'_> {
         targets: Named<f64>,
         what: TargetKind,
         p: &mut Problems<'_>,
-    ) -> Option<Vec<(usize, f64)>> {
+    ) -> Option<Vec<(DeviceIndex, f64)>> {
         let count = targets.len();
         let mut resolved = Vec::with_capacity(count);
         for (name, value) in targets {
@@ -46,7 +47,7 @@ impl ProgramChecker<'_> {
     /// Reports an axis that would take more than one hour to reach its velocity.
     pub(super) fn check_ramp_time(
         &self,
-        targets: &[(usize, f64)],
+        targets: &[(DeviceIndex, f64)],
         ramp: f64,
         at: Option<Span>,
         p: &mut Problems<'_>,

@@ -11,6 +11,7 @@
 use std::fmt;
 use std::sync::Arc;
 
+use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use tokio::sync::{mpsc, oneshot};
 
 use super::{Emergencies, SdoError};
@@ -55,7 +56,7 @@ pub enum MailboxError {
 /// The mailboxes of all devices of a machine, by name. Cheap to clone.
 #[derive(Clone, Default)]
 pub struct Mailboxes {
-    devices: Arc<[WorkerHandle]>,
+    devices: Arc<IndexVec<DeviceIndex, WorkerHandle>>,
 }
 
 /// Shows only the names: the rest differs from run to run.
@@ -110,8 +111,8 @@ impl Mailboxes {
         })
     }
 
-    /// Returns the urgent mailbox of the n-th device: its requests precede all others.
-    pub(crate) fn urgent(&self, device: usize) -> Option<DeviceMailbox> {
+    /// Returns the urgent mailbox of a device: its requests precede all others.
+    pub(crate) fn urgent(&self, device: DeviceIndex) -> Option<DeviceMailbox> {
         let device = self.devices.get(device)?;
         Some(DeviceMailbox {
             name: Arc::clone(&device.name),
@@ -239,6 +240,6 @@ pub fn open<W>(
         });
         counters.push(WorkerHandle { name, queues });
     }
-    let devices = counters.into();
+    let devices = Arc::new(counters.into());
     (Mailboxes { devices }, workers)
 }

@@ -1,6 +1,7 @@
 //! Steps every axis once per cycle, from its inputs to its outputs.
 
 use ecaxis_axis::StopPhase;
+use ecaxis_ecat::index::AxisIndex;
 
 use super::{Engine, Nanos};
 use crate::rt::bus_monitor::StopCause;
@@ -31,7 +32,7 @@ impl Engine {
         // Gears form no loops, so every pass steps at least one axis.
         for _ in 0..self.axes.len() {
             let mut waiting = false;
-            for index in 0..self.axes.len() {
+            for index in self.axes.indices() {
                 let Some(slot) = self.axes.get(index) else {
                     continue;
                 };
@@ -49,7 +50,7 @@ impl Engine {
                 break;
             }
         }
-        for group in 0..self.groups.len() {
+        for group in self.groups.indices() {
             if let Some(cause) = self.groups.get_mut(group).and_then(|g| g.found.take()) {
                 // If an axis cannot be stopped, the machine must not continue without its group.
                 let own = !matches!(cause, StopCause::Powered { .. });
@@ -59,7 +60,7 @@ impl Engine {
     }
 
     /// Steps one axis. A cause that must stop its group is stored in the group.
-    fn step_axis(&mut self, index: usize) {
+    fn step_axis(&mut self, index: AxisIndex) {
         let dt_s = self.config.cycle_ns as f64 * 1e-9;
         let master = self.axes.get(index).and_then(|slot| {
             let (master, actual) = slot.feed.master()?;

@@ -1,6 +1,7 @@
 //! Commands to the cycle, and stops.
 
 use ecaxis_axis::{Command, CommandError, StopMethod};
+use ecaxis_ecat::index::{AxisIndex, GroupIndex};
 
 use super::Engine;
 use crate::rt::axis::RtAxis;
@@ -85,7 +86,7 @@ impl Engine {
     /// Stops `own`, or all groups if `own` is `None`. A cause of one group stops that group by its
     /// configured method. The rest of the machine stops within the limits of its axes, unless it
     /// may continue.
-    pub(super) fn stop(&mut self, own: Option<usize>, cause: StopCause) {
+    pub(super) fn stop(&mut self, own: Option<GroupIndex>, cause: StopCause) {
         let goes_on = own
             .and_then(|own| self.groups.get(own))
             .is_some_and(ReactionGroup::continues_without);
@@ -102,7 +103,7 @@ impl Engine {
         if let Some(own) = own.filter(|_| goes_on) {
             self.abort_lines(own);
         }
-        for group in 0..self.groups.len() {
+        for group in self.groups.indices() {
             if own.is_none_or(|own| own == group) {
                 let first = self.stop_group(group, cause, None);
                 if first && goes_on && !machine_stops {
@@ -128,12 +129,12 @@ impl Engine {
 
     /// Ends the lines that share an axis with a stopped group: the other axes can no longer follow
     /// them.
-    fn abort_lines(&mut self, own: usize) {
+    fn abort_lines(&mut self, own: GroupIndex) {
         let mut slots = self.axes.iter();
         if !slots.any(|slot| slot.group == own && slot.feed.on_line()) {
             return;
         }
-        for (axis, slot) in self.axes.iter_mut().enumerate() {
+        for (axis, slot) in self.axes.enumerate_mut() {
             if slot.group == own || !slot.feed.on_line() {
                 continue;
             }
@@ -146,7 +147,12 @@ impl Engine {
 
     /// Stops a group by `method`, or as the cause demands. An axis that is already stopping never
     /// stops more gently. Returns true if the group was not stopping before.
-    fn stop_group(&mut self, index: usize, cause: StopCause, method: Option<StopMethod>) -> bool {
+    fn stop_group(
+        &mut self,
+        index: GroupIndex,
+        cause: StopCause,
+        method: Option<StopMethod>,
+    ) -> bool {
         let Some(group) = self.groups.get_mut(index) else {
             return false;
         };
@@ -202,7 +208,7 @@ impl Engine {
         if self.stopping().is_some() {
             return;
         }
-        for index in 0..self.groups.len() {
+        for index in self.groups.indices() {
             let there = self
                 .exchange
                 .group_results()
@@ -231,7 +237,7 @@ impl Engine {
         }
     }
 
-    fn start_generator(&mut self, axis: usize, start: GeneratorRequest) {
+    fn start_generator(&mut self, axis: AxisIndex, start: GeneratorRequest) {
         if self.stopping().is_some() {
             return;
         }
@@ -256,7 +262,7 @@ impl Engine {
     }
 
     /// True if an axis follows `leader`, directly or through other gears.
-    fn follows(&self, axis: usize, leader: usize) -> bool {
+    fn follows(&self, axis: AxisIndex, leader: AxisIndex) -> bool {
         let mut at = Some(axis);
         for _ in 0..=self.axes.len() {
             match at {

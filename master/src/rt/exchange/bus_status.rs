@@ -3,6 +3,8 @@
 
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 
+use ecaxis_ecat::index::{DeviceIndex, IndexVec};
+
 use crate::clock::Nanos;
 
 /// Bit 3 of a SyncManager's status.
@@ -23,7 +25,7 @@ pub struct MailboxStatus {
 pub struct BusStatus {
     /// For each member: the time of the last status, shifted left by one; bit 0: the mailbox was
     /// full. 0: never seen.
-    mailboxes: Box<[AtomicU64]>,
+    mailboxes: IndexVec<DeviceIndex, AtomicU64>,
     /// System time minus session clock.
     clock: AtomicI64,
 }
@@ -43,7 +45,7 @@ impl BusStatus {
     }
 
     /// Stores the status register of a mailbox, read by a frame sent at `at`. RT: O(1).
-    pub(super) fn store_mailbox_status(&self, member: usize, at: Nanos, status: u8) {
+    pub(super) fn store_mailbox_status(&self, member: DeviceIndex, at: Nanos, status: u8) {
         if status == Self::UNSEEN {
             return;
         }
@@ -61,7 +63,7 @@ impl BusStatus {
 
     /// Returns the last status of a member's mailbox.
     #[must_use]
-    pub fn mailbox(&self, member: usize) -> Option<MailboxStatus> {
+    pub fn mailbox(&self, member: DeviceIndex) -> Option<MailboxStatus> {
         let seen = self.mailboxes.get(member)?.load(Ordering::Relaxed);
         (seen != 0).then_some(MailboxStatus {
             at: seen >> 1,
@@ -85,20 +87,27 @@ mod tests {
     #[test]
     fn unprocessed_mailbox_status_is_ignored() {
         let bus_status = BusStatus::new(2);
-        assert_eq!(bus_status.mailbox(0), None);
-        bus_status.store_mailbox_status(0, 5_000, 0x48);
-        bus_status.store_mailbox_status(0, 6_000, BusStatus::UNSEEN);
-        bus_status.store_mailbox_status(7, 6_000, 0x08);
+        assert_eq!(bus_status.mailbox(DeviceIndex(0)), None);
+        bus_status.store_mailbox_status(DeviceIndex(0), 5_000, 0x48);
+        bus_status.store_mailbox_status(DeviceIndex(0), 6_000, BusStatus::UNSEEN);
+        bus_status.store_mailbox_status(DeviceIndex(7), 6_000, 0x08);
         let full = MailboxStatus {
             at: 5_000,
             full: true,
         };
         assert_eq!(
-            (bus_status.mailbox(0), bus_status.mailbox(1)),
+            (
+                bus_status.mailbox(DeviceIndex(0)),
+                bus_status.mailbox(DeviceIndex(1))
+            ),
             (Some(full), None)
         );
-        bus_status.store_mailbox_status(0, 7_000, 0x40);
-        assert!(bus_status.mailbox(0).is_some_and(|seen| !seen.full));
+        bus_status.store_mailbox_status(DeviceIndex(0), 7_000, 0x40);
+        assert!(
+            bus_status
+                .mailbox(DeviceIndex(0))
+                .is_some_and(|seen| !seen.full)
+        );
     }
 
     #[test]

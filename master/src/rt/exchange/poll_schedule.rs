@@ -6,6 +6,7 @@ use super::diagnostics::DiagnosticRegister;
 use super::frame::{DATAGRAM_HEADER, WKC};
 use crate::rt::image::MailboxPlan;
 use ecaxis_ecat::datagram::Command;
+use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_ecat::registers;
 
 /// Data bytes of the longest read.
@@ -18,7 +19,7 @@ pub const MAX_POLL_DATAGRAM: usize = DATAGRAM_HEADER + MAX_POLL_DATA + WKC;
 pub(super) enum PollTarget {
     /// A register block of one member.
     Registers {
-        device: usize,
+        device: DeviceIndex,
         block: DiagnosticRegister,
     },
     /// The status of mailboxes, a byte each, starting at this index of
@@ -41,7 +42,7 @@ pub(super) struct PollSchedule {
     diagnosis: Box<[PollDatagram]>,
     mailboxes: Box<[PollDatagram]>,
     /// The devices whose status the mailbox reads contain, in order.
-    pub mailbox_devices: Box<[usize]>,
+    pub mailbox_devices: Box<[DeviceIndex]>,
     /// The next diagnosis read and the next mailbox read.
     next: (usize, usize),
     mailbox_is_next: bool,
@@ -56,9 +57,9 @@ impl PollSchedule {
             |station: u16, register: u16| u32::from(register) << 16 | u32::from(station);
         let diagnosis = DiagnosticRegister::ALL.iter().flat_map(|&block| {
             let (register, len) = block.register_and_len();
-            members
-                .iter()
-                .enumerate()
+            (0..)
+                .map(DeviceIndex)
+                .zip(members)
                 .map(move |(device, member)| PollDatagram {
                     target: PollTarget::Registers { device, block },
                     command: Command::FPRD,
@@ -81,7 +82,7 @@ impl PollSchedule {
                 len,
             })
             .collect();
-        for (device, member) in members.iter().enumerate() {
+        for (device, member) in (0..).map(DeviceIndex).zip(members) {
             if let Some(sm) = member.mailbox
                 && !mapped.is_some_and(|plan| plan.devices.contains(&device))
             {
@@ -154,7 +155,7 @@ mod tests {
             match poll.target {
                 PollTarget::Registers { device, block } => {
                     assert_eq!(n % 2, 0);
-                    assert_eq!(poll.address & 0xffff, 1001 + device as u32);
+                    assert_eq!(poll.address & 0xffff, 1001 + device.0 as u32);
                     blocks.push((block, device));
                 }
                 PollTarget::Mailboxes { first } => {
@@ -162,11 +163,11 @@ mod tests {
                 }
             }
         }
-        let first = (0, 0x080d_03e9, 1);
-        let second = (2, 0x081d_03eb, 1);
+        let first = (DeviceIndex(0), 0x080d_03e9, 1);
+        let second = (DeviceIndex(2), 0x081d_03eb, 1);
         assert_eq!(mailboxes[..4], [first, second, first, second]);
         assert_eq!(
-            blocks[..4].iter().map(|p| p.1).collect::<Vec<_>>(),
+            blocks[..4].iter().map(|p| p.1.0).collect::<Vec<_>>(),
             [0, 1, 2, 0]
         );
         // The schedule has visited all members and starts again.
@@ -181,7 +182,7 @@ mod tests {
         let members = members(&[Some(1); 12]);
         let plan = MailboxPlan {
             logical: 0x0001_0100,
-            devices: (0..12).filter(|n| *n != 4).collect(),
+            devices: (0..12).filter(|n| *n != 4).map(DeviceIndex).collect(),
         };
         let mut schedule = PollSchedule::new(&members, Some(&plan));
         let polls = std::iter::from_fn(|| schedule.next())
@@ -203,7 +204,7 @@ mod tests {
             (0, Command::LRD, 0x0001_0100, 8),
         ];
         assert_eq!(mailboxes, expected);
-        assert_eq!(schedule.mailbox_devices[11], 4);
+        assert_eq!(schedule.mailbox_devices[11], DeviceIndex(4));
     }
 
     #[test]

@@ -6,13 +6,14 @@ use super::frame::{DatagramSlot, Frame, push};
 use super::poll_schedule::MAX_POLL_DATAGRAM;
 use crate::link::MAX_FRAME;
 use ecaxis_ecat::datagram::Command;
+use ecaxis_ecat::index::{DeviceIndex, GroupIndex};
 use ecaxis_ecat::registers;
 
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ProcessDatagram {
     pub(super) slot: DatagramSlot,
     pub(super) access: Access,
-    pub(super) group: usize,
+    pub(super) group: GroupIndex,
     /// Offset in the image.
     pub(super) image: usize,
     pub(super) expected_wkc: u16,
@@ -37,14 +38,14 @@ impl DatagramSlots {
         frames: &mut [Frame],
         plan: &ImagePlan,
         datagrams: &[DatagramPlan],
-        order: &[usize],
+        order: &[DeviceIndex],
         clock: Option<&ClockPlan>,
     ) -> Self {
         let clock = clock.map(|clock| {
             let address = u32::from(registers::DC_SYSTEM_TIME) << 16 | u32::from(clock.reference);
             push(&mut frames[0], 0, Command::FRMW, address, 8)
         });
-        let offset = |device: &usize| plan.regions[*device].map_or(0, |region| region.offset);
+        let offset = |device: &DeviceIndex| plan.regions[*device].map_or(0, |region| region.offset);
         let process_data = datagrams.iter().map(|datagram| {
             let first = order.partition_point(|device| offset(device) < datagram.offset);
             let behind = datagram.offset + datagram.len;

@@ -1,5 +1,7 @@
 //! The layout of the process image: the logical address, datagram and frame of each SubDevice.
 
+use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
+
 use crate::rt::config::RtConfig;
 
 /// First logical address of the process image.
@@ -19,7 +21,7 @@ pub struct ProcessData {
     pub out_len: usize,
     pub in_len: usize,
     /// The group to whose working counters it contributes.
-    pub group: usize,
+    pub group: GroupIndex,
     /// True if it supports LRW; otherwise it is accessed by its own LWR and LRD.
     pub lrw: bool,
     /// True if it has an FMMU for the status of its mailbox.
@@ -56,7 +58,7 @@ pub struct DatagramPlan {
     /// The frame of the cycle that carries it.
     pub frame: usize,
     /// The group whose SubDevices it addresses, and no others.
-    pub group: usize,
+    pub group: GroupIndex,
     pub access: Access,
     pub logical: u32,
     /// Offset of its data in the image.
@@ -73,14 +75,14 @@ pub struct DatagramPlan {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MailboxPlan {
     pub logical: u32,
-    /// The device indices, in the order of their bytes.
-    pub devices: Vec<usize>,
+    /// The devices in the order of their bytes.
+    pub devices: Vec<DeviceIndex>,
 }
 
 impl MailboxPlan {
     /// Returns the logical address of a device's status.
     #[must_use]
-    pub fn logical_of(&self, device: usize) -> Option<u32> {
+    pub fn logical_of(&self, device: DeviceIndex) -> Option<u32> {
         let place = self.devices.iter().position(|&other| other == device)?;
         Some(self.address(place))
     }
@@ -96,10 +98,10 @@ impl MailboxPlan {
 /// The whole image.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ImagePlan {
-    /// In the order of the given devices; `None` if a device has no process data.
-    pub regions: Vec<Option<DeviceRegion>>,
+    /// `None` if a device has no process data.
+    pub regions: IndexVec<DeviceIndex, Option<DeviceRegion>>,
     /// The group of each device.
-    pub groups: Vec<usize>,
+    pub groups: IndexVec<DeviceIndex, GroupIndex>,
     pub datagrams: Vec<DatagramPlan>,
     /// The same image with separate datagrams for each device, so that each has its own working
     /// counter. Empty if the cycle is too short for their frames.
@@ -113,8 +115,7 @@ pub struct ImagePlan {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("{len} bytes of process data do not fit into one frame of {}", NEXT_FRAME - DATAGRAM)]
 pub struct TooLarge {
-    /// Index of the device.
-    pub device: usize,
+    pub device: DeviceIndex,
     pub len: usize,
 }
 
@@ -173,11 +174,12 @@ pub fn plan(devices: &[ProcessData]) -> Result<ImagePlan, TooLarge> {
 )]
 fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge> {
     let mut image = ImagePlan {
-        regions: vec![None; devices.len()],
+        regions: vec![None; devices.len()].into(),
         groups: devices.iter().map(|device| device.group).collect(),
         ..ImagePlan::default()
     };
-    let mut order: Vec<(usize, &ProcessData)> = devices.iter().enumerate().collect();
+    let indices = (0..).map(DeviceIndex);
+    let mut order: Vec<_> = indices.zip(devices).collect();
     order.sort_by_key(|(_, device)| device.group);
     let mut frames = FramePacker {
         last: 0,
@@ -244,8 +246,11 @@ fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge>
         });
         image.len += len;
     }
-    let watched = devices.iter().enumerate().filter(|(_, d)| d.mailbox);
-    let watched: Vec<usize> = watched.map(|(index, _)| index).collect();
+    let watched = (0..)
+        .map(DeviceIndex)
+        .zip(devices)
+        .filter(|(_, d)| d.mailbox);
+    let watched: Vec<_> = watched.map(|(index, _)| index).collect();
     if !watched.is_empty() {
         image.mailboxes = Some(MailboxPlan {
             logical: LOGICAL_BASE.saturating_add(u32::try_from(image.len).unwrap_or(u32::MAX)),
@@ -282,7 +287,7 @@ mod tests {
         let each = sizes.iter().map(|&(out_len, in_len)| ProcessData {
             out_len,
             in_len,
-            group: 0,
+            group: GroupIndex(0),
             lrw: true,
             mailbox: false,
         });
@@ -291,7 +296,7 @@ mod tests {
 
     fn grouped(mut devices: Vec<ProcessData>, groups: &[usize]) -> Vec<ProcessData> {
         for (device, &group) in devices.iter_mut().zip(groups) {
-            device.group = group;
+            device.group = GroupIndex(group);
         }
         devices
     }
@@ -303,7 +308,7 @@ mod tests {
             image.datagrams,
             [DatagramPlan {
                 frame: 0,
-                group: 0,
+                group: GroupIndex(0),
                 access: Access::Both,
                 logical: LOGICAL_BASE,
                 offset: 0,
@@ -311,9 +316,12 @@ mod tests {
                 expected_wkc: 3 + 1 + 2,
             }]
         );
-        assert_eq!(image.regions[1].map(|r| r.offset), Some(14));
-        assert_eq!(image.regions[2].map(|r| r.logical), Some(LOGICAL_BASE + 15));
-        assert_eq!(image.regions[3], None);
+        assert_eq!(image.regions[DeviceIndex(1)].map(|r| r.offset), Some(14));
+        assert_eq!(
+            image.regions[DeviceIndex(2)].map(|r| r.logical),
+            Some(LOGICAL_BASE + 15)
+        );
+        assert_eq!(image.regions[DeviceIndex(3)], None);
     }
 
     #[test]
@@ -325,7 +333,7 @@ mod tests {
         assert_eq!(
             plan(&lrw(&[(1500, 0)])),
             Err(TooLarge {
-                device: 0,
+                device: DeviceIndex(0),
                 len: 1500
             })
         );
@@ -338,7 +346,7 @@ mod tests {
         let datagrams: Vec<_> = image
             .datagrams
             .iter()
-            .map(|d| (d.frame, d.group, d.offset, d.len, d.expected_wkc))
+            .map(|d| (d.frame, d.group.0, d.offset, d.len, d.expected_wkc))
             .collect();
         assert_eq!(
             datagrams,
@@ -346,7 +354,7 @@ mod tests {
         );
         let offsets: Vec<_> = image.regions.iter().map(|r| r.map(|r| r.offset)).collect();
         assert_eq!(offsets, [Some(1), Some(0), Some(27), None, Some(14)]);
-        assert_eq!(image.groups, [1, 0, 2, 1, 1]);
+        assert_eq!(*image.groups, [1, 0, 2, 1, 1].map(GroupIndex));
     }
 
     #[test]
@@ -390,7 +398,7 @@ mod tests {
         ) {
             let devices: Vec<ProcessData> = devices
                 .into_iter()
-                .map(|(out_len, in_len, group, lrw, mailbox)| ProcessData { out_len, in_len, group, lrw, mailbox })
+                .map(|(out_len, in_len, group, lrw, mailbox)| ProcessData { out_len, in_len, group: GroupIndex(group), lrw, mailbox })
                 .collect();
             let image = plan(&devices).expect("none is too large");
             for frame in 0..image.frames() {
@@ -403,13 +411,13 @@ mod tests {
                 prop_assert_eq!(datagram.logical, LOGICAL_BASE + datagram.offset as u32);
                 prop_assert!(datagram.offset + datagram.len <= image.len);
             }
-            let watched: Vec<usize> = (0..devices.len()).filter(|&d| devices[d].mailbox).collect();
+            let watched: Vec<_> = (0..devices.len()).filter(|&d| devices[d].mailbox).map(DeviceIndex).collect();
             prop_assert_eq!(image.mailboxes.as_ref().map_or(&[][..], |m| &m.devices), &watched[..]);
             for (place, &device) in watched.iter().enumerate() {
                 let logical = image.mailboxes.as_ref().and_then(|m| m.logical_of(device));
                 prop_assert_eq!(logical, Some(LOGICAL_BASE + (image.len + place) as u32));
             }
-            let carried = |access: Access, group: usize, from: usize, to: usize| {
+            let carried = |access: Access, group: GroupIndex, from: usize, to: usize| {
                 let carries = image.datagrams.iter().filter(|d| {
                     (d.access == access || d.access == Access::Both)
                         && d.group == group && d.offset <= from && to <= d.offset + d.len

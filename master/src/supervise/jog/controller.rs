@@ -4,6 +4,7 @@ use std::fmt;
 
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Command, CommandError, HomingStatus, Mode};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 
 use super::{HOLD_TO_RUN_TIMEOUT, JogEvent, MAX_MANUAL_SPEED, Pending, Presence, RAMP, Request};
 use crate::clock::Nanos;
@@ -76,7 +77,7 @@ pub struct JogAxis {
 /// The state of all axes in manual mode.
 #[derive(Debug)]
 pub(super) struct JogController {
-    pub hands: Vec<JogAxis>,
+    pub hands: IndexVec<AxisIndex, JogAxis>,
     pub news: Pending,
     /// The maximum time in ns to wait for a drive.
     timeout: Nanos,
@@ -87,47 +88,47 @@ pub(super) struct JogController {
 pub(super) struct JogContext<'s> {
     pub now: Nanos,
     pub machine: &'s Machine,
-    /// Indices into the machine's devices, as in [`super::View`].
-    pub axes: &'s [usize],
+    /// The device of each axis.
+    pub axes: &'s IndexVec<AxisIndex, DeviceIndex>,
     pub snapshot: &'s Snapshot,
 }
 
 impl JogContext<'_> {
-    fn setup(&self, axis: usize) -> Option<&AxisSetup> {
+    fn setup(&self, axis: AxisIndex) -> Option<&AxisSetup> {
         let device = self.machine.devices.get(*self.axes.get(axis)?)?;
         device.axis.as_ref()
     }
 
-    fn group(&self, axis: usize) -> usize {
+    fn group(&self, axis: AxisIndex) -> GroupIndex {
         let device = self.axes.get(axis);
-        device.map_or(0, |&device| self.machine.group_of(device))
+        device.map_or(GroupIndex::MACHINE, |&device| self.machine.group_of(device))
     }
 
-    fn enabled(&self, axis: usize) -> bool {
+    fn enabled(&self, axis: AxisIndex) -> bool {
         let status = self.snapshot.axes.get(axis);
         status.is_some_and(|status| status.enabled)
     }
 
     /// Returns `true` while the set-point moves. At constant velocity the set-point has arrived but
     /// still moves.
-    fn moving(&self, axis: usize) -> bool {
+    fn moving(&self, axis: AxisIndex) -> bool {
         let status = self.snapshot.axes.get(axis);
         status.is_some_and(|s| s.enabled && (s.moving || s.target_velocity != 0.0))
     }
 
-    fn stopped(&self, axis: usize) -> bool {
+    fn stopped(&self, axis: AxisIndex) -> bool {
         let group = self.snapshot.groups.get(self.group(axis));
         group.is_some_and(|group| group.stopped.is_some())
     }
 }
 
 /// Commands with the indices of their axes.
-pub(super) type Commands = Vec<(usize, Command)>;
+pub(super) type Commands = Vec<(AxisIndex, Command)>;
 
 impl JogController {
     pub fn new(axes: usize, timeout: Nanos) -> Self {
         Self {
-            hands: vec![JogAxis::default(); axes],
+            hands: vec![JogAxis::default(); axes].into(),
             news: Pending::new(),
             timeout,
         }
@@ -137,7 +138,7 @@ impl JogController {
     /// instead.
     pub fn refused(
         &mut self,
-        axis: usize,
+        axis: AxisIndex,
         reason: CommandError,
         scene: &JogContext<'_>,
         out: &mut Commands,
@@ -159,7 +160,7 @@ impl JogController {
 
     /// Reports finished activities. The snapshot must already show the effect of all commands.
     pub fn look(&mut self, scene: &JogContext<'_>, out: &mut Commands) {
-        for (axis, hand) in self.hands.iter_mut().enumerate() {
+        for (axis, hand) in self.hands.enumerate_mut() {
             let Some(status) = scene.snapshot.axes.get(axis) else {
                 continue;
             };
@@ -182,7 +183,7 @@ impl JogController {
 
     /// Stops motion without an operator or a repeated jog request. Must be called before `take`.
     pub fn watch(&mut self, scene: &JogContext<'_>, presence: Presence, out: &mut Commands) {
-        for (axis, hand) in self.hands.iter_mut().enumerate() {
+        for (axis, hand) in self.hands.enumerate_mut() {
             let late = scene.now.saturating_sub(hand.since) >= HOLD_TO_RUN_TIMEOUT;
             let moving = scene.moving(axis);
             match hand.doing {
@@ -211,7 +212,7 @@ impl JogController {
 
     /// Stops everything that moves.
     pub fn brake(&mut self, scene: &JogContext<'_>, out: &mut Commands) {
-        for (axis, hand) in self.hands.iter_mut().enumerate() {
+        for (axis, hand) in self.hands.enumerate_mut() {
             if hand.doing.moves() {
                 hand.stop(axis, scene.now, out);
             }
@@ -222,14 +223,14 @@ impl JogController {
     pub fn take(&mut self, request: Request, scene: &JogContext<'_>, out: &mut Commands) {
         match request {
             Request::StopAll => {
-                for (axis, hand) in self.hands.iter_mut().enumerate() {
+                for (axis, hand) in self.hands.enumerate_mut() {
                     if scene.enabled(axis) {
                         hand.stop(axis, scene.now, out);
                     }
                 }
             }
             Request::EmergencyStop => {
-                for (axis, hand) in self.hands.iter_mut().enumerate() {
+                for (axis, hand) in self.hands.enumerate_mut() {
                     hand.begin(Activity::Stopping, scene.now);
                     out.push((axis, Command::EmergencyStop));
                 }
@@ -260,7 +261,7 @@ impl JogController {
 
     fn begin(
         &mut self,
-        axis: usize,
+        axis: AxisIndex,
         doing: Activity,
         command: Command,
         scene: &JogContext<'_>,
@@ -273,7 +274,7 @@ impl JogController {
         }
     }
 
-    fn jog(&mut self, axis: usize, velocity: f64, scene: &JogContext<'_>, out: &mut Commands) {
+    fn jog(&mut self, axis: AxisIndex, velocity: f64, scene: &JogContext<'_>, out: &mut Commands) {
         let (Some(hand), Some(setup)) = (self.hands.get_mut(axis), scene.setup(axis)) else {
             return;
         };
@@ -299,13 +300,14 @@ impl JogController {
     }
 
     /// Resets an axis and everything that stopped with it.
-    fn reset(&mut self, axis: usize, scene: &JogContext<'_>, out: &mut Commands) {
+    fn reset(&mut self, axis: AxisIndex, scene: &JogContext<'_>, out: &mut Commands) {
         let group = scene.group(axis);
         let stopped = scene.stopped(axis);
-        for (other, hand) in self.hands.iter_mut().enumerate() {
+        for (other, hand) in self.hands.enumerate_mut() {
             let status = scene.snapshot.axes.get(other);
             let ill = status.is_some_and(|s| s.fault.is_some() || s.trip.is_some());
-            let with_it = group != 0 && scene.group(other) == group && (ill || stopped);
+            let with_it =
+                group != GroupIndex::MACHINE && scene.group(other) == group && (ill || stopped);
             if other == axis || with_it {
                 hand.preempt(Activity::Resetting, other, out);
                 hand.begin(Activity::Resetting, scene.now);
@@ -323,7 +325,7 @@ impl JogAxis {
     /// Stops the present motion before the next activity. Most activities leave the set-point
     /// alone, and a motion may be refused. Without this stop the axis would move unsupervised. A
     /// motion accepted in the same cycle takes over without braking.
-    fn preempt(&self, next: Activity, axis: usize, out: &mut Commands) {
+    fn preempt(&self, next: Activity, axis: AxisIndex, out: &mut Commands) {
         let jogs = matches!(self.doing, Activity::Jogging { .. });
         let brakes = matches!(next, Activity::Stopping | Activity::Disabling);
         if !brakes && (jogs || (self.doing.moves() && !next.moves())) {
@@ -331,7 +333,7 @@ impl JogAxis {
         }
     }
 
-    fn stop(&mut self, axis: usize, now: Nanos, out: &mut Commands) {
+    fn stop(&mut self, axis: AxisIndex, now: Nanos, out: &mut Commands) {
         self.begin(Activity::Stopping, now);
         out.push((axis, Command::Stop));
     }
@@ -409,12 +411,12 @@ impl JogAxis {
     }
 }
 
-type Motion = (usize, Activity, Command);
+type Motion = (AxisIndex, Activity, Command);
 
 /// Returns a motion that ends by itself.
-fn motion(request: Request, scene: &JogContext<'_>) -> Result<Motion, (usize, String)> {
+fn motion(request: Request, scene: &JogContext<'_>) -> Result<Motion, (AxisIndex, String)> {
     let ramp = RAMP;
-    let slow = |axis: usize, speed: f64| {
+    let slow = |axis: AxisIndex, speed: f64| {
         if speed > 0.0 && speed <= MAX_MANUAL_SPEED {
             return Ok(());
         }
@@ -476,6 +478,6 @@ fn motion(request: Request, scene: &JogContext<'_>) -> Result<Motion, (usize, St
             let timeout_s = homing.timeout_ns as f64 * 1e-9;
             Ok((axis, Activity::Homing, Command::Home { timeout_s }))
         }
-        _ => Err((0, "not a motion".to_owned())),
+        _ => Err((AxisIndex::default(), "not a motion".to_owned())),
     }
 }

@@ -13,6 +13,7 @@ use std::collections::VecDeque;
 use std::fmt;
 
 use ecaxis_axis::Mode;
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 
 use crate::clock::Nanos;
 use crate::config::{GroupStopScope, Machine, StopGroup};
@@ -43,11 +44,11 @@ pub struct View<'v> {
     /// The time on the run's clock.
     pub now: Nanos,
     pub machine: &'v Machine,
-    /// Indices into the machine's devices, one per axis.
-    pub axes: &'v [usize],
+    /// The device of each axis.
+    pub axes: &'v IndexVec<AxisIndex, DeviceIndex>,
     pub snapshot: &'v Snapshot,
     /// The state of each axis in manual mode.
-    pub hands: &'v [JogAxis],
+    pub hands: &'v IndexVec<AxisIndex, JogAxis>,
     /// Events since the last call, in order.
     pub news: &'v [JogEvent],
 }
@@ -63,7 +64,7 @@ impl View<'_> {
 
     /// Returns the device name of an axis.
     #[must_use]
-    pub fn name(&self, axis: usize) -> &str {
+    pub fn name(&self, axis: AxisIndex) -> &str {
         let device = self.axes.get(axis);
         let device = device.and_then(|&device| self.machine.devices.get(device));
         device.map_or("?", |device| device.name.as_str())
@@ -88,24 +89,24 @@ pub enum Presence {
     Gone,
 }
 
-/// A request, with axis indices of the cycle and values in user units. Any later request ends a
+/// A request, with values in user units. Any later request ends a
 /// jog; a request that is not a motion ends a move.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Request {
     Enable {
-        axis: usize,
+        axis: AxisIndex,
     },
     /// Decelerates, then removes power.
     Disable {
-        axis: usize,
+        axis: AxisIndex,
     },
     /// Moves at this velocity for [`HOLD_TO_RUN_TIMEOUT`]. Repeated requests prolong the motion.
     Jog {
-        axis: usize,
+        axis: AxisIndex,
         velocity: f64,
     },
     MoveBy {
-        axis: usize,
+        axis: AxisIndex,
         distance: f64,
         /// The fraction of the velocity limit, at most [`MAX_MANUAL_SPEED`].
         speed: f64,
@@ -113,26 +114,26 @@ pub enum Request {
     /// Moves to a position. On a modulo axis the position lies within one turn, and the machine
     /// file gives the direction.
     MoveTo {
-        axis: usize,
+        axis: AxisIndex,
         position: f64,
         /// The speed, as in [`Request::MoveBy`].
         speed: f64,
     },
     /// Homes the axis as configured in the machine file.
     Home {
-        axis: usize,
+        axis: AxisIndex,
     },
     SetMode {
-        axis: usize,
+        axis: AxisIndex,
         mode: Mode,
     },
     /// Acknowledges trips and faults of the axis and of everything that stopped with it.
     Reset {
-        axis: usize,
+        axis: AxisIndex,
     },
     /// Decelerates and holds.
     Stop {
-        axis: usize,
+        axis: AxisIndex,
     },
     StopAll,
     /// Stops all axes and removes power as fast as possible, as configured for each axis.
@@ -155,15 +156,15 @@ impl Request {
 #[derive(Debug, Clone, PartialEq)]
 pub enum JogEvent {
     /// The request is done.
-    Done { axis: usize, what: Activity },
+    Done { axis: AxisIndex, what: Activity },
     /// The request was refused. If it would have moved the axis, the axis brakes from its previous
     /// motion.
-    Refused { axis: usize, why: String },
+    Refused { axis: AxisIndex, why: String },
     /// A jog was not repeated, and the axis brakes.
-    LetGo { axis: usize },
+    LetGo { axis: AxisIndex },
     /// The request has failed.
     Failed {
-        axis: usize,
+        axis: AxisIndex,
         what: Activity,
         why: String,
     },
@@ -172,7 +173,7 @@ pub enum JogEvent {
 impl JogEvent {
     /// Returns the axis index.
     #[must_use]
-    pub fn axis(&self) -> usize {
+    pub fn axis(&self) -> AxisIndex {
         match self {
             Self::Done { axis, .. }
             | Self::Refused { axis, .. }
@@ -214,18 +215,18 @@ impl fmt::Display for JogEvent {
 /// emergency inputs stay in the group whose stop stops everything.
 #[must_use]
 pub fn for_manual_mode(mut machine: Machine) -> Machine {
-    let watched: Vec<usize> = machine
+    let watched: Vec<_> = machine
         .stop
         .emergency
         .iter()
         .filter_map(|condition| Some(machine.inputs.get(condition.input)?.device))
         .collect();
-    let free = |&device: &usize| {
+    let free = |&device: &DeviceIndex| {
         machine.devices[device].axis.is_some()
-            && machine.group_of(device) == 0
+            && machine.group_of(device) == GroupIndex::MACHINE
             && !watched.contains(&device)
     };
-    let devices: Vec<usize> = (0..machine.devices.len()).filter(free).collect();
+    let devices: Vec<_> = machine.devices.indices().filter(free).collect();
     if !devices.is_empty() {
         machine.stop.groups.push(StopGroup {
             name: "axes".to_owned(),

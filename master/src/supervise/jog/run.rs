@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use ecaxis_axis::Command;
+use ecaxis_ecat::index::{AxisIndex, GroupIndex};
 
 use super::controller::{Activity, Commands, JogContext, JogController};
 use super::{JogEvent, Operator, Presence, View};
@@ -23,13 +24,13 @@ impl Supervisor {
         operator: &mut dyn Operator,
     ) -> Result<(), Error> {
         let timeout = self.machine.bus.enable_timeout_ns + self.longest_stop();
-        let all: Vec<usize> = (0..self.axes.len()).collect();
+        let all: Vec<_> = self.axes.indices().collect();
         let timeout = timeout + self.longest_release(&all);
         let mut worker = JogController::new(self.axes.len(), timeout);
         let (machine, axes) = (Arc::clone(&self.machine), self.axes.clone());
         // Enabled axes whose mode must be read over CoE because it is not in their process data.
-        let mut enabled: Vec<usize> = Vec::new();
-        let hidden = |axis: usize| {
+        let mut enabled: Vec<AxisIndex> = Vec::new();
+        let hidden = |axis: AxisIndex| {
             let device = axes.get(axis).and_then(|&d| machine.devices.get(d));
             let layout = device.map(|device| &device.selection.layout);
             layout.is_some_and(|layout| layout.tx_field(MODES_OF_OPERATION_DISPLAY, 0).is_none())
@@ -73,10 +74,10 @@ impl Supervisor {
                     worker.take(request, &scene, &mut commands);
                 }
             }
-            let stopped = |group: (usize, &GroupStatus)| {
+            let stopped = |group: (GroupIndex, &GroupStatus)| {
                 group.1.stopped.is_some() && !self.is_stopped(group.0)
             };
-            let just_stopped = snapshot.groups.iter().enumerate().any(stopped);
+            let just_stopped = snapshot.groups.enumerate().any(stopped);
             enabled.extend(news.iter().filter_map(just_enabled));
             // Mailbox reads may take long, and the jog timeout is not checked meanwhile.
             if just_stopped || !enabled.is_empty() {
@@ -90,7 +91,7 @@ impl Supervisor {
             }
             if turn.presence == Presence::Gone {
                 // The operator has seen these faults, so the shutdown does not report them.
-                let ill = |axis: &usize| {
+                let ill = |axis: &AxisIndex| {
                     let status = snapshot.axes.get(*axis);
                     status.is_some_and(|s| s.fault.is_some() || s.trip.is_some())
                 };

@@ -2,6 +2,7 @@
 
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Command, Mode};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 
 use super::{Settling, Supervisor, TargetKind};
 use crate::clock::Nanos;
@@ -17,7 +18,7 @@ impl Supervisor {
         step: &Step,
         start: Nanos,
         relative: bool,
-        targets: &[(usize, f64)],
+        targets: &[(DeviceIndex, f64)],
         [speed, ramp]: [f64; 2],
     ) -> Result<(), Error> {
         let targets = self.destinations(relative, targets).await?;
@@ -35,14 +36,14 @@ impl Supervisor {
     pub(in crate::supervise) async fn destinations(
         &mut self,
         relative: bool,
-        targets: &[(usize, f64)],
-    ) -> Result<Vec<(usize, f64)>, Error> {
+        targets: &[(DeviceIndex, f64)],
+    ) -> Result<Vec<(AxisIndex, f64)>, Error> {
         let targets = self.targets(targets);
         let turning = targets.iter().any(|&(axis, _)| self.modulo(axis));
         let origin = if relative || turning {
             self.poll_and_query().await?.axes
         } else {
-            Vec::new()
+            IndexVec::default()
         };
         let there = targets.into_iter().map(|(axis, target)| {
             let from = origin.get(axis).map_or(0.0, |s| s.target_position);
@@ -56,7 +57,7 @@ impl Supervisor {
         Ok(there.collect())
     }
 
-    fn modulo(&self, axis: usize) -> bool {
+    fn modulo(&self, axis: AxisIndex) -> bool {
         let setup = self.setup(axis);
         setup.is_some_and(|s| s.config.scale.modulo().is_some())
     }
@@ -65,18 +66,15 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        targets: &[(usize, Mode)],
+        targets: &[(DeviceIndex, Mode)],
     ) -> Result<(), Error> {
-        let targets = targets.iter().filter_map(|&(device, mode)| {
-            Some((self.axes.iter().position(|&d| d == device)?, mode))
-        });
-        let targets: Vec<(usize, Mode)> = targets.collect();
-        let axes: Vec<usize> = targets.iter().map(|&(axis, _)| axis).collect();
+        let targets = self.targets(targets);
+        let axes: Vec<_> = targets.iter().map(|&(axis, _)| axis).collect();
         self.settle(&axes, start).await?;
         let commands = targets.iter();
         self.command(commands.map(|&(axis, mode)| (axis, Command::SetMode(mode))))
             .await;
-        let there = |s: &Snapshot, axis: usize| {
+        let there = |s: &Snapshot, axis: AxisIndex| {
             let wanted = targets.iter().find(|(a, _)| *a == axis);
             let status = &s.axes[axis];
             Some(status.mode) == wanted.map(|(_, mode)| *mode) && status.switching.is_none()
@@ -91,7 +89,7 @@ impl Supervisor {
         step: &Step,
         start: Nanos,
         aim: TargetKind,
-        targets: &[(usize, f64)],
+        targets: &[(AxisIndex, f64)],
         command: impl Fn(f64) -> Command,
     ) -> Result<(), Error> {
         self.command(
@@ -102,12 +100,12 @@ impl Supervisor {
         .await;
         let mut settling = Settling::default();
         self.wait_until(step, start, |this, snapshot| {
-            let status = |axis: usize| &snapshot.axes[axis];
+            let status = |axis: AxisIndex| &snapshot.axes[axis];
             let late = targets.iter().find(|(axis, _)| !status(*axis).in_target);
             let Some(&(axis, target)) = late else {
                 return Ok(true);
             };
-            let on_its_way = |axis: usize| status(axis).moving && !status(axis).held_by_range;
+            let on_its_way = |axis: AxisIndex| status(axis).moving && !status(axis).held_by_range;
             if targets.iter().any(|&(axis, _)| on_its_way(axis)) {
                 settling = Settling::default();
                 return Ok(false);
@@ -124,7 +122,7 @@ impl Supervisor {
     pub(in crate::supervise) fn not_reached(
         &self,
         step: &Step,
-        axis: usize,
+        axis: AxisIndex,
         aim: TargetKind,
         target: f64,
         last: &AxisStatus,
@@ -143,7 +141,7 @@ impl Supervisor {
     /// within one turn.
     fn to_display_unit(
         &self,
-        axis: usize,
+        axis: AxisIndex,
         aim: TargetKind,
         target: f64,
         last: &AxisStatus,

@@ -6,6 +6,7 @@
 
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{Command, Edge, Probe, ProbeStatus, Source};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 
 use super::{Settling, Supervisor, TargetKind};
 use crate::clock::{self, Nanos};
@@ -21,7 +22,7 @@ const LATE_EDGE: Nanos = 50_000_000;
 /// The target, input and edge of a search.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ProbeMove {
-    pub device: usize,
+    pub device: DeviceIndex,
     pub probe: Probe,
     pub edge: Edge,
     pub relative: bool,
@@ -98,7 +99,7 @@ impl Supervisor {
         };
         // The axis already stops, unless the edge came in the cycle that accepted the move.
         self.command([(axis, Command::Stop)].into_iter()).await;
-        let resting = |s: &Snapshot, axis: usize| !s.axes[axis].moving && s.axes[axis].at_rest;
+        let resting = |s: &Snapshot, axis: AxisIndex| !s.axes[axis].moving && s.axes[axis].at_rest;
         self.until(step, start, resting, &[axis]).await?;
         self.keep(step, run, axis, &search, position);
         Ok(())
@@ -109,7 +110,7 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        axis: usize,
+        axis: AxisIndex,
         search: &ProbeMove,
     ) -> Result<(), Error> {
         let arm = Command::ArmProbe {
@@ -139,7 +140,13 @@ impl Supervisor {
         .await
     }
 
-    fn not_probed(&self, step: &Step, axis: usize, target: f64, search: &ProbeMove) -> Error {
+    fn not_probed(
+        &self,
+        step: &Step,
+        axis: AxisIndex,
+        target: f64,
+        search: &ProbeMove,
+    ) -> Error {
         let setup = self.setup(axis);
         let place = |position| match setup {
             Some(setup) => setup.config.scale.place(UserUnits(position)).0,
@@ -156,7 +163,7 @@ impl Supervisor {
     }
 
     /// Reports what was captured and stores it for the summary.
-    fn keep(&mut self, step: &Step, run: u32, axis: usize, search: &ProbeMove, position: f64) {
+    fn keep(&mut self, step: &Step, run: u32, axis: AxisIndex, search: &ProbeMove, position: f64) {
         let setup = self.setup(axis);
         let scale = setup.map(|setup| &setup.config.scale);
         let found = ProbeCapture {

@@ -2,6 +2,7 @@
 
 use ecaxis_axis::status::HomingStatus;
 use ecaxis_axis::{AxisStatus, Command, Mode};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 
 use super::{SETTLE_TIMEOUT, STANDSTILL_TIME, Supervisor};
 use crate::clock::{self, Nanos};
@@ -16,8 +17,8 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        holds: impl Fn(&Snapshot, usize) -> bool,
-        axes: &[usize],
+        holds: impl Fn(&Snapshot, AxisIndex) -> bool,
+        axes: &[AxisIndex],
     ) -> Result<(), Error> {
         let begun = clock::now();
         let timeout = self.machine.bus.enable_timeout_ns.max(self.longest_stop());
@@ -50,7 +51,7 @@ impl Supervisor {
     /// axis that oscillates is also slow at each turning point, so it must stay slow.
     pub(in crate::supervise) async fn settle(
         &mut self,
-        axes: &[usize],
+        axes: &[AxisIndex],
         start: Nanos,
     ) -> Result<(), Error> {
         let begun = clock::now();
@@ -80,9 +81,9 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        devices: &[usize],
+        devices: &[DeviceIndex],
     ) -> Result<(), Error> {
-        let timeout = |device: &usize| {
+        let timeout = |device: &DeviceIndex| {
             let axis = self.machine.devices[*device].axis.as_ref();
             let ns = axis.and_then(|a| a.homing.as_ref()).map(|h| h.timeout_ns);
             ns.unwrap_or_default() as f64 * 1e-9
@@ -115,12 +116,8 @@ impl Supervisor {
         .await
     }
 
-    fn homing_method(&self, axis: usize) -> i8 {
-        let device = self
-            .axes
-            .get(axis)
-            .and_then(|&d| self.machine.devices.get(d));
-        let setup = device.and_then(|d| d.axis.as_ref()?.homing.as_ref());
+    fn homing_method(&self, axis: AxisIndex) -> i8 {
+        let setup = self.setup(axis).and_then(|setup| setup.homing.as_ref());
         setup.map_or(0, |setup| setup.homing.method)
     }
 
