@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use ecaxis_axis::{Edge, StopMethod};
 use ecaxis_ecat::index::DeviceIndex;
 
-use super::{Condition, GroupStopScope, Machine, duration};
+use super::{Condition, GroupStopScope, Machine, OutputRef, duration};
 use crate::text::rounded;
 
 /// One step of the program.
@@ -124,9 +124,9 @@ pub enum Action {
         conditions: Vec<Condition>,
         timeout_ns: u64,
     },
-    /// Set outputs: indices into [`Machine::outputs`], and values.
+    /// Set outputs to values.
     Set {
-        values: Vec<(usize, f64)>,
+        values: Vec<(OutputRef, f64)>,
     },
     Repeat {
         times: u32,
@@ -295,7 +295,7 @@ impl Machine {
             }
             Action::Set { values } => {
                 let each = values.iter().filter_map(|&(output, value)| {
-                    Some(format!("{} = {value}", self.outputs.get(output)?.name))
+                    Some(format!("{} = {value}", self.outputs.get(output.0)?.name))
                 });
                 format!("set {}", each.collect::<Vec<_>>().join(", "))
             }
@@ -309,7 +309,7 @@ impl Machine {
     pub fn condition(&self, condition: &Condition) -> String {
         let name = self
             .inputs
-            .get(condition.input)
+            .get(condition.input.0)
             .map_or("?", |input| input.name.as_str());
         let bounds = [
             ("=", condition.equal),

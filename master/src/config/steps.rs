@@ -19,7 +19,8 @@ use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawAction, RawAxes, RawCondition, RawSignal, RawStep, RawStop};
 use super::signal::SignalDirection;
 use super::{
-    Action, AxisSetup, Condition, DeviceConfig, Signal, Step, StopSetup, TableFile, signal,
+    Action, AxisSetup, Condition, DeviceConfig, InputRef, OutputRef, Signal, Step, StopSetup,
+    TableFile, signal,
 };
 use ecaxis_axis::Mode;
 pub(crate) use preconditions::enables;
@@ -244,7 +245,7 @@ impl ProgramChecker<'_> {
             }
             RawAction::Set(values) => {
                 let count = values.len();
-                let values: Vec<(usize, f64)> = values
+                let values: Vec<_> = values
                     .into_iter()
                     .filter_map(|(signal, value)| self.output(&signal, &value, p))
                     .collect();
@@ -332,7 +333,7 @@ impl ProgramChecker<'_> {
         }
         let [equal, above, below] = bounds.map(|bound| bound.map(|n| *n.get_ref()));
         Some(Condition {
-            input: signal::known(&mut self.inputs, input),
+            input: InputRef(signal::known(&mut self.inputs, input)),
             equal,
             above,
             below,
@@ -344,10 +345,11 @@ impl ProgramChecker<'_> {
         raw: &RawSignal,
         value: &Spanned<f64>,
         p: &mut Problems<'_>,
-    ) -> Option<(usize, f64)> {
+    ) -> Option<(OutputRef, f64)> {
         let output = signal::resolve(raw, self.devices, SignalDirection::Out, p)?;
         possible(&output, value, p)?;
-        Some((signal::known(&mut self.outputs, output), *value.get_ref()))
+        let output = OutputRef(signal::known(&mut self.outputs, output));
+        Some((output, *value.get_ref()))
     }
 }
 

@@ -4,6 +4,7 @@ use ecaxis_axis::{AxisStatus, Command, CommandError};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 
 use super::bus_monitor::StopCause;
+use super::controller::OutputRef;
 use super::exchange::SubDeviceDiagnostics;
 use super::heartbeat::Heartbeat;
 use super::reaction_group::GroupStatus;
@@ -34,10 +35,9 @@ pub enum RtCommand {
         axis: AxisIndex,
         start: GeneratorRequest,
     },
-    /// Sets an output that no axis drives; `output` is an index into
-    /// [`super::cycle::Signals::outputs`].
+    /// Sets an output that no axis drives.
     Output {
-        output: usize,
+        output: OutputRef,
         value: f64,
     },
     /// Starts the bus monitor: from now on too many bad cycles stop the machine.

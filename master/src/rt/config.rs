@@ -3,6 +3,7 @@
 use ecaxis_axis::StopMethod;
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 
+use super::controller::InputRef;
 use super::image::ProcessData;
 use super::spin::Spin;
 use crate::clock::Nanos;
@@ -67,8 +68,7 @@ pub enum GroupStopScope {
 /// A condition on an input. All given bounds must hold.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Condition {
-    /// The index of the input among those of the machine.
-    pub input: usize,
+    pub input: InputRef,
     pub equal: Option<f64>,
     pub above: Option<f64>,
     pub below: Option<f64>,

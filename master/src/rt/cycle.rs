@@ -294,7 +294,7 @@ impl Engine {
         // A missing or NaN input counts as an active emergency stop.
         let pressed = |c: &Condition| {
             inputs
-                .get(c.input)
+                .get(c.input.0)
                 .is_none_or(|n| n.is_nan() || c.holds(*n))
         };
         if self.guarding && self.config.emergency.iter().any(pressed) {

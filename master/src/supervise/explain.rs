@@ -9,7 +9,7 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex};
 use super::{Supervisor, diagnosis_history};
 use crate::acyclic::al;
 use crate::clock::{self, Nanos};
-use crate::config::LimitConflict;
+use crate::config::{InputRef, LimitConflict};
 use crate::post_mortem::snapshot::{self, Depth};
 use crate::post_mortem::{DeviceSnapshot, Witnessed};
 use crate::report::{Cause, DriveReport, Error, Progress};
@@ -39,7 +39,8 @@ impl Supervisor {
             // Not reached for requested stops: callers pass only failures.
             StopCause::Requested => Cause::Interrupted,
             StopCause::EmergencyStop => {
-                let value = |input: usize| snapshot.inputs.get(input).copied().unwrap_or(f64::NAN);
+                let value =
+                    |input: InputRef| snapshot.inputs.get(input.0).copied().unwrap_or(f64::NAN);
                 let all = &self.machine.stop.emergency;
                 let pressed = all.iter().find(|c| c.holds(value(c.input))).or(all.first());
                 Cause::EmergencyStop {
@@ -250,17 +251,12 @@ impl Supervisor {
 
     /// Returns the failed device's own report. Best effort: the machine stops meanwhile.
     async fn drive_report(&mut self, axis: AxisIndex, since: Nanos) -> Box<DriveReport> {
-        let device = self
-            .axes
-            .get(axis)
-            .copied()
-            .unwrap_or(DeviceIndex(usize::MAX));
         let mut history = Vec::new();
-        if let (Some(mailbox), Some(config)) = (
-            self.mailboxes.urgent(device),
-            self.machine.devices.get(device),
-        ) && let Some(Ok(messages)) =
-            clock::timeout(ASK_TIMEOUT, diagnosis_history::read(&mailbox, config)).await
+        if let Some(&device) = self.axes.get(axis)
+            && let Some(mailbox) = self.mailboxes.urgent(device)
+            && let Some(config) = self.machine.devices.get(device)
+            && let Some(Ok(messages)) =
+                clock::timeout(ASK_TIMEOUT, diagnosis_history::read(&mailbox, config)).await
         {
             history = messages;
         }

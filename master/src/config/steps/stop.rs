@@ -24,7 +24,7 @@ impl ProgramChecker<'_> {
             let Some(condition) = self.condition(raw, p) else {
                 continue;
             };
-            let device = self.inputs[condition.input].device;
+            let device = self.inputs[condition.input.0].device;
             let group = groups.iter().find(|g| g.devices.contains(&device));
             if let Some(group) = group.filter(|g| g.outside == GroupStopScope::Continue) {
                 let message = format!(

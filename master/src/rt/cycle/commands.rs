@@ -49,7 +49,7 @@ impl Engine {
             }
             RtCommand::Feed { axis, start } => self.start_generator(axis, start),
             RtCommand::Output { output, value } => {
-                if let Some(signal) = self.signals.outputs.get(output) {
+                if let Some(signal) = self.signals.outputs.get(output.0) {
                     signal.set(self.exchange.outputs_mut(), value);
                 }
             }

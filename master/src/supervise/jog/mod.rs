@@ -89,8 +89,8 @@ pub enum Presence {
     Gone,
 }
 
-/// A request, with values in user units. Any later request ends a
-/// jog; a request that is not a motion ends a move.
+/// A request, with values in user units. Any later request ends a jog; a request that is not a
+/// motion ends a move.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Request {
     Enable {
@@ -219,7 +219,7 @@ pub fn for_manual_mode(mut machine: Machine) -> Machine {
         .stop
         .emergency
         .iter()
-        .filter_map(|condition| Some(machine.inputs.get(condition.input)?.device))
+        .filter_map(|condition| Some(machine.inputs.get(condition.input.0)?.device))
         .collect();
     let free = |&device: &DeviceIndex| {
         machine.devices[device].axis.is_some()

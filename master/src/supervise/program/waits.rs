@@ -6,7 +6,7 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 
 use super::{SETTLE_TIMEOUT, STANDSTILL_TIME, Supervisor};
 use crate::clock::{self, Nanos};
-use crate::config::{Action, Condition, Step};
+use crate::config::{Action, Condition, InputRef, Step};
 use crate::report::{Cause, Error};
 use crate::rt::channel::Snapshot;
 
@@ -132,7 +132,7 @@ impl Supervisor {
         let begun = clock::now();
         loop {
             let snapshot = self.poll_and_query().await?;
-            let value = |input: usize| snapshot.inputs.get(input).copied().unwrap_or(f64::NAN);
+            let value = |input: InputRef| snapshot.inputs.get(input.0).copied().unwrap_or(f64::NAN);
             let open = conditions.iter().find(|c| !c.holds(value(c.input)));
             let Some(open) = open else { return Ok(()) };
             if self.over(start) {
