@@ -1,9 +1,9 @@
 //! Typed indices of a machine's lists, and vectors that accept only their own index.
 
-use alloc::vec::{IntoIter, Vec};
+use alloc::vec::Vec;
 use core::marker::PhantomData;
 use core::ops::{Deref, DerefMut, Index, IndexMut};
-use core::{fmt, slice};
+use core::slice;
 
 macro_rules! index {
     ($($(#[$doc:meta])+ $name:ident)+) => {$(
@@ -20,12 +20,6 @@ macro_rules! index {
         impl From<$name> for usize {
             fn from(index: $name) -> Self {
                 index.0
-            }
-        }
-
-        impl fmt::Display for $name {
-            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                self.0.fmt(f)
             }
         }
     )+};
@@ -141,14 +135,5 @@ impl<'a, I, T> IntoIterator for &'a mut IndexVec<I, T> {
 
     fn into_iter(self) -> Self::IntoIter {
         self.items.iter_mut()
-    }
-}
-
-impl<I, T> IntoIterator for IndexVec<I, T> {
-    type Item = T;
-    type IntoIter = IntoIter<T>;
-
-    fn into_iter(self) -> IntoIter<T> {
-        self.items.into_iter()
     }
 }

@@ -15,6 +15,9 @@ use ecaxis_master::supervise::jog::{
 use ecaxis_test_support::{axes, faults, machine, virtual_time};
 use operator::{Seen, by_hand, here, request};
 
+/// The first two axes.
+const X: AxisIndex = AxisIndex(0);
+const Y: AxisIndex = AxisIndex(1);
 /// Limits of the machines of `axes`, in turns/s and turns/s².
 const VELOCITY: f64 = 50.0;
 const ACCELERATION: f64 = 500.0;
@@ -27,10 +30,10 @@ fn once_enabled(
 ) -> impl FnMut(&View<'_>, f64) -> OperatorInput + Send + 'static {
     let mut ready = None;
     move |view, now| {
-        let axis = &view.snapshot.axes[AxisIndex(0)];
+        let axis = &view.snapshot.axes[X];
         if ready.is_none() && !axis.ready {
-            return match view.hands[AxisIndex(0)].doing {
-                Activity::Nothing => request(Request::Enable { axis: AxisIndex(0) }),
+            return match view.hands[X].doing {
+                Activity::Nothing => request(Request::Enable { axis: X }),
                 _ => here(),
             };
         }
@@ -68,10 +71,7 @@ fn a_released_axis_brakes() {
         machine(&axes(1)),
         virtual_time(),
         once_enabled(move |_, since| match since {
-            ..1.0 => Some(request(Request::Jog {
-                axis: AxisIndex(0),
-                velocity,
-            })),
+            ..1.0 => Some(request(Request::Jog { axis: X, velocity })),
             ..3.0 => Some(here()),
             _ => None,
         }),
@@ -93,12 +93,12 @@ fn a_released_axis_brakes() {
     let news: Vec<_> = seen.iter().flat_map(|s| s.news.clone()).collect();
     let reported = [
         JogEvent::Done {
-            axis: AxisIndex(0),
+            axis: X,
             what: Activity::Enabling,
         },
-        JogEvent::LetGo { axis: AxisIndex(0) },
+        JogEvent::LetGo { axis: X },
         JogEvent::Done {
-            axis: AxisIndex(0),
+            axis: X,
             what: Activity::Stopping,
         },
     ];
@@ -113,11 +113,11 @@ fn an_absent_operator_starts_nothing_and_stops_all_motion() {
             virtual_time(),
             once_enabled(move |_, since| {
                 let jog = Request::Jog {
-                    axis: AxisIndex(0),
+                    axis: X,
                     velocity: 5.0,
                 };
                 let go = Request::MoveTo {
-                    axis: AxisIndex(0),
+                    axis: X,
                     position: 80.0,
                     speed: 0.2,
                 };
@@ -159,7 +159,7 @@ fn an_operator_who_leaves_in_motion_leaves_a_machine_at_rest() {
         virtual_time(),
         once_enabled(|_, since| match since {
             0.0 => Some(request(Request::MoveBy {
-                axis: AxisIndex(0),
+                axis: X,
                 distance: 80.0,
                 speed: MAX_MANUAL_SPEED,
             })),
@@ -184,12 +184,9 @@ fn an_operator_who_leaves_in_motion_leaves_a_machine_at_rest() {
 
 #[test]
 fn jog_rejects_more_than_a_quarter_of_the_speed_limit() {
-    let jog = |velocity| Request::Jog {
-        axis: AxisIndex(0),
-        velocity,
-    };
+    let jog = |velocity| Request::Jog { axis: X, velocity };
     let by = |speed| Request::MoveBy {
-        axis: AxisIndex(0),
+        axis: X,
         distance: 1.0,
         speed,
     };
@@ -203,18 +200,18 @@ fn jog_rejects_more_than_a_quarter_of_the_speed_limit() {
         by(-0.1),
         by(f64::NAN),
         Request::MoveTo {
-            axis: AxisIndex(0),
+            axis: X,
             position: 101.0,
             speed: 0.1,
         },
         Request::MoveTo {
-            axis: AxisIndex(0),
+            axis: X,
             position: f64::NAN,
             speed: 0.1,
         },
-        Request::Home { axis: AxisIndex(0) },
+        Request::Home { axis: X },
         Request::SetMode {
-            axis: AxisIndex(0),
+            axis: X,
             mode: Mode::Csv,
         },
     ];
@@ -247,12 +244,12 @@ fn a_rejected_request_keeps_the_dead_man_rule_active() {
                 // The second request is accepted before the rejection of the first is reported.
                 turn.requests = vec![
                     Request::MoveTo {
-                        axis: AxisIndex(0),
+                        axis: X,
                         position: 1000.0,
                         speed: 0.1,
                     },
                     Request::Jog {
-                        axis: AxisIndex(0),
+                        axis: X,
                         velocity: 5.0,
                     },
                 ];
@@ -278,10 +275,7 @@ fn jog_stays_within_the_range_while_the_key_is_held() {
         machine(&axes(1)),
         virtual_time(),
         once_enabled(move |_, since| match since {
-            ..12.0 => Some(request(Request::Jog {
-                axis: AxisIndex(0),
-                velocity,
-            })),
+            ..12.0 => Some(request(Request::Jog { axis: X, velocity })),
             _ => None,
         }),
     );
@@ -305,27 +299,23 @@ fn a_fault_stops_all_axes_and_is_reset() {
             let status = &view.snapshot.axes;
             let idle = view.idle();
             let ready = status.iter().all(|axis| axis.ready);
-            if status[AxisIndex(1)].fault.is_some() && !reset && !status[AxisIndex(0)].enabled {
+            if status[Y].fault.is_some() && !reset && !status[X].enabled {
                 reset = true;
-                return request(Request::Reset { axis: AxisIndex(1) });
+                return request(Request::Reset { axis: Y });
             }
             if now > 6.0 {
                 return operator::gone();
             }
             let mut turn = here();
-            if idle && !ready && (!reset || status[AxisIndex(1)].fault.is_none()) {
-                turn.requests = (0..2)
-                    .map(|axis| Request::Enable {
-                        axis: AxisIndex(axis),
-                    })
-                    .collect();
+            if idle && !ready && (!reset || status[Y].fault.is_none()) {
+                turn.requests = [X, Y].map(|axis| Request::Enable { axis }).to_vec();
             } else if ready {
-                turn.requests = (0..2)
+                turn.requests = [X, Y]
                     .map(|axis| Request::Jog {
-                        axis: AxisIndex(axis),
-                        velocity: if axis == 0 { 2.0 } else { -2.0 },
+                        axis,
+                        velocity: if axis == X { 2.0 } else { -2.0 },
                     })
-                    .collect();
+                    .to_vec();
             }
             turn
         },
@@ -357,12 +347,12 @@ fn an_emergency_stop_removes_power_and_requires_a_reset() {
             machine(&axes(2)),
             virtual_time(),
             once_enabled(move |view, since| {
-                let axis = &view.snapshot.axes[AxisIndex(0)];
+                let axis = &view.snapshot.axes[X];
                 let (next, turn) = match phase {
                     0 => (
                         1,
                         request(Request::MoveBy {
-                            axis: AxisIndex(0),
+                            axis: X,
                             distance: 50.0,
                             speed: 0.2,
                         }),
@@ -370,19 +360,19 @@ fn an_emergency_stop_removes_power_and_requires_a_reset() {
                     1 if since > 0.5 => (2, request(Request::EmergencyStop)),
                     2 if since > 1.5 => {
                         assert!(!axis.enabled && axis.trip == Some(Trip::EmergencyStop));
-                        (3, request(Request::Enable { axis: AxisIndex(0) }))
+                        (3, request(Request::Enable { axis: X }))
                     }
                     3 if view.news.iter().any(JogEvent::is_failure) => {
                         assert!(!axis.enabled);
-                        let enable = Request::Reset { axis: AxisIndex(0) };
+                        let enable = Request::Reset { axis: X };
                         (if reset { 4 } else { 6 }, request(enable))
                     }
-                    4 if view.idle() => (5, request(Request::Enable { axis: AxisIndex(0) })),
+                    4 if view.idle() => (5, request(Request::Enable { axis: X })),
                     5 if axis.ready => (6, here()),
                     6 => return None,
                     same => (same, here()),
                 };
-                phase = if turn.requests == [Request::Reset { axis: AxisIndex(0) }] && !reset {
+                phase = if turn.requests == [Request::Reset { axis: X }] && !reset {
                     return None;
                 } else {
                     next
@@ -421,18 +411,18 @@ track = { negative_limit = -6.0, positive_limit = 6.0, home = [2.0, 2.5], index 
 #[test]
 fn jog_homes_an_axis_and_switches_its_mode() {
     let plan = [
-        Request::Home { axis: AxisIndex(0) },
+        Request::Home { axis: X },
         Request::MoveTo {
-            axis: AxisIndex(0),
+            axis: X,
             position: 5.0,
             speed: 0.2,
         },
         Request::SetMode {
-            axis: AxisIndex(0),
+            axis: X,
             mode: Mode::Csv,
         },
         Request::Jog {
-            axis: AxisIndex(0),
+            axis: X,
             velocity: 2.0,
         },
     ];
@@ -469,7 +459,7 @@ fn homing_ends_without_an_operator() {
         virtual_time(),
         once_enabled(|_, since| {
             let mut turn = match since {
-                0.0 => request(Request::Home { axis: AxisIndex(0) }),
+                0.0 => request(Request::Home { axis: X }),
                 ..2.0 => here(),
                 _ => return None,
             };
@@ -521,46 +511,33 @@ fn random_requests_stay_within_the_limits() {
                 turn.presence = Presence::Away;
             }
             for _ in 0..dice(3) {
-                let axis = dice(2) as usize;
+                let axis = AxisIndex(dice(2) as usize);
                 let part = dice(1000) as f64 / 500.0 - 1.0;
                 let again = match dice(60) {
                     0..10 => {
                         let velocity = part * 2.0 * MAX_MANUAL_SPEED * VELOCITY;
-                        last_jog[axis] = now;
-                        Request::Jog {
-                            axis: AxisIndex(axis),
-                            velocity,
-                        }
+                        last_jog[axis.0] = now;
+                        Request::Jog { axis, velocity }
                     }
                     10 => Request::MoveBy {
-                        axis: AxisIndex(axis),
+                        axis,
                         distance: part * 20.0,
                         speed: part * 0.5,
                     },
                     11 => Request::MoveTo {
-                        axis: AxisIndex(axis),
+                        axis,
                         position: part * 150.0,
                         speed: part * 0.5,
                     },
-                    12..20 => Request::Enable {
-                        axis: AxisIndex(axis),
-                    },
-                    20 => Request::Disable {
-                        axis: AxisIndex(axis),
-                    },
-                    21 => Request::Stop {
-                        axis: AxisIndex(axis),
-                    },
+                    12..20 => Request::Enable { axis },
+                    20 => Request::Disable { axis },
+                    21 => Request::Stop { axis },
                     22 => Request::StopAll,
-                    23..30 => Request::Reset {
-                        axis: AxisIndex(axis),
-                    },
+                    23..30 => Request::Reset { axis },
                     30 if dice(20) == 0 => Request::EmergencyStop,
-                    31 => Request::Home {
-                        axis: AxisIndex(axis),
-                    },
+                    31 => Request::Home { axis },
                     32 => Request::SetMode {
-                        axis: AxisIndex(axis),
+                        axis,
                         mode: Mode::Csv,
                     },
                     33 => Request::Enable { axis: AxisIndex(7) },

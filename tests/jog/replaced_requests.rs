@@ -6,7 +6,7 @@ use ecaxis_ecat::index::AxisIndex;
 use ecaxis_master::supervise::jog::{Activity, JogEvent, OperatorInput, Presence, Request, View};
 
 use super::operator::{Seen, by_hand, gone, here, request};
-use super::{LET_GO_S, VERSATILE, once_enabled, within_limits};
+use super::{LET_GO_S, VERSATILE, X, Y, once_enabled, within_limits};
 use ecaxis_test_support::{axes, machine, virtual_time};
 
 /// Jogs for a quarter of a second, sends one other request, then sends no requests.
@@ -19,14 +19,11 @@ fn replaced_by(file: &str, instead: Request, presence: Presence) -> (f64, Vec<Se
         once_enabled(move |view, since| {
             let velocity = 5.0;
             if since < LAST {
-                return Some(request(Request::Jog {
-                    axis: AxisIndex(0),
-                    velocity,
-                }));
+                return Some(request(Request::Jog { axis: X, velocity }));
             }
             if !asked {
                 asked = true;
-                assert_eq!(view.snapshot.axes[AxisIndex(0)].target_velocity, velocity);
+                assert_eq!(view.snapshot.axes[X].target_velocity, velocity);
                 return Some(request(instead));
             }
             let mut turn = here();
@@ -47,23 +44,23 @@ fn replaced_by(file: &str, instead: Request, presence: Presence) -> (f64, Vec<Se
 fn a_request_that_replaces_a_jog_keeps_the_dead_man_rule_active() {
     let speed = 0.1;
     let others = [
-        Request::Enable { axis: AxisIndex(0) },
-        Request::Reset { axis: AxisIndex(0) },
+        Request::Enable { axis: X },
+        Request::Reset { axis: X },
         Request::SetMode {
-            axis: AxisIndex(0),
+            axis: X,
             mode: Mode::Csv,
         },
         Request::MoveBy {
-            axis: AxisIndex(0),
+            axis: X,
             distance: 1000.0,
             speed,
         },
         Request::MoveTo {
-            axis: AxisIndex(0),
+            axis: X,
             position: 1000.0,
             speed,
         },
-        Request::Home { axis: AxisIndex(0) },
+        Request::Home { axis: X },
     ];
     // The second machine has a range but no homing and no other mode, so it rejects each request.
     for file in [VERSATILE, &axes(1)] {
@@ -88,7 +85,7 @@ fn a_request_that_replaces_a_jog_keeps_the_dead_man_rule_active() {
 #[test]
 fn a_move_continues_from_a_jog() {
     let instead = Request::MoveTo {
-        axis: AxisIndex(0),
+        axis: X,
         position: 20.0,
         speed: 0.1,
     };
@@ -111,7 +108,7 @@ fn a_move_continues_from_a_jog() {
 
 fn both(request: impl Fn(AxisIndex) -> Request) -> OperatorInput {
     OperatorInput {
-        requests: [0, 1].map(AxisIndex).map(request).to_vec(),
+        requests: [X, Y].map(request).to_vec(),
         ..OperatorInput::default()
     }
 }
@@ -123,7 +120,7 @@ fn both_enabled(
     let mut ready = None;
     move |view, now| {
         if ready.is_none() && !view.snapshot.axes.iter().all(|axis| axis.ready) {
-            return match view.hands[AxisIndex(0)].doing {
+            return match view.hands[X].doing {
                 Activity::Nothing if now < 0.01 => both(|axis| Request::Enable { axis }),
                 _ => here(),
             };

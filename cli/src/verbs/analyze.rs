@@ -149,7 +149,7 @@ fn known(args: &Args) -> Result<(Context, Option<Expected<'_>>), Failure> {
     if let Some(file) = &args.machine {
         let machine = config::load(file).map_err(|e| hints::config(file, &e))?;
         known = known.with_machine(&machine);
-        let names = machine.devices.into_iter().map(|device| device.name);
+        let names = machine.devices.iter().map(|device| device.name.clone());
         expected = Some((file.as_path(), names.collect()));
     }
     if let Some(path) = &args.esi {

@@ -345,10 +345,8 @@ impl Machine {
     /// Returns the group's name in the machine file; empty for group 0, which has no name.
     #[must_use]
     pub fn group_name(&self, group: GroupIndex) -> &str {
-        let named = group
-            .0
-            .checked_sub(1)
-            .and_then(|index| self.stop.groups.get(index));
+        let named = group.0.checked_sub(1);
+        let named = named.and_then(|index| self.stop.groups.get(index));
         named.map_or("", |group| &group.name)
     }
 

@@ -1,6 +1,6 @@
 //! Process data by name: the bits of a device that a step reads or sets.
 
-use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
+use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use ecaxis_esi as esi;
 use ecaxis_esi::layout::Field;
 
@@ -176,15 +176,13 @@ pub(crate) fn resolve(
     p: &mut Problems<'_>,
 ) -> Option<Signal> {
     let names = devices.iter().map(|d| d.name);
-    let found = place(raw.device.get_ref(), names)
-        .map(DeviceIndex)
-        .and_then(|index| {
-            // An invalid device has already been reported.
-            let device = devices[index].device;
-            device
-                .map(|device| one(raw.name.get_ref(), way, index, device))
-                .transpose()
-        });
+    let found = place(raw.device.get_ref(), names).and_then(|index| {
+        // An invalid device has already been reported.
+        let device = devices[index].device;
+        device
+            .map(|device| one(raw.name.get_ref(), way, index, device))
+            .transpose()
+    });
     found.unwrap_or_else(|error| {
         let at = if error.device { &raw.device } else { &raw.name };
         p.add_hint(at.span(), error.message, error.hint);
@@ -192,12 +190,13 @@ pub(crate) fn resolve(
     })
 }
 
-fn place<'n>(
+fn place<'n, I: From<usize>>(
     name: &str,
     mut names: impl Iterator<Item = &'n str> + Clone,
-) -> Result<usize, NameError> {
+) -> Result<I, NameError> {
     let all = names.clone();
-    names.position(|n| n == name).ok_or_else(|| NameError {
+    let found = names.position(|n| n == name).map(I::from);
+    found.ok_or_else(|| NameError {
         message: format!("no device is named `{name}`"),
         hint: suggestion(name, all, "devices"),
         device: true,
@@ -300,7 +299,7 @@ impl Machine {
             hint: suggestion(name, names, "axes"),
             ..error
         })?;
-        Ok(AxisRef(AxisIndex(at)))
+        Ok(AxisRef(at))
     }
 
     /// Returns an input by its device's name and its own name. Valid names are the entry's name in
@@ -335,8 +334,7 @@ impl Machine {
     }
 
     fn signal(&self, device: &str, name: &str, way: SignalDirection) -> Result<Signal, NameError> {
-        let names = self.devices.iter().map(|d| d.name.as_str());
-        let index = DeviceIndex(place(device, names)?);
+        let index = place(device, self.devices.iter().map(|d| d.name.as_str()))?;
         one(name, way, index, &self.devices[index])
     }
 }

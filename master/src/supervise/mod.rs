@@ -490,7 +490,7 @@ impl Supervisor {
             .and_then(|&device| self.bus.devices.get(device))
             .map_or_else(
                 || DeviceRef {
-                    name: format!("axis {axis}"),
+                    name: format!("axis {}", axis.0),
                     position: 0,
                     station: 0,
                 },

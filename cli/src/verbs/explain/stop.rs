@@ -55,10 +55,7 @@ pub(super) fn stop(machine: &Machine, out: &mut Document) {
             outside
         ]);
     }
-    let (axes, devices) = (
-        names(true, GroupIndex::MACHINE),
-        names(false, GroupIndex::MACHINE),
-    );
+    let [axes, devices] = [true, false].map(|axes| names(axes, GroupIndex::MACHINE));
     table.row(cells![
         "(the rest)",
         axes,

@@ -33,36 +33,26 @@ fn messages(hands: &MachineSide) -> Vec<String> {
 
 #[test]
 fn stale_requests_are_dropped_except_stops() {
-    let (axis, speed) = (0, 0.1);
+    let (axis, speed) = (AxisIndex(0), 0.1);
     let wanted = [
         Request::Jog {
-            axis: AxisIndex(axis),
+            axis,
             velocity: 5.0,
         },
         Request::MoveBy {
-            axis: AxisIndex(axis),
+            axis,
             distance: 1.0,
             speed,
         },
-        Request::Home {
-            axis: AxisIndex(axis),
-        },
-        Request::Enable {
-            axis: AxisIndex(axis),
-        },
-        Request::Reset {
-            axis: AxisIndex(axis),
-        },
+        Request::Home { axis },
+        Request::Enable { axis },
+        Request::Reset { axis },
     ];
     let stops = [
-        Request::Stop {
-            axis: AxisIndex(axis),
-        },
+        Request::Stop { axis },
         Request::StopAll,
         Request::EmergencyStop,
-        Request::Disable {
-            axis: AxisIndex(axis),
-        },
+        Request::Disable { axis },
     ];
     for (age, passed) in [(0, true), (200, true), (400, false), (5_000, false)] {
         let (asks, mut hands) = hands();

@@ -2,7 +2,9 @@
 
 use super::super::panel::tests::panel;
 use super::*;
-use ecaxis_ecat::index::AxisIndex;
+
+const X: AxisIndex = AxisIndex(0);
+const Y: AxisIndex = AxisIndex(1);
 
 fn request(asks: &[UiAction]) -> Option<Request> {
     match asks {
@@ -23,12 +25,7 @@ fn single_key_press_moves_nothing() {
 #[test]
 fn held_key_jogs_until_released() {
     let (mut ui, panel) = (Ui::default(), panel(2));
-    let jog = |velocity| {
-        Some(Request::Jog {
-            axis: AxisIndex(0),
-            velocity,
-        })
-    };
+    let jog = |velocity| Some(Request::Jog { axis: X, velocity });
     let mut press = |key, now| request(&ui.key(key, now, Some(&panel)));
     assert_eq!(press(Key::Right, 0), None);
     // The keyboard's initial delay, then it repeats: 5 % of 100.
@@ -98,7 +95,7 @@ fn ui_accepts_typed_positions() {
     };
     let there = |position| {
         [UiAction::For(Request::MoveTo {
-            axis: AxisIndex(0),
+            axis: X,
             position,
             speed: SPEEDS[FIRST_SPEED],
         })]
@@ -122,15 +119,15 @@ fn commands_address_the_selected_axis() {
     let (mut ui, panel) = (Ui::default(), panel(3));
     ui.key(Key::Down, 0, Some(&panel));
     for (key, expected) in [
-        ('e', Request::Enable { axis: AxisIndex(1) }),
-        ('d', Request::Disable { axis: AxisIndex(1) }),
-        ('h', Request::Home { axis: AxisIndex(1) }),
-        ('r', Request::Reset { axis: AxisIndex(1) }),
+        ('e', Request::Enable { axis: Y }),
+        ('d', Request::Disable { axis: Y }),
+        ('h', Request::Home { axis: Y }),
+        ('r', Request::Reset { axis: Y }),
         ('x', Request::EmergencyStop),
         (
             '.',
             Request::MoveBy {
-                axis: AxisIndex(1),
+                axis: Y,
                 distance: 1.0,
                 speed: SPEEDS[FIRST_SPEED],
             },
@@ -160,7 +157,7 @@ fn commands_address_the_selected_axis() {
 #[test]
 fn selecting_another_axis_stops_the_first() {
     let (mut ui, mut panel) = (Ui::default(), panel(2));
-    panel.axes[AxisIndex(0)].doing = Activity::Jogging { velocity: 1.0 };
+    panel.axes[X].doing = Activity::Jogging { velocity: 1.0 };
     let asks = ui.key(Key::Down, 0, Some(&panel));
-    assert_eq!(request(&asks), Some(Request::Stop { axis: AxisIndex(0) }));
+    assert_eq!(request(&asks), Some(Request::Stop { axis: X }));
 }

@@ -21,25 +21,15 @@ fn stop_groups_are_parsed_with_their_defaults() {
     );
     let group = |name: &str, device, others, outside| StopGroup {
         name: name.to_owned(),
-        devices: vec![device],
+        devices: vec![DeviceIndex(device)],
         others,
         outside,
     };
     assert_eq!(
         machine.stop.groups,
         [
-            group(
-                "g",
-                DeviceIndex(1),
-                StopMethod::DisableVoltage,
-                GroupStopScope::Continue
-            ),
-            group(
-                "h",
-                DeviceIndex(0),
-                StopMethod::QuickStop,
-                GroupStopScope::Stop
-            ),
+            group("g", 1, StopMethod::DisableVoltage, GroupStopScope::Continue),
+            group("h", 0, StopMethod::QuickStop, GroupStopScope::Stop),
         ]
     );
 }

@@ -178,8 +178,7 @@ fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge>
         groups: devices.iter().map(|device| device.group).collect(),
         ..ImagePlan::default()
     };
-    let indices = (0..).map(DeviceIndex);
-    let mut order: Vec<_> = indices.zip(devices).collect();
+    let mut order: Vec<_> = image.regions.indices().zip(devices).collect();
     order.sort_by_key(|(_, device)| device.group);
     let mut frames = FramePacker {
         last: 0,
@@ -246,11 +245,9 @@ fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge>
         });
         image.len += len;
     }
-    let watched = (0..)
-        .map(DeviceIndex)
-        .zip(devices)
-        .filter(|(_, d)| d.mailbox);
-    let watched: Vec<_> = watched.map(|(index, _)| index).collect();
+    let indices = image.regions.indices().zip(devices);
+    let watched = indices.filter_map(|(index, device)| device.mailbox.then_some(index));
+    let watched: Vec<_> = watched.collect();
     if !watched.is_empty() {
         image.mailboxes = Some(MailboxPlan {
             logical: LOGICAL_BASE.saturating_add(u32::try_from(image.len).unwrap_or(u32::MAX)),
