@@ -47,7 +47,7 @@ pub enum StopCause {
 impl StopCause {
     /// Returns the axis that caused the stop.
     #[must_use]
-    pub fn axis(&self) -> Option<usize> {
+    pub fn axis(&self) -> Option<AxisIndex> {
         match *self {
             Self::DriveFault { axis }
             | Self::Trip { axis, .. }

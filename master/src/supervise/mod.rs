@@ -225,11 +225,7 @@ impl Supervisor {
             .map(|(device, found)| (device.at.clone(), found.clock_difference))
     }
 
-    async fn enable_axes(
-        &mut self,
-        step: Option<&Step>,
-        axes: &[AxisIndex],
-    ) -> Result<(), Error> {
+    async fn enable_axes(&mut self, step: Option<&Step>, axes: &[AxisIndex]) -> Result<(), Error> {
         let snapshot = self.poll_and_query().await?;
         let mut orders = Vec::with_capacity(2 * axes.len());
         self.ensure_not_stopped(step, axes)?;

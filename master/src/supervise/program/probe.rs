@@ -140,13 +140,7 @@ impl Supervisor {
         .await
     }
 
-    fn not_probed(
-        &self,
-        step: &Step,
-        axis: AxisIndex,
-        target: f64,
-        search: &ProbeMove,
-    ) -> Error {
+    fn not_probed(&self, step: &Step, axis: AxisIndex, target: f64, search: &ProbeMove) -> Error {
         let setup = self.setup(axis);
         let place = |position| match setup {
             Some(setup) => setup.config.scale.place(UserUnits(position)).0,
