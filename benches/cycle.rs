@@ -3,11 +3,11 @@
 use std::hint::black_box;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::channel;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use ecaxis_axis::{Axis, AxisConfig, Command, Inputs, Limits, Mode, Scale};
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config;
 use ecaxis_master::rt::cycle::Engine;
@@ -39,7 +39,7 @@ fn whole_cycle(c: &mut Criterion) {
         };
         options.clock.enter();
         let (progress, _told) = channel();
-        let stop = Arc::new(AtomicBool::new(false));
+        let stop = Arc::<CancelToken>::default();
         let job = RunBuilder {
             machine: &Arc::new(machine),
             options: &options,

@@ -14,9 +14,10 @@ mod counting;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread::JoinHandle;
 
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config;
 use ecaxis_master::mailbox::Mailboxes;
 use ecaxis_master::rt::controller::{Controller, CycleContext};
@@ -177,7 +178,7 @@ fn run(nic: &str, axes: usize, asked: usize, seconds: u64) -> Ran {
         enable: false,
         ..Options::default()
     };
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     let allocated = Arc::new(AtomicU64::new(u64::MAX));
     let meter = Meter {
         cycles: 0,

@@ -20,8 +20,8 @@ use std::f64::consts::TAU;
 use std::io::{self, Write};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config::{self, AxisRef, OutputRef};
 use ecaxis_master::rt::controller::{Controller, CycleContext};
 use ecaxis_master::session::{self, Observer, Options, Progress, SignalReport};
@@ -98,7 +98,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         start: None,
         elapsed_s: 0.0,
     };
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     // Ctrl-C, SIGTERM and a closing terminal bring the axes to rest.
     session::stop_on_signals(Arc::clone(&stop), |report| match report {
         SignalReport::StopRepeated => std::process::exit(1),

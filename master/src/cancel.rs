@@ -69,22 +69,17 @@ impl CancelToken {
         work.await
     }
 
-    /// Runs `work` and cancels the token once `flag` is set.
-    pub(crate) async fn cancel_on<F: Future>(&self, flag: &AtomicBool, work: F) -> F::Output {
+    /// Runs `work` and cancels this token once `parent` is cancelled.
+    pub(crate) async fn cancel_with<F: Future>(&self, parent: &Self, work: F) -> F::Output {
         let mut work = pin!(work);
         poll_fn(|context| {
-            if flag.load(Ordering::Relaxed) {
+            if parent.is_cancelled() {
                 self.cancel();
             }
             work.as_mut().poll(context)
         })
         .await
     }
-}
-
-/// Runs `work` until it completes; returns `None` once `stop` is set, even in a shielded section.
-pub(crate) async fn run_until_set<F: Future>(stop: &AtomicBool, work: F) -> Option<F::Output> {
-    run_until(|| stop.load(Ordering::Relaxed), work).await
 }
 
 /// Runs `work` until it completes; returns `None` once `ends` returns true. Every executor here
@@ -146,14 +141,14 @@ mod tests {
         ] {
             let stop = CancelToken::default();
             let (flag, reported, step) = (
-                AtomicBool::new(false),
+                CancelToken::default(),
                 std::cell::RefCell::new(String::new()),
                 Cell::new(0),
             );
             let reached = |n: i32| {
                 step.set(n);
                 if n == at {
-                    flag.store(true, Ordering::Relaxed);
+                    flag.cancel();
                 }
             };
             let say = |text: &str| reported.borrow_mut().push_str(text);
@@ -187,8 +182,8 @@ mod tests {
                 say("d");
                 reached(5);
             };
-            let done =
-                polled(stop.cancel_on(&flag, stop.run_until_cancelled(work)), 20).expect("it ends");
+            let done = polled(stop.cancel_with(&flag, stop.run_until_cancelled(work)), 20)
+                .expect("it ends");
             assert_eq!(reported.into_inner(), expected, "at {at}");
             assert_eq!(done.is_some(), at == 5, "at {at}, reached {}", step.get());
             assert_eq!(stop.held.load(Ordering::Relaxed), 0);

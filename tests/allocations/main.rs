@@ -5,12 +5,12 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::pin::{Pin, pin};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::channel;
 use std::task::{Context, Poll, Waker};
 
 use ecaxis_axis::Command;
 use ecaxis_ecat::index::AxisIndex;
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{self, Clock, Nanos};
 use ecaxis_master::config::{AxisRef, Machine};
 use ecaxis_master::link::capture::{Recorder, WriterMode};
@@ -145,7 +145,7 @@ fn metered_among_users(
 ) -> (u64, EngineReport, Ended, u64) {
     options.clock.enter();
     let (progress, reported) = channel();
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     let job = RunBuilder {
         machine: &Arc::new(machine),
         options,

@@ -1,9 +1,10 @@
 //! A user-defined controller in the cycle, supervised like other motion.
 
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, atomic::AtomicBool};
+use std::sync::{Arc, Mutex};
 
 use ecaxis_axis::{Command, CommandError};
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{self, Clock};
 use ecaxis_master::config::{AxisRef, InputRef, Machine, OutputRef};
 use ecaxis_master::rt::controller::{Controller, CycleContext};
@@ -19,7 +20,7 @@ fn control_with(
     machine: Machine,
     controller: impl Controller + 'static,
 ) -> Outcome {
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     let mut heard = Heard::default();
     run_with(machine, options, stop, &mut heard, Box::new(controller))
 }

@@ -2,9 +2,9 @@
 //! several callers.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use ecaxis_master::bringup::Step;
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config::Machine;
 use ecaxis_master::mailbox::{MailboxError, Mailboxes};
 use ecaxis_master::session::{self, Cause, EmergencyReport, Observer, Options, Outcome, Progress};
@@ -162,7 +162,7 @@ fn the_diagnosis_history_of_a_faulty_device_is_read() {
 /// user is done.
 struct WithUser<F> {
     user: Option<F>,
-    stop: Arc<AtomicBool>,
+    stop: Arc<CancelToken>,
     thread: Option<std::thread::JoinHandle<()>>,
     heard: Heard,
 }
@@ -190,11 +190,11 @@ where
 }
 
 /// Ends the run when dropped, however the user ends.
-struct EndsTheRun(Arc<AtomicBool>);
+struct EndsTheRun(Arc<CancelToken>);
 
 impl Drop for EndsTheRun {
     fn drop(&mut self) {
-        self.0.store(true, Ordering::Relaxed);
+        self.0.cancel();
     }
 }
 
@@ -203,7 +203,7 @@ fn with_user<F>(axis_count: usize, options: Options, user: F) -> (Outcome, Heard
 where
     F: AsyncFnOnce(Mailboxes) + Send + 'static,
 {
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     let mut observer = WithUser {
         user: Some(user),
         stop: Arc::clone(&stop),

@@ -3,11 +3,11 @@
 
 use std::fmt::Write as _;
 use std::pin::pin;
-use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::channel;
 use std::sync::{Arc, Mutex};
 use std::task::{Context, Waker};
 
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{self, Nanos};
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
@@ -117,7 +117,7 @@ fn keep(cycle: &str, seed: u64, gains: Gains, seconds: u64) -> Kept {
         arrivals: Arc::clone(&arrivals),
     };
     let (progress, reported) = channel();
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     let job = RunBuilder {
         machine: &Arc::new(machine),
         options: &options,

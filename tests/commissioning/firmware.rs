@@ -10,6 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use ecaxis_master::acyclic::eeprom::EepromAccess;
 use ecaxis_master::acyclic::{AlState, al};
 use ecaxis_master::acyclic::{DatagramClient, device, mailbox};
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::Locator;
 use ecaxis_master::link::sim::SimLink;
@@ -60,7 +61,7 @@ struct Bench {
     link: Switched,
     off: Arc<AtomicBool>,
     /// The user's cancellation of the next update.
-    stop: Arc<AtomicBool>,
+    stop: Arc<CancelToken>,
     /// The position of the device under test.
     position: u16,
     expected: Expected,
@@ -139,7 +140,7 @@ impl Bench {
     fn examine(&mut self) -> DeviceIdentity {
         let which = Locator::Position(self.position);
         let work = async move |wire| firmware::examine(&wire, which, Some("x")).await;
-        let stop = AtomicBool::new(false);
+        let stop = CancelToken::default();
         let done = run_on_link(&mut self.link, Clock::Virtual, &stop, work);
         done.expect("carried").expect("examined")
     }
@@ -165,7 +166,7 @@ impl Bench {
         };
         let stop = Arc::clone(&self.stop);
         let done = run_on_link(&mut self.link, Clock::Virtual, &stop, work).expect("carried");
-        self.stop.store(false, Ordering::Relaxed);
+        self.stop = Arc::default();
         done
     }
 
@@ -359,7 +360,7 @@ fn a_cancelled_update_leaves_no_device_in_bootstrap() {
                     if let UpdateProgress::Moved { done, of } = reported
                         && done * 100 >= of * percent
                     {
-                        stop.store(true, Ordering::Relaxed);
+                        stop.cancel();
                     }
                 };
                 let error = bench.update(via, &file, &mut report).expect_err("ended");
@@ -414,7 +415,7 @@ fn the_eeprom_of_a_running_device_stays_assigned_to_it() {
         let state = |bench: &Bench| bench.device().al_state().to_string();
         for wanted in [AlState::PreOp, AlState::SafeOp, AlState::Op] {
             let name = &wanted.to_string();
-            let never = AtomicBool::new(false);
+            let never = CancelToken::default();
             let work = async |wire: DatagramClient| {
                 let at = device::locate(&wire, Locator::Position(0), None).await;
                 let (found, at) = at.expect("located");
@@ -450,7 +451,7 @@ fn the_eeprom_of_a_running_device_stays_assigned_to_it() {
         assert_eq!((bench.link.claims, state(bench).as_str()), (0, "Op"));
 
         // A device without an active MainDevice releases its EEPROM in Init for an update.
-        let never = AtomicBool::new(false);
+        let never = CancelToken::default();
         let back = async |wire: DatagramClient| {
             let at = device::locate(&wire, Locator::Position(0), None).await;
             let devices = [at.expect("located").1];

@@ -2,7 +2,6 @@
 //! `ecaxis sdo` and `ecaxis eeprom`.
 
 mod cli;
-use std::sync::atomic::AtomicBool;
 use std::thread;
 
 use ecaxis_ecat::index::DeviceIndex;
@@ -12,6 +11,7 @@ use ecaxis_master::acyclic::image::{with_alias, write};
 use ecaxis_master::acyclic::{AlState, al};
 use ecaxis_master::acyclic::{DatagramClient, Registers, device, mailbox};
 use ecaxis_master::bringup::bring_up;
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{self, Locator, Machine};
 use ecaxis_master::link::sim::SimLink;
@@ -64,7 +64,7 @@ fn on<T: Send + 'static>(machine: Machine, works: Vec<Work<T>>) -> Vec<T> {
 }
 
 fn carried<T>(link: &mut SimLink, work: impl AsyncFnOnce(DatagramClient) -> T) -> T {
-    run_on_link(link, Clock::Virtual, &AtomicBool::new(false), work).expect("carried")
+    run_on_link(link, Clock::Virtual, &CancelToken::default(), work).expect("carried")
 }
 
 /// Runs an operation on one device's mailbox.

@@ -7,8 +7,8 @@ mod causes;
 
 use std::fmt::Write;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{self, Clock};
 use ecaxis_master::config::Machine;
 use ecaxis_master::post_mortem::{Cause, FaultReport};
@@ -151,7 +151,7 @@ impl Controller for Slow {
 }
 
 fn overloaded(for_ns: u64) -> FaultReport {
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     let controller = Box::new(Slow { at: 1500, for_ns });
     let mut heard = Heard::default();
     let outcome = run_with(
@@ -329,7 +329,8 @@ fn a_failed_run_writes_its_report() {
 fn a_successful_or_interrupted_run_has_no_report() {
     let (outcome, _) = run(machine(&axes(1)), virtual_time());
     assert!(outcome.result.is_ok() && outcome.story.is_none());
-    let stop = Arc::new(AtomicBool::new(true));
+    let stop = Arc::<CancelToken>::default();
+    stop.cancel();
     let mut heard = Heard::default();
     let outcome = ecaxis_master::session::run(machine(&axes(1)), virtual_time(), stop, &mut heard);
     assert!(outcome.result.is_err() && outcome.story.is_none());

@@ -5,10 +5,10 @@ use std::num::NonZeroU64;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config::ExchangeMode;
 use ecaxis_master::link::capture::{CapturingLink, Recorder, WriterMode};
 use ecaxis_master::link::{self, Link, SocketKind};
@@ -65,7 +65,7 @@ fn run(link: Box<dyn Link>, setup: Setup, bus: Option<&Bus>, time: Duration) -> 
         setup,
         thread(time),
         bus,
-        &AtomicBool::new(false),
+        &CancelToken::default(),
     )
     .expect("runs")
     .expect("not interrupted")
@@ -219,7 +219,8 @@ fn an_interrupt_ends_a_bench_before_motion() {
     let segment = fixture::segment(1).expect("one axis");
     let link = Box::new(InProcess::new(segment, ReplyDelay::Wire));
     let (parts, outer) = fixture::parts(setup, link).expect("one axis");
-    let stop = Arc::new(AtomicBool::new(true));
+    let stop = Arc::<CancelToken>::default();
+    stop.cancel();
     let ended = measure::rig(
         parts,
         outer,

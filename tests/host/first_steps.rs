@@ -1,10 +1,10 @@
 //! The commands in docs/first-steps.md produce the output shown there.
 
 use std::process::Stdio;
-use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use ecaxis_master::acyclic::DatagramClient;
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::link::{self, SocketKind};
 use ecaxis_master::mailbox::MailboxTransport;
@@ -157,7 +157,7 @@ fn serve(bench: &Bench, pair: &VethPair, file: &str) -> ProgramOutput {
 /// leave it.
 fn led_to_safe_op(pair: &VethPair, position: u16) {
     let (mut link, _) = link::open(&pair.b, SocketKind::default()).expect("the interface");
-    let stop = AtomicBool::new(false);
+    let stop = CancelToken::default();
     let led = run_on_link(
         link.as_mut(),
         Clock::Real,

@@ -1,28 +1,28 @@
 //! Interruptions of a run in this process, in real time, because the user is another thread.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::session::{self, Error, Observer, Options, Progress, Summary};
 use ecaxis_test_support::host::retry_if_host_stalled;
 use ecaxis_test_support::{axes, machine};
 
 /// Stops the run like a user, when an event has occurred.
 struct Interrupter<F> {
-    stop: Arc<AtomicBool>,
+    stop: Arc<CancelToken>,
     when: F,
 }
 
 impl<F: FnMut(&Progress) -> bool> Observer for Interrupter<F> {
     fn progress(&mut self, progress: &Progress) {
         if (self.when)(progress) {
-            self.stop.store(true, Ordering::Relaxed);
+            self.stop.cancel();
         }
     }
 }
 
 fn interrupted(when: impl FnMut(&Progress) -> bool) -> (Option<Summary>, Result<(), Error>) {
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     let mut observer = Interrupter {
         stop: Arc::clone(&stop),
         when,

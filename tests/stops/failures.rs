@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 use std::future::Future;
 use std::path::Path;
 use std::pin::pin;
-use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::channel;
 use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll, Waker};
 
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Nanos;
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
@@ -543,7 +543,7 @@ fn a_panic_in_the_cycle_brings_the_axes_to_rest() {
         let job = RunBuilder {
             machine: &Arc::new(machine),
             options: &options,
-            stop: Arc::new(AtomicBool::new(false)),
+            stop: Arc::<CancelToken>::default(),
             progress,
             controller: None,
         };

@@ -2,9 +2,10 @@
 //! file.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use ecaxis_master::acyclic::DatagramClient;
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{Machine, Nic};
 use ecaxis_master::link::{self, Link, SocketKind};
@@ -90,7 +91,7 @@ impl Bus {
     {
         let nic = self.nic();
         let clock = self.options.clock;
-        let stop = Arc::new(AtomicBool::new(false));
+        let stop = Arc::<CancelToken>::default();
         signals::stop_on_interrupt(&stop);
         let heard = Arc::new(AtomicU64::new(0));
         let others = Arc::clone(&heard);

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::session::{self, SignalReport};
 use tokio::runtime::Builder;
 use tokio::signal::unix::{SignalKind, signal};
@@ -15,16 +16,16 @@ use crate::render::note;
 
 /// Sets `stop` at the first signal that ends the program; the next signal exits at once. An
 /// installation failure is only reported, because the program ends without signals, too.
-pub(crate) fn stop_on_interrupt(stop: &Arc<AtomicBool>) {
+pub(crate) fn stop_on_interrupt(stop: &Arc<CancelToken>) {
     listen(stop, true, || {});
 }
 
 /// Like [`stop_on_interrupt`], but prints nothing until the program exits. `restore` runs first.
-pub(crate) fn stop_quietly(stop: &Arc<AtomicBool>, restore: impl Fn() + Send + 'static) {
+pub(crate) fn stop_quietly(stop: &Arc<CancelToken>, restore: impl Fn() + Send + 'static) {
     listen(stop, false, restore);
 }
 
-fn listen(stop: &Arc<AtomicBool>, aloud: bool, restore: impl Fn() + Send + 'static) {
+fn listen(stop: &Arc<CancelToken>, aloud: bool, restore: impl Fn() + Send + 'static) {
     let listens = session::stop_on_signals(Arc::clone(stop), move |report| {
         if report == SignalReport::StopRepeated {
             restore();

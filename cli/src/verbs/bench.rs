@@ -3,9 +3,10 @@
 use std::num::NonZeroU64;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+
 use std::time::Duration;
 
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{self, Bus, ExchangeMode, Nic, duration};
 use ecaxis_master::link::SocketKind;
@@ -209,7 +210,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             "note: `{nic}` was left by a program that was killed; `ip link del {nic}` removes it"
         ));
     }
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     signals::stop_on_interrupt(&stop);
     let bus = Bus {
         cycle_ns: plan.cycle_ns,
@@ -244,7 +245,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         save(path, &(json + "\n"))?;
     }
     shown?;
-    if stop.load(Ordering::Relaxed) {
+    if stop.is_cancelled() {
         let message = "interrupted: this is what was measured so far";
         return Err(Failure::new(hints::INTERRUPTED, message));
     }

@@ -1,9 +1,9 @@
 //! The EEPROM before and after a command, and its backup.
 
-use std::sync::atomic::AtomicBool;
 use std::thread;
 
 use ecaxis_master::acyclic::AlState;
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{self, Locator, Nic};
 use ecaxis_master::link::sim::SimLink;
@@ -34,7 +34,7 @@ fn with_eeprom_of<T: Send + 'static>(
         let device = SimDevice::from_esi(&config.device, &config.esi.modules, options);
         let devices = vec![device.expect("a device")];
         let mut link = SimLink::new(Segment::new(devices, SegmentOptions::default()));
-        let stop = AtomicBool::new(false);
+        let stop = CancelToken::default();
         let done = run_on_link(&mut link, Clock::Virtual, &stop, async |wire| {
             let at = OpenDevice::find(wire, Locator::Position(0), None, Nic::Sim).await;
             work(&mut at.expect("located")).await

@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{self, ConfigError, Machine, Nic, duration};
 use ecaxis_master::post_mortem::FaultReport;
@@ -118,7 +118,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         );
     }
     let (nic, devices) = (machine.bus.nic.clone(), machine.devices.len());
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     signals::stop_on_interrupt(&stop);
     let mut teller = ProgressPrinter::new(options.clock, &machine.bus, args.verbosity.plain());
     let Outcome {

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config;
 use ecaxis_master::link::OpenError;
 use ecaxis_master::link::SocketKind;
@@ -102,7 +103,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut segment = session::simulated_bus(&machine, seed, at_once.as_ref(), ring)
         .map_err(|error| hints::failure(&error, &machine.bus.nic))?;
 
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     signals::stop_on_interrupt(&stop);
     let signalled = Arc::new(AtomicBool::new(false));
     if on_signal.is_some() {
@@ -148,19 +149,23 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         note(&format!("warning: {denied}"));
     }
     let stats = server
-        .serve(&mut segment, &stop, |segment, now| {
-            if let Some(script) = &on_signal
-                && signalled.swap(false, Ordering::Relaxed)
-            {
-                segment.start_faults(script.clone(), now);
-            }
-            if let Some(to) = &mut trace
-                && let Err(e) = to.sample(segment, now)
-            {
-                note(&format!("warning: writing the trace: {e}; it ends here"));
-                trace = None;
-            }
-        })
+        .serve(
+            &mut segment,
+            || stop.is_cancelled(),
+            |segment, now| {
+                if let Some(script) = &on_signal
+                    && signalled.swap(false, Ordering::Relaxed)
+                {
+                    segment.start_faults(script.clone(), now);
+                }
+                if let Some(to) = &mut trace
+                    && let Err(e) = to.sample(segment, now)
+                {
+                    note(&format!("warning: writing the trace: {e}; it ends here"));
+                    trace = None;
+                }
+            },
+        )
         .map_err(|e| hints::serve(&e))?;
     let report = report(&stats, &segment);
     result(&if args.json {

@@ -76,6 +76,16 @@ pub struct EsiFile {
     pub warnings: Vec<Warning>,
 }
 
+impl EsiFile {
+    /// Returns identity, type and name of each device, first of those built.
+    pub fn headers(&self) -> impl Iterator<Item = (Identity, &str, &str)> {
+        let built = self.devices.iter();
+        let built = built.map(|d| (d.identity, d.type_name.as_str(), d.name.as_str()));
+        let skipped = self.skipped.iter();
+        built.chain(skipped.map(|d| (d.identity, d.type_name.as_str(), d.name.as_str())))
+    }
+}
+
 /// A problem of one element that the reader skipped or replaced.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Warning {

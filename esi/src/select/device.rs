@@ -66,9 +66,7 @@ pub fn find_device<'a>(
         .copied()
         .max_by_key(|device| device.identity.revision)
     else {
-        let skipped = file.skipped.iter();
-        let skipped = skipped.map(|device| line(device.identity, &device.type_name, &device.name));
-        let available = list(file.devices.iter().map(line_of).chain(skipped));
+        let available = list(file.headers());
         return Err(SelectError::NoSuchDevice {
             query: query.to_string(),
             available,
@@ -79,7 +77,11 @@ pub fn find_device<'a>(
         .iter()
         .any(|device| device.identity.product != newest.identity.product)
     {
-        let available = list(matching.into_iter().map(line_of));
+        let available = list(
+            matching
+                .iter()
+                .map(|d| (d.identity, &*d.type_name, &*d.name)),
+        );
         return Err(SelectError::Ambiguous {
             query: query.to_string(),
             available,
@@ -108,20 +110,16 @@ fn unreadable(file: &EsiFile) -> String {
     .collect()
 }
 
-fn line_of(device: &Device) -> String {
-    line(device.identity, &device.type_name, &device.name)
-}
-
-fn line(id: Identity, type_name: &str, name: &str) -> String {
-    format!(
-        "{type_name} ({name}, product 0x{:08x} revision 0x{:08x})",
-        id.product, id.revision
-    )
-}
-
-fn list(devices: impl Iterator<Item = String>) -> String {
+fn list<'a>(devices: impl Iterator<Item = (Identity, &'a str, &'a str)>) -> String {
     const SHOWN: usize = 12;
-    let texts: Vec<String> = devices.collect();
+    let texts: Vec<String> = devices
+        .map(|(id, type_name, name)| {
+            format!(
+                "{type_name} ({name}, product 0x{:08x} revision 0x{:08x})",
+                id.product, id.revision
+            )
+        })
+        .collect();
     let more = texts.len().saturating_sub(SHOWN);
     let mut text = texts.into_iter().take(SHOWN).collect::<Vec<_>>().join("; ");
     if more > 0 {

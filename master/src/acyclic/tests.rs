@@ -2,7 +2,6 @@
 
 use std::cell::Cell;
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use ecaxis_esi::sii;
@@ -13,6 +12,7 @@ use super::enumerate::{EnumeratedDevice, address, enumerate, select};
 use super::image::{WriteError, write};
 use super::{DatagramClient, mailbox};
 use crate::acyclic::{AlState, DeviceRef};
+use crate::cancel::CancelToken;
 use crate::clock::Clock;
 use crate::config::{self, Locator};
 use crate::link::sim::SimLink;
@@ -31,7 +31,7 @@ fn with_drives<T: Send + 'static>(
         let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
         let machine = config::load(&demo).expect("a machine");
         let mut link = SimLink::new(simulated_bus(&machine, 1, None, None).expect("a bus"));
-        let done = run_on_link(&mut link, Clock::Virtual, &AtomicBool::new(false), work);
+        let done = run_on_link(&mut link, Clock::Virtual, &CancelToken::default(), work);
         (done.expect("carried"), link)
     });
     done.expect("a thread").join().expect("no panic")
@@ -273,7 +273,8 @@ fn run_on_link_returns_interrupted_when_stopped() {
         let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
         let machine = config::load(&demo).expect("a machine");
         let mut link = SimLink::new(simulated_bus(&machine, 1, None, None).expect("a bus"));
-        let stop = AtomicBool::new(true);
+        let stop = CancelToken::default();
+        stop.cancel();
         let done = run_on_link(&mut link, Clock::Virtual, &stop, async |wire| {
             enumerate(&wire).await
         });
@@ -287,7 +288,7 @@ fn run_on_link_returns_interrupted_when_stopped() {
 /// afterwards. 0x0500 is `access` before.
 fn stopped<T: Send + 'static>(
     access: u8,
-    work: impl AsyncFnOnce(DatagramClient, EnumeratedDevice, DeviceRef, &AtomicBool) -> T
+    work: impl AsyncFnOnce(DatagramClient, EnumeratedDevice, DeviceRef, &CancelToken) -> T
     + Send
     + 'static,
 ) -> (Result<T, Error>, (String, u8), Vec<u8>) {
@@ -297,7 +298,7 @@ fn stopped<T: Send + 'static>(
         let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
         let machine = config::load(&demo).expect("a machine");
         let mut link = SimLink::new(simulated_bus(&machine, 1, None, None).expect("a bus"));
-        let stop = AtomicBool::new(false);
+        let stop = CancelToken::default();
         let done = run_on_link(
             &mut link,
             Clock::Virtual,
@@ -310,7 +311,7 @@ fn stopped<T: Send + 'static>(
                 work(wire, found, device, &stop).await
             },
         );
-        let never = AtomicBool::new(false);
+        let never = CancelToken::default();
         let access = run_on_link(&mut link, Clock::Virtual, &never, async |wire| {
             let mut access = [0];
             let read = wire.read_at(0, 0x0500, &mut access).await;
@@ -329,14 +330,16 @@ fn with_mailbox_restores_the_device_when_stopped() {
         let work = async |wire: DatagramClient,
                           found: EnumeratedDevice,
                           at: DeviceRef,
-                          stop: &AtomicBool| {
+                          stop: &CancelToken| {
             let sii = read_sii(&wire, &at, EepromAccess::of(found.state)).await?;
             let mut reached = 0;
             let step = "reading its parameters";
             let all = with_mailbox(&wire, &at, &sii, step, async |lent| -> Result<(), Error> {
                 loop {
                     reached += 1;
-                    stop.store(reached >= 10, Ordering::Relaxed);
+                    if reached >= 10 {
+                        stop.cancel();
+                    }
                     let read = lent.coe.upload(&wire, 0x1018, 1, false).await;
                     read.map_err(|error| Cause::Sdo(error).with_device(&at))?;
                 }
@@ -363,7 +366,9 @@ fn with_eeprom_restores_access_when_stopped() {
             let mut reported = 0;
             let mut progress = |_, _| {
                 reported += 1;
-                stop.store(reported == 3, Ordering::Relaxed);
+                if reported == 3 {
+                    stop.cancel();
+                }
             };
             eeprom.image(&mut progress).await
         });
@@ -396,7 +401,11 @@ fn eeprom_write_completes_after_its_first_word() {
             let claim = EepromAccess::of(found.state);
             let written = with_eeprom(&wire, &at, "writing its EEPROM", claim, async |eeprom| {
                 let image = changed(&eeprom.image(&mut |_, _| {}).await?);
-                let mut progress = |n, _| stop.store(n == stop_at, Ordering::Relaxed);
+                let mut progress = |n, _| {
+                    if n == stop_at {
+                        stop.cancel();
+                    }
+                };
                 let written = write(eeprom, &image, &mut progress).await;
                 Ok::<_, Error>((written.map_err(|e| e.to_string()), image))
             });

@@ -2,11 +2,11 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::thread;
 
 use super::STACK;
 use crate::acyclic::DatagramClient;
+use crate::cancel::CancelToken;
 use crate::clock::Clock;
 use crate::link::Link;
 use crate::link::pdu_loop::{drive_pdu_loop, main_device};
@@ -22,7 +22,7 @@ use crate::report::{Cause, Error, panic_text};
 pub fn with_bus<T, W>(
     open: impl FnOnce() -> Result<Box<dyn Link>, Error> + Send + 'static,
     clock: Clock,
-    stop: Arc<AtomicBool>,
+    stop: Arc<CancelToken>,
     work: W,
 ) -> Result<T, Error>
 where
@@ -54,7 +54,7 @@ where
 pub fn run_on_link<T>(
     link: &mut dyn Link,
     clock: Clock,
-    stop: &AtomicBool,
+    stop: &CancelToken,
     work: impl AsyncFnOnce(DatagramClient) -> T,
 ) -> Result<T, Error> {
     let (main_device, mut port) = main_device(0);
@@ -66,7 +66,7 @@ pub fn run_on_link<T>(
             &mut port,
             link,
             clock,
-            ends.cancel_on(stop, ends.run_until_cancelled(work)),
+            ends.cancel_with(stop, ends.run_until_cancelled(work)),
         )
     });
     match catch_unwind(run) {

@@ -8,12 +8,13 @@ use std::io::Write as _;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::mpsc::{Sender, channel};
 use std::thread;
 
 use ecaxis_sim::FaultScript;
 
+use crate::cancel::CancelToken;
 use crate::clock::{Clock, Nanos};
 use crate::config::Machine;
 use crate::link::Link;
@@ -119,7 +120,7 @@ impl From<Error> for Outcome {
 pub fn run(
     machine: Machine,
     options: Options,
-    stop: Arc<AtomicBool>,
+    stop: Arc<CancelToken>,
     observer: &mut dyn Observer,
 ) -> Outcome {
     start(machine, options, stop, observer, ProgramSource::None, None)
@@ -130,7 +131,7 @@ pub fn run_on(
     link: Box<dyn Link>,
     machine: Machine,
     options: Options,
-    stop: Arc<AtomicBool>,
+    stop: Arc<CancelToken>,
     observer: &mut dyn Observer,
 ) -> Outcome {
     start(
@@ -149,7 +150,7 @@ pub fn run_on(
 pub fn run_with(
     machine: Machine,
     options: Options,
-    stop: Arc<AtomicBool>,
+    stop: Arc<CancelToken>,
     observer: &mut dyn Observer,
     controller: Box<dyn Controller>,
 ) -> Outcome {
@@ -163,7 +164,7 @@ pub fn run_with(
 pub fn run_with_operator(
     machine: Machine,
     options: Options,
-    stop: Arc<AtomicBool>,
+    stop: Arc<CancelToken>,
     observer: &mut dyn Observer,
     operator: Box<dyn Operator>,
 ) -> Outcome {
@@ -186,7 +187,7 @@ enum ProgramSource {
 fn start(
     machine: Machine,
     options: Options,
-    stop: Arc<AtomicBool>,
+    stop: Arc<CancelToken>,
     observer: &mut dyn Observer,
     instead: ProgramSource,
     link: Option<Box<dyn Link>>,
@@ -211,7 +212,7 @@ fn start(
     }));
     // A panic of the observer may end the process, so the axes stop first.
     if observed.is_err() {
-        stopped.store(true, Ordering::Relaxed);
+        stopped.cancel();
     }
     let outcome = owner
         .join()
@@ -239,7 +240,7 @@ fn report_panics_briefly() {
 fn run_on_link_thread(
     machine: &Arc<Machine>,
     options: &Options,
-    stop: Arc<AtomicBool>,
+    stop: Arc<CancelToken>,
     progress: Sender<Progress>,
     instead: ProgramSource,
     link: Option<Box<dyn Link>>,

@@ -2,7 +2,6 @@
 
 use std::collections::VecDeque;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::Sender;
 use std::time::Duration;
 
@@ -14,7 +13,7 @@ use ethercrab::{Command as Datagram, MainDevice};
 use super::fault_evidence::BringUpEvidence;
 use super::{Cause, EmergencyLog, Error, Options, Progress, open, panic_text};
 use crate::bringup::{Bus, Step, bring_up};
-use crate::cancel::run_until_set;
+use crate::cancel::CancelToken;
 use crate::clock::{self, Clock, Nanos};
 use crate::config::{Machine, Signal};
 use crate::datagram::{CyclicMailboxTransport, DatagramClient};
@@ -47,7 +46,7 @@ pub struct RunBuilder<'a> {
     pub machine: &'a Arc<Machine>,
     pub options: &'a Options,
     /// The flag that stops the run.
-    pub stop: Arc<AtomicBool>,
+    pub stop: Arc<CancelToken>,
     /// The receiver of progress reports.
     pub progress: Sender<Progress>,
     /// The controller that replaces the file's program.
@@ -316,7 +315,7 @@ pub(super) fn prefer_replay_end(error: Error, link: &dyn Link, before: &str) -> 
 /// The I/O of a bring-up and its stop conditions.
 struct BringUpIo<'a> {
     clock: Clock,
-    stop: &'a AtomicBool,
+    stop: &'a CancelToken,
     link: &'a mut dyn Link,
     port: &'a mut PduLoop,
 }
@@ -344,7 +343,7 @@ fn bring_up_catching_panics(
     // ethercrab panics on some wire content, for example on a SubDevice without an open port.
     let run = std::panic::AssertUnwindSafe(|| {
         let bring_up = Box::pin(bring_up(main_device, machine, image, &mut report, log));
-        drive_pdu_loop(port, link, clock, run_until_set(stop, bring_up))
+        drive_pdu_loop(port, link, clock, stop.run_until_cancelled(bring_up))
     });
     match std::panic::catch_unwind(run) {
         Ok(Ok(Some(Ok(bus)))) => Ok(bus),

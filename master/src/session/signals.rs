@@ -3,13 +3,14 @@
 use std::fmt;
 use std::io;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+
 use std::thread;
 use std::time::{Duration, Instant};
 
 use tokio::runtime::Builder;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
+use crate::cancel::CancelToken;
 use crate::sys::signal as disposition;
 
 /// Signals that would end or suspend the process by default, ignored while the axes move.
@@ -57,7 +58,7 @@ impl fmt::Display for SignalReport {
 /// # Errors
 /// Fails if a signal cannot be caught or the thread cannot be started.
 pub fn stop_on_signals(
-    stop: Arc<AtomicBool>,
+    stop: Arc<CancelToken>,
     mut report: impl FnMut(SignalReport) + Send + 'static,
 ) -> io::Result<()> {
     let runtime = Builder::new_current_thread().enable_all().build()?;
@@ -83,7 +84,7 @@ pub fn stop_on_signals(
                     continue;
                 }
             };
-            stop.store(true, Ordering::Relaxed);
+            stop.cancel();
             match first {
                 None => {
                     first = Some(Instant::now());

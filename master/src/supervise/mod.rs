@@ -6,7 +6,6 @@ use std::collections::VecDeque;
 use std::future::poll_fn;
 use std::pin::pin;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::Sender;
 use std::time::Duration;
 
@@ -15,7 +14,7 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 
 use crate::acyclic::{AlState, DeviceRef, al};
 use crate::bringup::{Bus, clocks};
-use crate::cancel::run_until_set;
+use crate::cancel::CancelToken;
 use crate::clock::{self, Nanos};
 use crate::config::steps::enables;
 use crate::config::{Machine, Step};
@@ -62,7 +61,7 @@ pub struct Supervisor {
     /// The emergencies of the devices.
     pub log: EmergencyLog,
     pub outer: HostEndpoint,
-    pub stop: Arc<AtomicBool>,
+    pub stop: Arc<CancelToken>,
     pub progress: Sender<Progress>,
     /// The number of program runs, unless the time limit ends the program first.
     pub repeat: u32,
@@ -126,7 +125,7 @@ impl Supervisor {
     async fn run_inner(mut self) -> (ProgramOutcome, Result<(), Error>) {
         let mut ended = ProgramOutcome::default();
         let stop = Arc::clone(&self.stop);
-        let worked = run_until_set(&stop, self.run_to_end(&mut ended)).await;
+        let worked = stop.run_until_cancelled(self.run_to_end(&mut ended)).await;
         ended.interrupted = worked.is_none();
         ended.group_stops = self.group_stops();
         let mut result = worked.unwrap_or(Ok(()));

@@ -4,14 +4,12 @@
 //! * `stats`: statistics
 //!
 //! ```no_run
-//! use std::sync::atomic::AtomicBool;
-//!
 //! use ecaxis_sim::{Segment, SegmentOptions, ServeStats, Server};
 //!
 //! let mut segment = Segment::new(Vec::new(), SegmentOptions::default());
 //! let server = Server::open(&["eth1"])?;
-//! let stop = AtomicBool::new(false); // set by another thread
-//! let stats: ServeStats = server.serve(&mut segment, &stop, |_segment, _now| {})?;
+//! let stop = || false;
+//! let stats: ServeStats = server.serve(&mut segment, stop, |_segment, _now| {})?;
 //! println!("{} frames", stats.frames);
 //! # Ok::<(), ecaxis_sim::ServeError>(())
 //! ```
@@ -20,7 +18,6 @@ mod socket;
 mod stats;
 
 use std::io;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use crate::frame::{self, Kind};
 use crate::network::Nic;
@@ -82,7 +79,7 @@ impl Server {
         })
     }
 
-    /// Answers every frame until `stop` is set. A frame reaches the devices at the time of its
+    /// Answers every frame until `stop` returns true. A frame reaches the devices at the time of its
     /// arrival at the interface.
     ///
     /// The thread sleeps until a frame arrives. A spinning thread answers 1.5 times as fast at the
@@ -92,7 +89,7 @@ impl Server {
     pub fn serve(
         &self,
         segment: &mut Segment,
-        stop: &AtomicBool,
+        stop: impl Fn() -> bool,
         mut between: impl FnMut(&mut Segment, Nanos),
     ) -> Result<ServeStats, ServeError> {
         let mut replies = Replies {
@@ -102,7 +99,7 @@ impl Server {
         };
         let mut buffer = [0_u8; MAX_FRAME];
         let mut idle = 0_u64;
-        while !stop.load(Ordering::Relaxed) {
+        while !stop() {
             let now = clock(libc::CLOCK_MONOTONIC);
             replies.release(now);
             segment.advance(now);
@@ -117,7 +114,7 @@ impl Server {
             for (socket, nic) in self.sockets.iter().zip([Nic::Primary, Nic::Secondary]) {
                 while let Some(received) = socket.receive(&mut buffer)? {
                     replies.answer(segment, nic, received, &mut buffer);
-                    if stop.load(Ordering::Relaxed) {
+                    if stop() {
                         break;
                     }
                 }

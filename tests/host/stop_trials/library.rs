@@ -2,11 +2,12 @@
 
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread::{JoinHandle, sleep};
 use std::time::{Duration, Instant};
 
 use ecaxis_axis::Command;
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config::{self, AxisRef, Machine, Nic};
 use ecaxis_master::link::{self, Link, LinkError, LinkStats, MAX_FRAME, capture::RecordStats};
 use ecaxis_master::rt::controller::{Controller, CycleContext};
@@ -29,7 +30,7 @@ pub(super) enum Injected {
 }
 
 pub(super) struct Library {
-    stop: Arc<AtomicBool>,
+    stop: Arc<CancelToken>,
     /// The number of remaining panics, once they have started.
     panics: Arc<AtomicUsize>,
     times: usize,
@@ -40,7 +41,7 @@ impl Library {
     pub fn start(file: &Path, nic: &str, injected: Injected) -> Self {
         let mut machine = config::load(file).unwrap_or_else(|error| panic!("{error}"));
         machine.bus.nic = Nic::Interface(nic.to_owned());
-        let (stop, panics) = (Arc::<AtomicBool>::default(), Arc::<AtomicUsize>::default());
+        let (stop, panics) = (Arc::<CancelToken>::default(), Arc::<AtomicUsize>::default());
         let times = match injected {
             Injected::Controller => 1,
             Injected::Cycle { times } => times,
@@ -76,7 +77,7 @@ impl Library {
 
 impl Drop for Library {
     fn drop(&mut self) {
-        self.stop.store(true, Ordering::Relaxed);
+        self.stop.cancel();
     }
 }
 
@@ -84,7 +85,7 @@ fn run(
     machine: Machine,
     nic: &str,
     injected: Injected,
-    stop: Arc<AtomicBool>,
+    stop: Arc<CancelToken>,
     panics: Arc<AtomicUsize>,
 ) -> bool {
     let mut heard = Heard::default();

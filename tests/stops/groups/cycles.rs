@@ -1,10 +1,10 @@
 //! Group stops cycle by cycle, as a controller sees them.
 
-use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 
 use ecaxis_axis::{AxisStatus, Command, CommandError, State};
 use ecaxis_ecat::index::AxisIndex;
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config::{AxisRef, Machine};
 use ecaxis_master::rt::bus_monitor::StopCause;
 use ecaxis_master::rt::controller::{Controller, CycleContext};
@@ -42,7 +42,7 @@ fn trace(
         trace.push(axes.map(|axis| (machine.axis(axis), machine.stopped(axis).is_some())));
         act(machine, &axes, trace.len());
     };
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     let outcome = run_with(
         machine,
         options,

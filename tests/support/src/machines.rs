@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{self, Machine};
 use ecaxis_master::session::{self, Observer, Options, Outcome, Progress, Summary};
@@ -95,12 +95,7 @@ pub fn recorded(options: Options, folder: &Path) -> (Options, PathBuf) {
 
 pub fn run(machine: Machine, options: Options) -> (Outcome, Heard) {
     let mut heard = Heard::default();
-    let outcome = session::run(
-        machine,
-        options,
-        Arc::new(AtomicBool::new(false)),
-        &mut heard,
-    );
+    let outcome = session::run(machine, options, Arc::<CancelToken>::default(), &mut heard);
     (outcome, heard)
 }
 

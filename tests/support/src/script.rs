@@ -1,11 +1,11 @@
 //! Runs commands in sequence through a [`Controller`] and records the axis status of every cycle.
 
-use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 
 use ecaxis_axis::cia402::Mode;
 use ecaxis_axis::status::HomingStatus;
 use ecaxis_axis::{AxisStatus, Command};
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config::{AxisRef, Machine};
 use ecaxis_master::rt::controller::{Controller, CycleContext};
 use ecaxis_master::session::{Options, Outcome, run_with};
@@ -147,7 +147,7 @@ pub fn perform(machine: Machine, axis: &str, acts: &[Act], options: Options) -> 
         limit: options.limit.or(Some(120_000_000_000)),
         ..options
     };
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     let mut heard = Heard::default();
     let outcome = run_with(machine, options, stop, &mut heard, Box::new(script));
     let mut kept = trace.lock().expect("no panic while it is locked");

@@ -1,7 +1,8 @@
 //! A machine with axes on a [`BenchSegment`] without a bring-up: the parts of the real cycle and a
 //! minimal supervisor.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use ecaxis_master::cancel::CancelToken;
+
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -205,7 +206,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
 pub fn set_in_motion(
     outer: &mut HostEndpoint,
     setup: Setup,
-    stop: &AtomicBool,
+    stop: &CancelToken,
 ) -> Result<bool, RigError> {
     order(outer, RtCommand::Guard);
     let locked = wait(outer, stop, "the phase is not locked", |outer| {
@@ -257,13 +258,13 @@ fn order(outer: &mut HostEndpoint, order: RtCommand) {
 
 fn wait(
     outer: &mut HostEndpoint,
-    stop: &AtomicBool,
+    stop: &CancelToken,
     what: &'static str,
     mut done: impl FnMut(&mut HostEndpoint) -> bool,
 ) -> Result<bool, RigError> {
     let start = Instant::now();
     while !done(outer) {
-        if stop.load(Ordering::Relaxed) {
+        if stop.is_cancelled() {
             return Ok(false);
         }
         if start.elapsed() > TIMEOUT {

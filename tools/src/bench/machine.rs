@@ -1,10 +1,10 @@
 //! The machine of a machine file on its own bus. A normal session brings the bus up and down.
 
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use super::measure::Measured;
 use super::plan::Plan;
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config::Machine;
 use ecaxis_master::rt::spin::Spin;
 use ecaxis_master::session::{self, Error, Observer, Options, Outcome};
@@ -19,7 +19,7 @@ pub fn run(
     enable: bool,
     plan: &Plan,
     spin: Spin,
-    stop: &Arc<AtomicBool>,
+    stop: &Arc<CancelToken>,
     observer: &mut dyn Observer,
 ) -> Result<Option<Measured>, Error> {
     let mut machine = machine.clone();

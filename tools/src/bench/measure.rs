@@ -1,12 +1,13 @@
 //! Runs the real cycle on a real-time thread and measures it.
 
-use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+use std::sync::atomic::{AtomicU8, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use super::bus::{Bus, Counts};
 use super::fixture::{self, RigError, Setup};
 use crate::host::counters::{CpuCounters, CpuTimeDelta};
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{self, Clock, Nanos};
 use ecaxis_master::rt::channel::HostEndpoint;
 use ecaxis_master::rt::cycle::{Engine, EngineConfig};
@@ -90,7 +91,7 @@ pub fn rig(
     setup: Setup,
     thread: Thread,
     bus: Option<&Bus>,
-    stop: &AtomicBool,
+    stop: &CancelToken,
 ) -> Result<Option<Measured>, TurnError> {
     let step = AtomicU8::new(0);
     thread::scope(|scope| {
@@ -103,7 +104,7 @@ pub fn rig(
         if matches!(moving, Ok(true)) {
             step.store(MEASURE, Ordering::Release);
             let start = Instant::now();
-            while start.elapsed() < thread.time && !stop.load(Ordering::Relaxed) {
+            while start.elapsed() < thread.time && !stop.is_cancelled() {
                 thread::sleep(TICK.min(thread.time.saturating_sub(start.elapsed())));
             }
         }

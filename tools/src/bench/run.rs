@@ -3,7 +3,6 @@
 
 use std::io;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::bus::{Bus, InProcess, Options};
 use super::fixture::{self, RigError, Setup};
@@ -17,6 +16,7 @@ use super::wakeup::Cyclictest;
 use super::{caveats, machine};
 use crate::host::Fact;
 use crate::host::counters::CpuCounters;
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config::ExchangeMode;
 use ecaxis_master::config::duration::show as duration;
 use ecaxis_master::link::{self, Link, OpenError, SocketKind};
@@ -97,7 +97,7 @@ pub struct HostCheck {
 /// Fails if a variant cannot be run.
 pub fn run(
     plan: &Plan,
-    stop: &Arc<AtomicBool>,
+    stop: &Arc<CancelToken>,
     watcher: &mut dyn BenchObserver,
     check_host: impl FnOnce() -> HostCheck,
 ) -> Result<Option<Report>, BenchError> {
@@ -113,7 +113,7 @@ pub fn run(
     let mut all = variants(plan);
     'rounds: for round in 1..=plan.rounds {
         for kept in &mut all {
-            if stop.load(Ordering::Relaxed) {
+            if stop.is_cancelled() {
                 break 'rounds;
             }
             watcher.round(round, plan.rounds, &kept.name);
@@ -229,7 +229,7 @@ impl<'a> Fixture<'a> {
     fn round(
         &self,
         kept: &mut VariantResult,
-        stop: &Arc<AtomicBool>,
+        stop: &Arc<CancelToken>,
         watcher: &mut dyn BenchObserver,
     ) -> Result<bool, BenchError> {
         let plan = self.plan;
@@ -309,7 +309,7 @@ impl<'a> Fixture<'a> {
         spin: Spin,
         exchange: ExchangeMode,
         back_end: SocketKind,
-        stop: &AtomicBool,
+        stop: &CancelToken,
     ) -> Result<Option<Measured>, BenchError> {
         let plan = self.plan;
         let link: Box<dyn Link> = match &self.pair {

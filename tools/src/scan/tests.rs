@@ -3,7 +3,6 @@
 use std::future::{Future, poll_fn};
 use std::path::Path;
 use std::pin::pin;
-use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::channel;
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::task::{Context, Poll, Waker};
@@ -15,6 +14,7 @@ use super::{MainDeviceEvidence, Options, Scan, scan};
 use ecaxis_master::acyclic::AlState;
 use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::acyclic::enumerate::{address, enumerate};
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config::{self, Machine};
 use ecaxis_master::link::sim::SimLink;
@@ -39,7 +39,7 @@ fn on<T: Send + 'static>(
             .join(file);
         let machine = config::load(&path).expect("a machine");
         let mut link = SimLink::new(simulated_bus(&machine, 1, None, None).expect("a bus"));
-        let done = run_on_link(&mut link, Clock::Virtual, &AtomicBool::new(false), work);
+        let done = run_on_link(&mut link, Clock::Virtual, &CancelToken::default(), work);
         (done.expect("carried"), link)
     });
     done.expect("a thread").join().expect("no panic")
@@ -223,7 +223,7 @@ fn ran_well(link: &Shared, machine: &Arc<Machine>) -> bool {
         clock: Clock::Virtual,
         ..session::Options::default()
     };
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     let (progress, _told) = channel();
     let own = Box::new(link.clone());
     let job = RunBuilder {
@@ -288,7 +288,7 @@ fn scan_finds_no_main_device_after_a_run() {
                 ask: true,
                 ..Options::default()
             };
-            let stop = AtomicBool::new(false);
+            let stop = CancelToken::default();
             let look = run_on_link(
                 &mut bus,
                 Clock::Virtual,

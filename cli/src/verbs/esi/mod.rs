@@ -180,9 +180,7 @@ impl DeviceArgs {
                 },
                 Some(name),
             ) => {
-                let built = file.devices.iter().map(|device| &*device.type_name);
-                let skipped = file.skipped.iter().map(|device| &*device.type_name);
-                let mut types: Vec<&str> = built.chain(skipped).collect();
+                let mut types: Vec<&str> = file.headers().map(|(_, kind, _)| kind).collect();
                 let count = pluralize(types.len(), "device");
                 types.dedup();
                 let failure = failure(format!("none of its {count} matches {query}{unreadable}"));

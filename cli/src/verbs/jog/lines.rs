@@ -1,13 +1,13 @@
 //! Commands as lines, for scripts and without a terminal.
 
 use std::io::{self, BufRead, IsTerminal, Read, Write};
-use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::{Receiver, RecvError, Sender, TryRecvError, channel, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 
 use ecaxis_axis::Mode;
 use ecaxis_ecat::index::AxisIndex;
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config::{Machine, duration, nearest};
 use ecaxis_master::session::{self, Observer, Options, Progress};
@@ -62,7 +62,7 @@ enum Line {
 pub(super) fn run(
     machine: Machine,
     options: Options,
-    stop: Arc<AtomicBool>,
+    stop: Arc<CancelToken>,
     json: bool,
 ) -> Result<(), Failure> {
     let (lines, read) = sync_channel(AHEAD);

@@ -20,6 +20,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config::{Machine, Nic};
 use ecaxis_master::session::{self, Cause, Error, Observer, Options, Outcome, Progress};
@@ -114,7 +115,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     let options = options(args, &machine)?;
     let nic = machine.bus.nic.clone();
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::<CancelToken>::default();
     if args.lines {
         signals::stop_on_interrupt(&stop);
         return lines::run(machine, options, stop, args.json);
@@ -183,7 +184,7 @@ fn on(
     terminal: Terminal,
     machine: Machine,
     options: Options,
-    stop: &Arc<AtomicBool>,
+    stop: &Arc<CancelToken>,
     args: &Args,
     shared: &Arc<Shared>,
 ) -> Outcome {
@@ -374,7 +375,7 @@ struct TerminalSide<'s> {
     terminal: Terminal,
     asks: Sender<(Instant, UiAction)>,
     shared: &'s Shared,
-    stop: &'s AtomicBool,
+    stop: &'s CancelToken,
     title: &'s str,
 }
 
@@ -420,7 +421,7 @@ impl TerminalSide<'_> {
         }
         // The machine detects a missing terminal itself, but only after the bus is up.
         if !self.shared.over.load(Ordering::Relaxed) && self.shared.seen().panel.is_none() {
-            self.stop.store(true, Ordering::Relaxed);
+            self.stop.cancel();
         }
     }
 
@@ -428,7 +429,7 @@ impl TerminalSide<'_> {
         if ask == UiAction::Leave {
             self.shared.left.store(true, Ordering::Relaxed);
             if !attended {
-                self.stop.store(true, Ordering::Relaxed);
+                self.stop.cancel();
             }
         }
         self.send(ask);

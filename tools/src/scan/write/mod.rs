@@ -248,20 +248,21 @@ fn esi_keys(
     let path = relative(&described.path, place.folder);
     lines.add("esi", &quoted(&path.display().to_string()), "");
     let ours = described.device.identity;
-    let devices = &described.file.devices;
-    let mut others = devices
-        .iter()
-        .filter(|d| d.identity.product != ours.product)
+    let mut others = described
+        .file
+        .headers()
+        .filter(|(id, ..)| id.product != ours.product)
         .peekable();
     if others.peek().is_some() {
         lines.add("type", &quoted(&described.device.type_name), "");
-        if others.any(|d| d.type_name == described.device.type_name) {
+        if others.any(|(_, type_name, _)| type_name == described.device.type_name) {
             lines.add("product", &format!("0x{:08x}", ours.product), "");
         }
     }
-    let newer = devices
-        .iter()
-        .any(|d| d.identity.product == ours.product && d.identity.revision > ours.revision);
+    let newer = described
+        .file
+        .headers()
+        .any(|(id, ..)| id.product == ours.product && id.revision > ours.revision);
     if newer {
         lines.add("revision", &format!("0x{:08x}", ours.revision), "");
     }
