@@ -11,7 +11,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 static MEASUREMENT: Mutex<()> = Mutex::new(());
 
-/// Keeps tests that measure the process apart.
+/// Keeps the tests apart: what one of them needs would count in the measurement of another.
 pub fn measure() -> MutexGuard<'static, ()> {
     MEASUREMENT.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -282,6 +282,7 @@ fn said(image: &[u8]) -> Vec<String> {
 
 #[test]
 fn damage_is_reported_with_its_position() {
+    let _alone = crate::measure();
     assert_eq!(said(&whole()), Vec::<String>::new());
     for (what, damage, expected) in CASES {
         let mut image = whole();
@@ -304,6 +305,7 @@ fn damage_is_reported_with_its_position() {
 /// Checks every cut and every wrong byte.
 #[test]
 fn parse_never_panics_on_cuts_and_wrong_bytes() {
+    let _alone = crate::measure();
     let image = whole();
     let used = head(&image, 0xffff) + 2;
     for end in 0..used {
@@ -352,6 +354,7 @@ fn parse_needs_bounded_memory_for_any_counts() {
 
 #[test]
 fn emitted_images_have_no_warnings() {
+    let _alone = crate::measure();
     for path in common::files("esi", &["xml"]) {
         let file = parse(&std::fs::read(&path).unwrap()).unwrap();
         for device in &file.devices {
@@ -364,6 +367,7 @@ fn emitted_images_have_no_warnings() {
 /// A warning about values that real devices contain would be a false alarm.
 #[test]
 fn recorded_images_have_one_warning() {
+    let _alone = crate::measure();
     let mut odd = Vec::new();
     for path in common::files("sii", &["bin", "hex", "sii"]) {
         let bytes = std::fs::read(&path).unwrap();
