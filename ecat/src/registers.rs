@@ -80,5 +80,5 @@ pub const DC_ACTIVATION: u16 = 0x0981;
 pub const DC_START_TIME: u16 = 0x0990;
 /// SYNC0 cycle time.
 pub const DC_SYNC0_CYCLE: u16 = 0x09a0;
-/// SYNC1 cycle time.
+/// SYNC1 cycle time: the time from SYNC0 to SYNC1.
 pub const DC_SYNC1_CYCLE: u16 = 0x09a4;

@@ -1,7 +1,9 @@
 //! Unusual but valid choices of vendor files: repeated objects, Excludes, empty lists, mappings
 //! without PDO elements, and SYNC1.
 
-use ecaxis_esi::{EntryRef, Mode, SelectOptions, Selection, find_device, parse, select};
+use ecaxis_esi::{
+    EntryRef, Mode, SelectOptions, Selection, find_device, offered_modes, parse, select,
+};
 
 const MS: u64 = 1_000_000;
 
@@ -262,6 +264,11 @@ fn a_mapping_that_only_the_dictionary_has_takes_the_objects_of_the_mode() {
             (0, vec![2]),
         ]
     );
+    let parsed = parse(&file).unwrap();
+    assert_eq!(
+        offered_modes(&parsed, &parsed.devices[0]),
+        [Mode::Pp, Mode::Csp]
+    );
     // The user's own contents.
     let list = [EntryRef {
         index: 0x6040,
@@ -273,6 +280,36 @@ fn a_mapping_that_only_the_dictionary_has_takes_the_objects_of_the_mode() {
         ..SelectOptions::default()
     };
     assert_eq!(choose(&file, &choice).layout.rx_bytes(), 2);
+}
+
+/// The empty mapping object of a drive with other PDOs is used only where these lack the Statusword
+/// or the set-point.
+#[test]
+fn an_empty_mapping_object_leaves_a_usable_default_alone() {
+    let status = pdo(
+        "TxPdo",
+        "Fixed=\"1\" Sm=\"3\" Mandatory=\"1\"",
+        0x1a00,
+        &[(0x6041, 16), (0x6064, 32)],
+    );
+    let empty = pdo("TxPdo", "", 0x1a07, &[]);
+    let csv = pdo(
+        "RxPdo",
+        "Fixed=\"1\" Sm=\"2\"",
+        0x1600,
+        &[CONTROL, VELOCITY],
+    );
+    let speed = "<Profile><Dictionary><DataTypes><DataType><Name>DINT</Name><BitSize>32</BitSize>\
+        </DataType></DataTypes><Objects><Object><Index>#x606C</Index><Name>v</Name><Type>DINT</Type>\
+        <BitSize>32</BitSize><Flags><Access>ro</Access><PdoMapping>T</PdoMapping></Flags></Object>\
+        </Objects></Dictionary></Profile>";
+    for coe in [FREE, "PdoConfig=\"1\""] {
+        let file = drive(coe, &[speed, &csv, &status, &empty].concat(), "");
+        let selection = in_mode(&file, Mode::Csv);
+        assert_eq!(tx(&selection), [0x1a00], "{coe}");
+        let note = selection.notes.iter().any(|note| note.contains("0x606c"));
+        assert!(note, "{:?}", selection.notes);
+    }
 }
 
 /// Register 0x09A4 is the time from SYNC0 to SYNC1 (ET1100 data sheet, section I, 9.2.3). EL7201
@@ -289,6 +326,9 @@ fn sync1_is_the_delay_after_sync0() {
         ("1", ">4000000", 0, "#x700", 1_000_000, 3_000_000),
         ("1", "Factor=\"0\">0", 500, "#x700", 1_000_000, 500),
         ("1", "Factor=\"1\">0", 1_000, "#x300", 1_000_000, 0),
+        // SYNC1 cannot come before SYNC0.
+        ("1", "Factor=\"-4\">0", 0, "#x700", 1_000_000, 250_000),
+        ("1", "Factor=\"1\">0", -100, "#x700", 1_000_000, 999_900),
     ];
     let pdos = pdo(
         "RxPdo",

@@ -146,6 +146,30 @@ fn reference_without_definition_loses_only_its_pdo() {
 }
 
 #[test]
+fn references_may_refer_forwards_twice() {
+    let chain = "<Pdo Ref=\"b\"/><TxPdo Ref=\"status\" RefName=\"b\"><Name>B</Name></TxPdo>";
+    let file = parse(&two_devices(chain, DEFINITION)).unwrap();
+    assert_eq!(file.warnings, []);
+    let names: Vec<_> = file.devices[0]
+        .tx_pdos
+        .iter()
+        .map(|pdo| &*pdo.name)
+        .collect();
+    assert_eq!(names, ["B", "B"]);
+}
+
+/// A copy needs as much memory as its definition, which a file of this size does not.
+#[test]
+fn many_references_to_a_long_name_lose_their_device() {
+    let name = "n".repeat(1 << 20);
+    let definition =
+        format!("<TxPdo RefName=\"x\"><Index>#x1A00</Index><Name>{name}</Name></TxPdo>");
+    let file = parse(&two_devices(&definition, &"<Pdo Ref=\"x\"/>".repeat(2_000))).unwrap();
+    assert_eq!(file.devices.len(), 1);
+    assert!(file.warnings[0].message.contains("exceed"));
+}
+
+#[test]
 fn many_references_to_a_long_pdo_lose_their_device() {
     let entry = "<Entry><Index>0</Index><BitLen>1</BitLen></Entry>".repeat(10_000);
     let definition = format!("<TxPdo RefName=\"x\"><Index>#x1A00</Index>{entry}</TxPdo>");

@@ -63,6 +63,12 @@ impl CancelToken {
         run_until(|| self.is_cancelled() && held() == outside, work).await
     }
 
+    /// Runs `work` until it completes. Returns `None` once the token is cancelled, even in a shielded
+    /// section.
+    pub(crate) async fn run_until_requested<F: Future>(&self, work: F) -> Option<F::Output> {
+        run_until(|| self.is_cancelled(), work).await
+    }
+
     /// Runs `work` to completion even if the token is cancelled.
     pub async fn shield<F: Future>(&self, work: F) -> F::Output {
         let _held = ShieldGuard::new(&self.held);

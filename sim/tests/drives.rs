@@ -185,3 +185,21 @@ fn cycle_of_two_drives_is_far_faster_than_real_time() {
         assert!(each < 40_000, "{each} ns per cycle");
     }
 }
+
+/// Voltage enabled (Statusword bit 4) is the supply in most drives. A maxon drive reports its power
+/// stage (EPOS4 firmware specification, Statusword).
+#[test]
+fn only_a_maxon_drive_clears_voltage_enabled_without_power() {
+    let own = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/esi/SV1.xml");
+    let own = std::fs::read(own).unwrap();
+    for (bytes, expected) in [(Some(own), 0x0010), (fixture(EPOS4), 0x0000)] {
+        let Some(bytes) = bytes else { continue };
+        let file = ecaxis_esi::parse(&bytes).unwrap();
+        let mut bus = Bus::new(vec![sim(&file.devices[0])]);
+        bus.address_all();
+        bus.wait(10_000_000);
+        let word = bus.segment.device(0).unwrap().object(0x6041, 0).unwrap();
+        let word = u16::from_le_bytes([word[0], word[1]]);
+        assert_eq!(word & 0x0050, 0x0040 | expected, "0x{word:04x}");
+    }
+}

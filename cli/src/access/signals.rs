@@ -14,7 +14,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use crate::failure::FAILED;
 use crate::render::note;
 
-/// Sets `stop` at the first signal that ends the program; the next signal exits at once. An
+/// Cancels `stop` at the first signal that ends the program; the next signal exits at once. An
 /// installation failure is only reported, because the program ends without signals, too.
 pub(crate) fn stop_on_interrupt(stop: &Arc<CancelToken>) {
     listen(stop, true, || {});

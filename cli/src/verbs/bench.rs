@@ -3,7 +3,6 @@
 use std::num::NonZeroU64;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-
 use std::time::Duration;
 
 use ecaxis_master::cancel::CancelToken;

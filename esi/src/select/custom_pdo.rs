@@ -110,7 +110,7 @@ impl PdoSelector<'_> {
 
     /// Returns length and type of an object, from the dictionary or from any PDO that maps the
     /// object.
-    fn entry(&self, wanted: EntryRef) -> Result<Entry, SelectError> {
+    pub(super) fn entry(&self, wanted: EntryRef) -> Result<Entry, SelectError> {
         let EntryRef { index, sub } = wanted;
         if let Some((object, item)) = self
             .dictionary

@@ -103,7 +103,14 @@ pub(super) fn settings(mode: &DcMode, cycle_ns: u64) -> Result<DcSettings, Selec
     };
     let sync1_delay = match mode.assign_activate & SYNC1 {
         0 => 0,
-        _ => sync1_cycle - sync0 + shift(mode.sync1, sync0),
+        // SYNC1 cannot come before SYNC0: then it follows the SYNC0 before.
+        _ => {
+            let delay = sync1_cycle - sync0 + shift(mode.sync1, sync0);
+            match delay < 0 {
+                true => delay.rem_euclid(sync0.max(1)),
+                false => delay,
+            }
+        }
     };
     Ok(DcSettings {
         name: mode.name.clone(),

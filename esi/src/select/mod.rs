@@ -300,9 +300,16 @@ pub fn offered_modes(file: &EsiFile, device: &Device) -> Vec<Mode> {
                     |placed| placed.iter().any(|p| module::mode_of(&p.module).is_some()),
                 );
             }
-            let control = |pdo: &Pdo, index| pdo.entries.iter().any(|entry| entry.index == index);
-            mode.target_object()
-                .is_some_and(|target| device.rx_pdos.iter().any(|pdo| control(pdo, target)))
+            let has = |pdo: &Pdo, index| pdo.entries.iter().any(|entry| entry.index == index);
+            // An empty mapping object takes any object that the dictionary maps.
+            let mappable = |target| {
+                let empty = |pdo: &Pdo| !pdo.fixed && pdo.entries.is_empty();
+                let item = device.dictionary.item(target, 0);
+                device.rx_pdos.iter().any(empty) && item.is_some_and(|i| i.pdo_mapping.rx)
+            };
+            mode.target_object().is_some_and(|target| {
+                device.rx_pdos.iter().any(|pdo| has(pdo, target)) || mappable(target)
+            })
         })
         .collect()
 }

@@ -1,9 +1,14 @@
 //! Selects the assigned PDOs and their contents.
 
+use std::collections::HashMap;
+
 use super::module::PluggedModule;
 use super::{EntryRef, SelectError, oversampling};
 use crate::mode::Mode;
 use crate::model::{Coe, Device, Dictionary, Direction, Pdo, SmUse};
+
+const STATUSWORD: u16 = 0x6041;
+const POSITION: u16 = 0x6064;
 
 /// A named list of PDOs by SyncManager: an `AlternativeSmMapping`, or the assignment of a DC mode.
 #[derive(Clone, Copy)]
@@ -235,22 +240,12 @@ impl PdoSelector<'_> {
                 Direction::Tx => self.with_position(available, &default, set, &needed),
             });
         }
-        // A mapping object without contents takes what the mode needs.
-        let is_empty = |pdo: &&Pdo| !pdo.fixed && pdo.entries.is_empty();
-        let configurable = self.coe().is_some_and(|coe| coe.pdo_config);
-        if let Some(carrier) = available.iter().find(is_empty).filter(|_| configurable) {
-            let list: Vec<_> = needed
-                .iter()
-                .map(|&index| EntryRef { index, sub: 0 })
-                .collect();
-            let empty = std::slice::from_ref(carrier);
-            if let Ok(set) = self.with_own_entries(empty, &[], &list, Some(mode)) {
-                notes.push(format!(
-                    "PDO 0x{:04x} gets the objects of mode {mode}: no PDO of the ESI has them",
-                    carrier.index
-                ));
-                return Ok(set);
-            }
+        if let Some(pdo) = self.filled(available, &default, &needed) {
+            notes.push(format!(
+                "PDO 0x{:04x} gets the objects of mode {mode}: no PDO of the ESI has them",
+                pdo.index
+            ));
+            return Ok(self.alongside(pdo, &default));
         }
         match self.direction {
             Direction::Rx => Err(SelectError::ModeNotOffered {
@@ -287,6 +282,34 @@ impl PdoSelector<'_> {
             .or_else(|| cover(available, default, objects))
     }
 
+    /// Returns an empty mapping object with what a mode needs, for devices whose PDOs only the
+    /// dictionary describes. Inputs also get the actual position.
+    fn filled(&self, available: &[Pdo], default: &[Pdo], needed: &[u16]) -> Option<Pdo> {
+        let coe = self.coe().filter(|coe| coe.pdo_config)?;
+        let is_default = |pdo: &Pdo| default.iter().any(|other| other.index == pdo.index);
+        let takes_objects = |pdo: &&Pdo| {
+            !pdo.fixed && pdo.entries.is_empty() && (coe.pdo_assign || is_default(pdo))
+        };
+        let empty = available.iter().find(takes_objects)?;
+        // Inputs that have the Statusword stay as they are.
+        if self.direction == Direction::Tx && contains(default, STATUSWORD) {
+            return None;
+        }
+        let with = |objects: &[u16]| {
+            let mut pdo = empty.clone();
+            let entries = objects
+                .iter()
+                .map(|&index| self.entry(EntryRef { index, sub: 0 }));
+            pdo.entries = entries.collect::<Result<_, _>>().ok()?;
+            Some(pdo)
+        };
+        match self.direction {
+            Direction::Rx => with(needed),
+            Direction::Tx if needed.contains(&POSITION) => with(needed),
+            Direction::Tx => with(&[needed, &[POSITION]].concat()).or_else(|| with(needed)),
+        }
+    }
+
     /// Adds the actual position (0x6064) to inputs without it, if a PDO contains it. The axis
     /// supervises its position in every mode.
     fn with_position(
@@ -296,8 +319,7 @@ impl PdoSelector<'_> {
         mut set: Vec<Pdo>,
         needed: &[u16],
     ) -> Vec<Pdo> {
-        const POSITION: u16 = 0x6064;
-        if contains(&set, POSITION) {
+        if needed.contains(&POSITION) || contains(&set, POSITION) {
             return set;
         }
         let with_position = available.iter().filter(|pdo| {
@@ -320,7 +342,7 @@ impl PdoSelector<'_> {
                 .into_iter()
                 .flatten()
                 .collect(),
-            Direction::Tx => vec![0x6041, mode.actual_object()],
+            Direction::Tx => vec![STATUSWORD, mode.actual_object()],
         }
     }
 
@@ -428,28 +450,26 @@ fn without_repeats(mut set: Vec<Pdo>, needed: &[u16], notes: &mut Vec<String>) -
         let mapped = pdo.entries.iter().filter(|entry| !entry.is_gap());
         mapped.map(|entry| (entry.index, entry.sub)).collect()
     };
-    let mut at = 0;
-    while let Some(pdo) = set.get(at) {
-        let others: Vec<_> = set
-            .iter()
-            .filter(|other| other.index != pdo.index)
-            .collect();
-        let own = objects(pdo);
-        let repeated = |object: &(u16, u8)| {
-            let mut all = others.iter().flat_map(|other| objects(other));
-            all.any(|other| other == *object)
-        };
-        let repeats = !own.is_empty() && own.iter().all(repeated);
-        if repeats && pdo.index != main && !pdo.mandatory {
-            notes.push(format!(
-                "PDO 0x{:04x} is assigned by default and left out: 0x{main:04x} and others have its objects",
-                pdo.index
-            ));
-            set.remove(at);
-        } else {
-            at += 1;
-        }
+    let mut copies: HashMap<(u16, u8), usize> = HashMap::new();
+    for object in set.iter().flat_map(objects) {
+        *copies.entry(object).or_default() += 1;
     }
+    set.retain(|pdo| {
+        let own = objects(pdo);
+        let is_repeated = |object: &(u16, u8)| copies.get(object).is_some_and(|&n| n > 1);
+        let repeats = !own.is_empty() && own.iter().all(is_repeated);
+        if !repeats || pdo.index == main || pdo.mandatory {
+            return true;
+        }
+        for object in own {
+            copies.entry(object).and_modify(|n| *n = n.saturating_sub(1));
+        }
+        notes.push(format!(
+            "PDO 0x{:04x} is assigned by default and left out: 0x{main:04x} and others have its objects",
+            pdo.index
+        ));
+        false
+    });
     set
 }
 

@@ -44,8 +44,8 @@ impl Sii {
             general: Some(general(device)),
             fmmus: device.fmmus.iter().map(|fmmu| fmmu.usage).collect(),
             sync_managers: sync_managers(device, &rx, &tx),
-            tx_pdos: tx.iter().map(pdo).collect(),
-            rx_pdos: rx.iter().map(pdo).collect(),
+            tx_pdos: tx.iter().filter(is_listed).map(pdo).collect(),
+            rx_pdos: rx.iter().filter(is_listed).map(pdo).collect(),
             dc: device
                 .dc_modes
                 .iter()
@@ -158,6 +158,11 @@ fn sync_unit(unit: &SyncUnit) -> u8 {
         .filter(|(on, _)| *on)
         .map(|(_, bit)| bit)
         .sum()
+}
+
+/// Returns `false` for an empty mapping object that only the dictionary describes.
+fn is_listed(pdo: &&Pdo) -> bool {
+    !pdo.entries.is_empty() || pdo.sm.is_some() || pdo.fixed
 }
 
 fn bootstrap(bytes: &[u8]) -> MailboxAreas {

@@ -11,7 +11,8 @@ pub(super) fn complete(device: &mut Device) {
     if device.slots.is_some() {
         return;
     }
-    let mut derived = Vec::new();
+    let has_elements = !device.rx_pdos.is_empty() || !device.tx_pdos.is_empty();
+    let mut configurable = false;
     for direction in [Direction::Rx, Direction::Tx] {
         let pdos = match direction {
             Direction::Rx => &device.rx_pdos,
@@ -21,7 +22,7 @@ pub(super) fn complete(device: &mut Device) {
             continue;
         }
         let pdos = pdos_of(device, direction);
-        derived.extend(pdos.iter().filter(|pdo| !pdo.fixed).map(|pdo| pdo.index));
+        configurable |= pdos.iter().any(|pdo| !pdo.fixed);
         match direction {
             Direction::Rx => device.rx_pdos = pdos,
             Direction::Tx => device.tx_pdos = pdos,
@@ -32,13 +33,12 @@ pub(super) fn complete(device: &mut Device) {
         .mailbox
         .as_mut()
         .and_then(|mailbox| mailbox.coe.as_mut());
-    if let Some(coe) = coe.filter(|_| !derived.is_empty()) {
+    if let Some(coe) = coe.filter(|_| configurable && !has_elements) {
         coe.pdo_config = true;
-        let assigns = |index| {
-            let count = device.dictionary.item(index, 0);
-            count.is_some_and(|count| count.access.write != Writable::Never)
-        };
-        coe.pdo_assign |= assigns(0x1c12) || assigns(0x1c13);
+        let counts = [0x1c12, 0x1c13].map(|index| device.dictionary.item(index, 0));
+        let mut known = counts.into_iter().flatten().peekable();
+        coe.pdo_assign |=
+            known.peek().is_some() && known.all(|count| count.access.write != Writable::Never);
     }
 }
 

@@ -65,14 +65,27 @@ pub fn parse_where(
     read(bytes, Some(wanted))
 }
 
+/// The longest chain of PDOs that refer to each other forwards.
+const MAX_REFERENCE_DEPTH: usize = 4;
+
 fn read(bytes: &[u8], wanted: info::Wanted<'_>) -> Result<EsiFile, EsiError> {
     let decoded = decode::decode(bytes);
     let mut definitions = PdoDefinitions::default();
-    // A `Ref` may stand before the `RefName` that it names.
-    if memchr::memmem::find(decoded.text.as_bytes(), b"RefName").is_some() {
+    // A `Ref` may stand before the `RefName` that it names, which may refer to another.
+    let has_references = memchr::memmem::find(decoded.text.as_bytes(), b"RefName").is_some();
+    for _ in 0..if has_references {
+        MAX_REFERENCE_DEPTH
+    } else {
+        0
+    } {
+        let known = definitions.len();
         let mut cursor = cursor::Cursor::new(&decoded.text);
+        cursor.pdo_definitions = definitions;
         info::read(&mut cursor, &mut EsiFile::default(), None)?;
         definitions = cursor.pdo_definitions;
+        if definitions.len() == known {
+            break;
+        }
     }
     let mut cursor = cursor::Cursor::new(&decoded.text);
     cursor.pdo_definitions = definitions;

@@ -1,8 +1,8 @@
 //! `RxPdo` and `TxPdo`.
 //!
 //! A PDO with an attribute `RefName` can be repeated by an element `Pdo`, `RxPdo` or `TxPdo` with
-//! an attribute `Ref` of the same text. Attributes and children of that element replace those of
-//! the definition.
+//! an attribute `Ref` of the same text. `Index`, `Name`, entries and numbers of that element replace
+//! those of the definition; flags and `Exclude`s are added.
 
 use std::collections::HashMap;
 
@@ -47,29 +47,38 @@ pub(super) fn append_reference<'a>(
     rx: &mut Vec<Pdo>,
     tx: &mut Vec<Pdo>,
 ) -> Result<(), EsiError> {
-    match definition(c, element) {
-        Ok(Some(Pdo { direction, .. })) => match direction {
-            Direction::Rx => append(c, element, Direction::Rx, rx),
-            Direction::Tx => append(c, element, Direction::Tx, tx),
-        },
+    let direction = definition(c, element).map(|found| found.map(|pdo| pdo.direction));
+    match direction {
+        Ok(Some(Direction::Rx)) => append(c, element, Direction::Rx, rx),
+        Ok(Some(Direction::Tx)) => append(c, element, Direction::Tx, tx),
         Ok(None) => Ok(()),
         Err(error) => c.leave_out(element, Err(error)),
     }
 }
 
-/// Returns a copy of the PDO that `Ref` names.
-fn definition<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Option<Pdo>, EsiError> {
+/// Returns the PDO that `Ref` names.
+fn definition<'c, 'a>(
+    c: &'c Cursor<'a>,
+    element: &Element<'a>,
+) -> Result<Option<&'c Pdo>, EsiError> {
     let Some(name) = c.attribute(element, "Ref")? else {
         return Ok(None);
     };
-    let Some(known) = c.pdo_definitions.get(&name) else {
+    let missing = || {
         let name = name.chars().take(80).collect();
-        return Err(c.error_at(element, EsiProblem::UnknownPdoReference(name)));
+        c.error_at(element, EsiProblem::UnknownPdoReference(name))
     };
-    let copy = known.clone();
-    let bytes = copy.entries.len() * size_of::<Entry>();
+    c.pdo_definitions.get(&name).map(Some).ok_or_else(missing)
+}
+
+/// Returns a copy of the PDO that `Ref` names. The limit on the contents of a file covers it.
+fn copied<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Option<Pdo>, EsiError> {
+    let Some(defined) = definition(c, element)? else {
+        return Ok(None);
+    };
+    let bytes = defined.size();
     c.spend(bytes, (c.position(element), element))?;
-    Ok(Some(copy))
+    Ok(definition(c, element)?.cloned())
 }
 
 fn read<'a>(
@@ -77,7 +86,7 @@ fn read<'a>(
     element: &Element<'a>,
     direction: Direction,
 ) -> Result<Pdo, EsiError> {
-    let defined = definition(c, element)?;
+    let defined = copied(c, element)?;
     let mut index = defined.as_ref().map(|pdo| pdo.index);
     let mut inherits_entries = defined.is_some();
     let mut pdo = defined.unwrap_or_else(|| empty(direction));
@@ -121,6 +130,7 @@ fn read<'a>(
         pdo.name = name.into_owned();
     }
     if let Some(name) = c.attribute(element, "RefName")? {
+        c.spend(pdo.size(), (pdo.position, element))?;
         c.pdo_definitions.insert(name, pdo.clone());
     }
     Ok(pdo)

@@ -270,11 +270,11 @@ fn known(machine: &Machine, identity: Identity) -> String {
     machine
         .devices
         .iter()
-        .flat_map(|d| &d.esi.devices)
-        .find(|d| d.identity == identity)
+        .flat_map(|d| d.esi.headers())
+        .find(|(described, ..)| *described == identity)
         .map_or_else(
             || identity.to_string(),
-            |d| format!("{} ({identity})", d.name),
+            |(.., name)| format!("{name} ({identity})"),
         )
 }
 

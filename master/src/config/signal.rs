@@ -1,6 +1,6 @@
 //! Process data by name: the bits of a device that a step reads or sets.
 
-use ecaxis_ecat::index::{DeviceIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_esi as esi;
 use ecaxis_esi::layout::Field;
 
@@ -177,6 +177,7 @@ pub(crate) fn resolve(
 ) -> Option<Signal> {
     let names = devices.iter().map(|d| d.name);
     let found = place(raw.device.get_ref(), names).and_then(|index| {
+        let index = DeviceIndex(index);
         // An invalid device has already been reported.
         let device = devices[index].device;
         device
@@ -190,12 +191,12 @@ pub(crate) fn resolve(
     })
 }
 
-fn place<'n, I: From<usize>>(
+fn place<'n>(
     name: &str,
     mut names: impl Iterator<Item = &'n str> + Clone,
-) -> Result<I, NameError> {
+) -> Result<usize, NameError> {
     let all = names.clone();
-    let found = names.position(|n| n == name).map(I::from);
+    let found = names.position(|n| n == name);
     found.ok_or_else(|| NameError {
         message: format!("no device is named `{name}`"),
         hint: suggestion(name, all, "devices"),
@@ -299,7 +300,7 @@ impl Machine {
             hint: suggestion(name, names, "axes"),
             ..error
         })?;
-        Ok(AxisRef(at))
+        Ok(AxisRef(AxisIndex(at)))
     }
 
     /// Returns an input by its device's name and its own name. Valid names are the entry's name in
@@ -334,7 +335,8 @@ impl Machine {
     }
 
     fn signal(&self, device: &str, name: &str, way: SignalDirection) -> Result<Signal, NameError> {
-        let index = place(device, self.devices.iter().map(|d| d.name.as_str()))?;
+        let names = self.devices.iter().map(|d| d.name.as_str());
+        let index = DeviceIndex(place(device, names)?);
         one(name, way, index, &self.devices[index])
     }
 }

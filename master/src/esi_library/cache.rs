@@ -14,7 +14,7 @@ use super::{MAX_BYTES, Record};
 use crate::file;
 
 /// The header of the index. Its number increases when the same file may give a different record.
-const HEAD: &str = concat!("ecaxis-esi-index ", env!("CARGO_PKG_VERSION"), " 2 ");
+const HEAD: &str = concat!("ecaxis-esi-index ", env!("CARGO_PKG_VERSION"), " 3 ");
 /// The minimum age of a modification time. A younger file may change again within the same tick of
 /// the file system's clock.
 const SETTLED: Duration = Duration::from_secs(2);

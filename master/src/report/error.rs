@@ -128,7 +128,7 @@ pub enum Cause {
     Sdo(SdoError),
     #[error("{}", .0.without_station())]
     Information(InfoError),
-    /// The scan failed in a way that the devices do not explain.
+    /// The scan failed, and no device explains it.
     #[error("{0}")]
     Scan(String),
     #[error(

@@ -45,7 +45,7 @@ pub struct Prepared {
 pub struct RunBuilder<'a> {
     pub machine: &'a Arc<Machine>,
     pub options: &'a Options,
-    /// The flag that stops the run.
+    /// The token that stops the run.
     pub stop: Arc<CancelToken>,
     /// The receiver of progress reports.
     pub progress: Sender<Progress>,
@@ -343,7 +343,7 @@ fn bring_up_catching_panics(
     // ethercrab panics on some wire content, for example on a SubDevice without an open port.
     let run = std::panic::AssertUnwindSafe(|| {
         let bring_up = Box::pin(bring_up(main_device, machine, image, &mut report, log));
-        drive_pdu_loop(port, link, clock, stop.run_until_cancelled(bring_up))
+        drive_pdu_loop(port, link, clock, stop.run_until_requested(bring_up))
     });
     match std::panic::catch_unwind(run) {
         Ok(Ok(Some(Ok(bus)))) => Ok(bus),

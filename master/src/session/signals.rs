@@ -3,7 +3,6 @@
 use std::fmt;
 use std::io;
 use std::sync::Arc;
-
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -29,7 +28,7 @@ const REPEATED: Duration = Duration::from_millis(500);
 /// The reaction of [`stop_on_signals`] to a signal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SignalReport {
-    /// The flag is set: the run stops in order.
+    /// The token is cancelled: the run stops in order.
     Stopping,
     /// Another SIGINT or SIGTERM arrived. If the process ends now, only the drives' watchdogs stop
     /// the axes.
@@ -48,7 +47,7 @@ impl fmt::Display for SignalReport {
     }
 }
 
-/// Sets `stop` on SIGINT, SIGTERM or SIGHUP, so that a run with this flag stops in order. SIGHUP
+/// Cancels `stop` on SIGINT, SIGTERM or SIGHUP, so that a run with this token stops in order. SIGHUP
 /// has no effect if it was ignored before, as by `nohup`.
 ///
 /// The process ignores SIGUSR1, SIGUSR2, SIGPIPE, SIGTTIN and SIGTTOU from now on. SIGTSTP no

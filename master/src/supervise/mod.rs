@@ -125,7 +125,7 @@ impl Supervisor {
     async fn run_inner(mut self) -> (ProgramOutcome, Result<(), Error>) {
         let mut ended = ProgramOutcome::default();
         let stop = Arc::clone(&self.stop);
-        let worked = stop.run_until_cancelled(self.run_to_end(&mut ended)).await;
+        let worked = stop.run_until_requested(self.run_to_end(&mut ended)).await;
         ended.interrupted = worked.is_none();
         ended.group_stops = self.group_stops();
         let mut result = worked.unwrap_or(Ok(()));

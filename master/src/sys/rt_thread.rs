@@ -53,8 +53,8 @@ pub enum RtSetupError {
 /// Host-wide settings while a machine runs; dropping this restores them.
 #[derive(Debug, Default)]
 pub struct CpuWakeGuard {
-    _latency: Option<File>,
-    _awake: Option<IdleSpinner>,
+    latency: Option<File>,
+    awake: Option<IdleSpinner>,
 }
 
 impl CpuWakeGuard {
@@ -66,7 +66,7 @@ impl CpuWakeGuard {
         let mut held = Self::default();
         let mut denied = Vec::new();
         match open_latency() {
-            Ok(file) => held._latency = Some(file),
+            Ok(file) => held.latency = Some(file),
             // This host has no idle states, or hides them: nothing to rule out.
             Err(error) if error.kind() == ErrorKind::NotFound => {}
             Err(error) => denied.push(RtSetupError::CpuLatency {
@@ -75,7 +75,7 @@ impl CpuWakeGuard {
         }
         if let Some(cpu) = awake {
             match IdleSpinner::start(cpu) {
-                Ok(awake) => held._awake = Some(awake),
+                Ok(awake) => held.awake = Some(awake),
                 Err(error) => denied.push(error),
             }
         }

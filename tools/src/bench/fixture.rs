@@ -1,8 +1,6 @@
 //! A machine with axes on a [`BenchSegment`] without a bring-up: the parts of the real cycle and a
 //! minimal supervisor.
 
-use ecaxis_master::cancel::CancelToken;
-
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -10,8 +8,7 @@ use ecaxis_axis::setpoint::{Motion, PositionWave, SetpointError, Shape, Wave};
 use ecaxis_axis::{Axis, AxisConfig, Command, Limits, Mode, Scale, StopMethod};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex};
 use ecaxis_esi::layout::{Field, Layout};
-
-use super::segment::{BenchSegment, DRIVE_BYTES, FIRST_STATION};
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config;
 use ecaxis_master::link::Link;
@@ -25,6 +22,8 @@ use ecaxis_master::rt::image::{self, AxisBits, ImagePlan, ProcessData};
 use ecaxis_master::rt::phase::{ClockPlan, Phase};
 use ecaxis_master::rt::setpoint_generator::GeneratorRequest;
 use ecaxis_master::rt::spin::Spin;
+
+use super::segment::{BenchSegment, DRIVE_BYTES, FIRST_STATION};
 
 /// The maximum number of axes, limited by working counters and station addresses.
 pub const MOST_AXES: usize = 1000;

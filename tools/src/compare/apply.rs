@@ -288,17 +288,17 @@ fn revision(
     found: u32,
     place: OutputPath<'_>,
 ) {
-    let identity = |d: &ecaxis_esi::Device| {
-        let id = d.identity;
-        (id.vendor, id.product, id.revision)
-    };
-    let wanted = identity(&described.device);
+    let wanted = described.device.identity;
     // The named file may describe the revision as well.
-    if !config.esi.devices.iter().any(|d| identity(d) == wanted) {
+    if !config
+        .esi
+        .headers()
+        .any(|(identity, ..)| identity == wanted)
+    {
         let path = write::relative(&described.path, place.folder);
         set(table, "esi", &quoted(&path.display().to_string()));
     }
-    let (.., revision) = wanted;
+    let revision = wanted.revision;
     set(table, "revision", &format!("0x{revision:08x}"));
     let rule = if revision == found {
         RevisionMatch::Equal

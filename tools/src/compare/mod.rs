@@ -438,11 +438,10 @@ impl DifferenceDisplay<'_> {
         let Some(identity) = device.and_then(Device::identity) else {
             return "an unknown device".to_owned();
         };
-        let esi = self.machine.devices.iter().flat_map(|d| &d.esi.devices);
-        let mut of_product = esi.filter(|d| {
-            (d.identity.vendor, d.identity.product) == (identity.vendor, identity.product)
-        });
-        let known = of_product.next().map(|d| d.type_name.clone());
+        let mut esi = self.machine.devices.iter().flat_map(|d| d.esi.headers());
+        let of_product =
+            esi.find(|(id, ..)| (id.vendor, id.product) == (identity.vendor, identity.product));
+        let known = of_product.map(|(_, type_name, _)| type_name.to_owned());
         match known.or_else(|| device.and_then(Device::own_name)) {
             Some(name) => format!("{name}, {identity}"),
             None => identity.to_string(),

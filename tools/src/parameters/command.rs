@@ -4,7 +4,6 @@
 use std::time::Duration;
 
 use ecaxis_master::acyclic::DeviceRef;
-
 use ecaxis_master::mailbox::{CoeClient, MailboxTransport, Timeouts};
 use ecaxis_master::report::{Cause, Error};
 

@@ -2,15 +2,14 @@
 
 use ecaxis_esi::model::{Access, PdoMapping};
 use ecaxis_esi::{Dictionary, Object, ObjectCode, ObjectItem, Writable};
-
-use super::DataType;
 use ecaxis_master::acyclic::DeviceRef;
-
 use ecaxis_master::mailbox::{
     CoeCause, CoeClient, EntryDescription, InfoError, InfoRequest, MailboxTransport,
     ObjectDescription, ObjectList,
 };
 use ecaxis_master::report::{Cause, Error};
+
+use super::DataType;
 
 /// The maximum number of subindices; the largest known device has a tenth of it.
 const MAX_ITEMS: usize = 50_000;

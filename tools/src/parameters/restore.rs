@@ -1,14 +1,13 @@
 //! Writes values to a device.
 
 use ecaxis_esi::Dictionary;
+use ecaxis_master::acyclic::DeviceRef;
+use ecaxis_master::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, abort_text};
+use ecaxis_master::report::{Cause, Error};
 
 use super::compare::Difference;
 use super::restore_order::{Write, is_list, is_setting, order, settings_only};
 use super::{Parameter, writable_in_pre_op};
-use ecaxis_master::acyclic::DeviceRef;
-
-use ecaxis_master::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, abort_text};
-use ecaxis_master::report::{Cause, Error};
 
 /// The maximum number of passes. Settings limit each other, so refused writes are retried after the
 /// others.

@@ -1,12 +1,11 @@
 //! Reads every readable object.
 
 use ecaxis_esi::Dictionary;
-
-use super::{Parameter, items, name_of, type_of, writable_in_pre_op};
 use ecaxis_master::acyclic::DeviceRef;
-
 use ecaxis_master::mailbox::{CoeClient, MailboxTransport, NamedObject};
 use ecaxis_master::report::{Cause, Error};
+
+use super::{Parameter, items, name_of, type_of, writable_in_pre_op};
 
 /// The values of a device.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]

@@ -104,14 +104,11 @@ impl DeviceArgs {
         let device = self
             .find(file)
             .map_err(|error| self.not_found(file, &error))?;
+        let (product, revision) = (device.identity.product, device.identity.revision);
         let older: Vec<String> = file
-            .devices
-            .iter()
-            .filter(|other| {
-                other.identity.product == device.identity.product
-                    && other.identity.revision != device.identity.revision
-            })
-            .map(|other| format!("0x{:08x}", other.identity.revision))
+            .headers()
+            .filter(|(other, ..)| other.product == product && other.revision != revision)
+            .map(|(other, ..)| format!("0x{:08x}", other.revision))
             .collect();
         let text = self.device.as_deref();
         let counted = text.is_some_and(|text| self.number_of(file, text).is_some());

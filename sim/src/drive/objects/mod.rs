@@ -51,7 +51,7 @@ const MANUFACTURER_SPECIFIC: RangeInclusive<u16> = 0x2000..=0x5fff;
 
 #[derive(Debug, Clone)]
 pub(super) struct Objects {
-    /// The drive's own rules differ from those of most drives.
+    /// A maxon drive: torque in µNm, Statusword bit 4 as the state of the power stage.
     pub is_maxon: bool,
     pub error_register: EntryHandle,
     pub error_code: EntryHandle,
