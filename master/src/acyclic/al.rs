@@ -5,7 +5,7 @@
 use std::fmt;
 use std::time::Duration;
 
-use super::DeviceRef;
+use super::{DatagramClient, DeviceRef};
 use crate::mailbox::{DatagramError, MailboxTransport};
 use crate::report::{Cause, Error};
 use ecaxis_ecat::al_status_code::al_status_text;
@@ -198,7 +198,9 @@ async fn request(
     let status = read_status(wire, device.station).await.map_err(failed)?;
     let (status, _) = status.ok_or_else(gone)?;
     tracing::debug!(%device, "AL status 0x{status:02x}, requesting {wanted}");
-    if status & ERROR != 0 {
+    // A controller with device emulation copies AL control into AL status. It has no error that an
+    // acknowledgement could end; the request itself clears the bit.
+    if status & ERROR != 0 && !emulated(wire, device.station).await {
         write_control(wire, device.station, status & 0x0f | ERROR)
             .await
             .map_err(failed)?;
@@ -260,6 +262,31 @@ pub async fn wait_state(
         }
     }
     Ok(())
+}
+
+/// Acknowledges the errors of all devices, with another request of Init.
+pub(crate) async fn acknowledge_in_init(wire: &DatagramClient) {
+    let Ok(count) = wire.count().await else {
+        return;
+    };
+    for position in 0..count {
+        let byte = async |register| {
+            let mut byte = [0];
+            let answer = wire.read_at(position, register, &mut byte).await;
+            (answer == Ok(1)).then_some(byte[0])
+        };
+        let failed = byte(registers::AL_STATUS).await;
+        if failed.is_none_or(|status| status & ERROR == 0) {
+            continue;
+        }
+        let configuration = byte(registers::ESC_CONFIGURATION).await;
+        if configuration.is_some_and(|bits| bits & DEVICE_EMULATION == 0) {
+            let acknowledge = [AlState::Init.code() | ERROR, 0];
+            let _ = wire
+                .write_at(position, registers::AL_CONTROL, &acknowledge)
+                .await;
+        }
+    }
 }
 
 async fn write_control(

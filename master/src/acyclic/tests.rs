@@ -10,7 +10,7 @@ use super::device::{locate, read_sii, with_mailbox};
 use super::eeprom::{Eeprom, EepromAccess, EepromError, with_eeprom};
 use super::enumerate::{EnumeratedDevice, address, enumerate, select};
 use super::image::{WriteError, write};
-use super::{DatagramClient, mailbox};
+use super::{DatagramClient, al, mailbox};
 use crate::acyclic::{AlState, DeviceRef};
 use crate::cancel::CancelToken;
 use crate::clock::Clock;
@@ -539,4 +539,79 @@ fn mailbox_open_restores_init_after_a_lost_frame() {
     let error = done.expect("carried").expect_err("a frame was lost");
     assert!(matches!(*error.cause, Cause::State(_)), "{error}");
     assert_eq!(left, ("Init".to_owned(), 0));
+}
+
+/// A wire that keeps what is written to AL control.
+struct Controls<'w> {
+    wire: &'w DatagramClient,
+    written: std::cell::RefCell<Vec<u8>>,
+}
+
+impl MailboxTransport for Controls<'_> {
+    async fn read(
+        &self,
+        station: u16,
+        register: u16,
+        buf: &mut [u8],
+    ) -> Result<u16, DatagramError> {
+        self.wire.read(station, register, buf).await
+    }
+
+    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, DatagramError> {
+        if register == 0x0120 {
+            self.written.borrow_mut().push(data[0]);
+        }
+        self.wire.write(station, register, data).await
+    }
+
+    async fn delay(&self, duration: Duration) {
+        self.wire.delay(duration).await;
+    }
+
+    fn now(&self) -> u64 {
+        self.wire.now()
+    }
+}
+
+/// ETG.1500, feature 103, and ETG.1000.4, AL control: a device with device emulation (0x0140 bit 8)
+/// copies AL control into AL status and must not receive the acknowledge bit. ETG.1000.6, 6.4: every
+/// other device leaves an error only after the acknowledgement.
+#[test]
+fn only_devices_without_device_emulation_receive_an_acknowledgement() {
+    let written = std::thread::spawn(|| {
+        Clock::Virtual.enter();
+        let terminals = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/terminals.toml");
+        let machine = config::load(&terminals).expect("a machine");
+        let mut link = SimLink::new(simulated_bus(&machine, 1, None, None).expect("a bus"));
+        let never = CancelToken::default();
+        let done = run_on_link(&mut link, Clock::Virtual, &never, async |wire| {
+            let found = addressed(&wire).await;
+            let mut written = Vec::new();
+            // The coupler emulates its device; the drive refuses SafeOp in Init with an error.
+            let last = found.len() - 1;
+            for (position, control) in [(0, 0x14), (last, 0x04)] {
+                let device = found[position].named("a device");
+                let control = [control, 0];
+                wire.write(device.station, 0x0120, &control)
+                    .await
+                    .expect("written");
+                wire.delay(Duration::from_millis(2)).await;
+                let status = al::read_status(&wire, device.station).await.expect("read");
+                assert!(status.is_some_and(|(status, _)| status & 0x10 != 0));
+                let controls = Controls {
+                    wire: &wire,
+                    written: Default::default(),
+                };
+                let second = Duration::from_secs(1);
+                al::change_state(&controls, &[device], AlState::Init, second)
+                    .await
+                    .expect("Init");
+                written.push(controls.written.into_inner());
+            }
+            written
+        });
+        done.expect("carried")
+    });
+    let written = written.join().expect("no panic");
+    assert_eq!(written, [vec![0x01], vec![0x11, 0x01]]);
 }

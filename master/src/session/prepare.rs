@@ -12,6 +12,7 @@ use ethercrab::{Command as Datagram, MainDevice};
 
 use super::fault_evidence::BringUpEvidence;
 use super::{Cause, EmergencyLog, Error, Options, Progress, open, panic_text};
+use crate::acyclic::{AlState, al};
 use crate::bringup::{Bus, Step, bring_up};
 use crate::cancel::CancelToken;
 use crate::clock::{self, Clock, Nanos};
@@ -354,7 +355,8 @@ fn bring_up_catching_panics(
     }
 }
 
-/// Requests Init from all SubDevices and switches SYNC0 off, in any state.
+/// Requests Init from all SubDevices and switches SYNC0 off, in any state. Errors are acknowledged
+/// one by one: a device with device emulation must not receive the acknowledge bit.
 pub(super) fn broadcast_init(
     clock: Clock,
     main_device: &'static MainDevice<'static>,
@@ -368,9 +370,11 @@ pub(super) fn broadcast_init(
         let datagram = Datagram::bwr(register).ignore_wkc();
         let _ = datagram.send(main_device, value).await;
     };
+    let wire = DatagramClient::new(main_device);
     let silence = async {
-        all(registers::AL_CONTROL, 0x0011).await;
+        all(registers::AL_CONTROL, u16::from(AlState::Init.code())).await;
         clock::delay(TO_INIT).await;
+        al::acknowledge_in_init(&wire).await;
         all(registers::DC_CYCLIC_CONTROL, 0).await;
     };
     let _ = drive_pdu_loop(port, link, clock, silence);
