@@ -14,4 +14,5 @@ mod phase;
 mod probe;
 mod program;
 mod samples;
+mod states;
 mod units;

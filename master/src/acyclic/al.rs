@@ -5,7 +5,7 @@
 use std::fmt;
 use std::time::Duration;
 
-use super::{DatagramClient, DeviceRef};
+use super::{DatagramClient, DeviceRef, Transition};
 use crate::mailbox::{DatagramError, MailboxTransport};
 use crate::report::{Cause, Error};
 use ecaxis_ecat::al_status_code::al_status_text;
@@ -138,18 +138,28 @@ pub(crate) async fn emulated(wire: &impl MailboxTransport, station: u16) -> bool
     read.is_ok_and(|count| count == 1) && configuration[0] & DEVICE_EMULATION != 0
 }
 
-/// Requests `wanted` from all devices and waits until the last one reaches it. Pending errors of
-/// devices are acknowledged first.
+/// Requests `wanted` from all devices and waits until the last one reaches it, all with the same
+/// time-out. Pending errors of devices are acknowledged first.
 pub async fn change_state(
     wire: &impl MailboxTransport,
     devices: &[DeviceRef],
     wanted: AlState,
     timeout: Duration,
 ) -> Result<(), Error> {
-    for device in devices {
-        request(wire, device, wanted).await?;
+    let transitions = devices.iter().map(|device| Transition { device, timeout });
+    change_states(wire, &transitions.collect::<Vec<_>>(), wanted).await
+}
+
+/// As [`change_state`], with a time-out for each device.
+pub async fn change_states(
+    wire: &impl MailboxTransport,
+    transitions: &[Transition<'_>],
+    wanted: AlState,
+) -> Result<(), Error> {
+    for transition in transitions {
+        request(wire, transition.device, wanted).await?;
     }
-    wait_state(wire, devices, wanted, timeout).await
+    wait_state(wire, transitions, wanted).await
 }
 
 /// `true` if the wire failed while a state changed.
@@ -160,13 +170,12 @@ pub(crate) fn is_wire(error: &Error) -> bool {
 /// Requests a lower state from every device, even if some fail. Returns the first error at the end.
 pub async fn lower_state(
     wire: &impl MailboxTransport,
-    devices: &[DeviceRef],
+    transitions: &[Transition<'_>],
     wanted: AlState,
-    timeout: Duration,
 ) -> Result<(), Error> {
     let mut trouble = None;
-    for device in devices {
-        if let Err(error) = request(wire, device, wanted).await {
+    for transition in transitions {
+        if let Err(error) = request(wire, transition.device, wanted).await {
             let silent = is_wire(&error);
             trouble.get_or_insert(error);
             // The wire failed, not a device: the other devices would only time out.
@@ -176,10 +185,9 @@ pub async fn lower_state(
         }
     }
     if !trouble.as_ref().is_some_and(is_wire) {
-        for device in devices {
-            if let Err(error) =
-                wait_state(wire, std::slice::from_ref(device), wanted, timeout).await
-            {
+        for transition in transitions {
+            let one = std::slice::from_ref(transition);
+            if let Err(error) = wait_state(wire, one, wanted).await {
                 trouble.get_or_insert(error);
             }
         }
@@ -221,17 +229,18 @@ async fn request(
     }
 }
 
-/// Waits until every device is in `wanted`.
+/// Waits until every device is in `wanted`. The time-outs begin together.
 pub async fn wait_state(
     wire: &impl MailboxTransport,
-    devices: &[DeviceRef],
+    transitions: &[Transition<'_>],
     wanted: AlState,
-    timeout: Duration,
 ) -> Result<(), Error> {
-    let end = wire
-        .now()
-        .saturating_add(u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX));
-    for device in devices {
+    let begin = wire.now();
+    // The device whose time ends first is awaited first. No other time ends meanwhile.
+    let mut order: Vec<_> = transitions.iter().collect();
+    order.sort_by_key(|transition| transition.timeout);
+    for &&Transition { device, timeout } in &order {
+        let end = begin.saturating_add(u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX));
         loop {
             let failed = |source| StateError::Wire { wanted, source }.with_device(device);
             let Some((status, code)) = read_status(wire, device.station).await.map_err(failed)?

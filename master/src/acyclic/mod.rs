@@ -10,6 +10,7 @@
 //! - [`eeprom`]: the EEPROM interface of one device;
 //! - [`image`]: EEPROM images, and how to write them;
 //! - [`mailbox`]: the mailboxes of one device, and the state they need;
+//! - [`state_timeouts`]: the time-outs of state changes;
 //! - [`topology`]: how the devices are connected.
 
 use std::fmt;
@@ -19,6 +20,7 @@ use crate::report::{Cause, Error};
 
 pub use crate::datagram::DatagramClient;
 pub use al::{AlState, StateError};
+pub use state_timeouts::{StateTimeouts, Transition};
 
 pub mod al;
 pub mod device;
@@ -26,6 +28,7 @@ pub mod eeprom;
 pub mod enumerate;
 pub mod image;
 pub mod mailbox;
+pub mod state_timeouts;
 #[cfg(test)]
 mod tests;
 pub mod topology;

@@ -74,7 +74,7 @@ pub(super) async fn explain_scan(
             let timeout = al::StateError::Timeout {
                 wanted: al::AlState::PreOp,
                 actual,
-                timeout: crate::link::pdu_loop::STATE_TIMEOUT,
+                timeout: machine.pre_op_timeout(),
             };
             timeout.with_device(&device)
         }

@@ -17,7 +17,8 @@ use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
-use crate::acyclic::{AlState, DeviceRef, al, enumerate};
+use crate::acyclic::state_timeouts::mailbox_timeouts;
+use crate::acyclic::{AlState, DeviceRef, StateTimeouts, Transition, al, enumerate};
 use crate::clock;
 use crate::config::{AdoptedUnits, LimitConflict, MAX_SUBDEVICES, Machine};
 use crate::datagram::DatagramClient;
@@ -51,6 +52,8 @@ type Group = SubDeviceGroup<MAX_SUBDEVICES, MAX_PDI>;
 #[derive(Debug)]
 pub struct BusDevice {
     pub at: DeviceRef,
+    /// The time-outs of its state changes.
+    pub timeouts: StateTimeouts,
     /// `None` without a CoE mailbox, and once a mailbox worker owns the mailbox.
     pub coe: Option<CoeClient>,
     /// True if the device has a system time: not every device that reports one in 0x0008 has it
@@ -209,8 +212,11 @@ pub async fn bring_up(
         if receive_times {
             timed.push((position, dc));
         }
+        let info = &config.device.info;
+        let coe = mailbox::open(&wire, config, &at).await?;
         devices.push(BusDevice {
-            coe: mailbox::open(&wire, config, &at).await?.map(CoeClient::new),
+            coe: coe.map(|layout| CoeClient::new(layout).with_timeouts(mailbox_timeouts(info))),
+            timeouts: StateTimeouts::new(info),
             at,
             held: Vec::new(),
             adopted: None,
@@ -274,8 +280,11 @@ async fn set_up(
 
     let dc = clocks::configure(wire, machine, devices, progress).await?;
 
-    let at: Vec<_> = devices.iter().map(|d| d.at.clone()).collect();
-    al::change_state(wire, &at, AlState::SafeOp, al::SAFE_OP_TIMEOUT).await?;
+    let transitions: Vec<_> = devices
+        .iter()
+        .map(|device| device.transition(AlState::SafeOp, false))
+        .collect();
+    al::change_states(wire, &transitions, AlState::SafeOp).await?;
     progress(Step::State(AlState::SafeOp));
     for (config, device) in machine.devices.iter().zip(devices) {
         device::start_up(wire, config, device, StartupPhase::InSafeOp, progress).await?;
@@ -284,6 +293,14 @@ async fn set_up(
 }
 
 impl BusDevice {
+    /// Returns the change to a state, up or back.
+    pub(crate) fn transition(&self, wanted: AlState, back: bool) -> Transition<'_> {
+        Transition {
+            device: &self.at,
+            timeout: self.timeouts.select(wanted, back),
+        }
+    }
+
     /// Passes the device's emergencies to the listener.
     fn report(&self, listener: &dyn EmergencySink) {
         if let Some(coe) = &self.coe {

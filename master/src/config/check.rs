@@ -187,7 +187,7 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
         priority: raw.priority.value().unwrap_or(defaults.priority),
         spin: raw.spin.value().unwrap_or_default(),
         awake,
-        op_timeout_ns: raw.op_timeout.value().unwrap_or(defaults.op_timeout_ns),
+        op_timeout_ns: raw.op_timeout.value(),
         enable_timeout_ns: raw
             .enable_timeout
             .value()

@@ -25,6 +25,7 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
 mod axis;
 mod check;
@@ -66,6 +67,7 @@ use ecaxis_esi as esi;
 use fields::Read;
 use raw::RawMachine;
 
+use crate::acyclic::StateTimeouts;
 use crate::esi_library::RevisionMatch;
 use crate::file;
 pub use crate::rt::config::{Condition, ExchangeMode, GroupStopScope};
@@ -112,8 +114,8 @@ pub struct Bus {
     pub spin: Spin,
     /// `true` if `cpu` is kept from sleep states.
     pub awake: bool,
-    /// The timeout from SafeOp to Op.
-    pub op_timeout_ns: u64,
+    /// The timeout from SafeOp to Op; `None`: that of each device.
+    pub op_timeout_ns: Option<u64>,
     /// The timeout of a drive to Operation enabled.
     pub enable_timeout_ns: u64,
     /// The process data watchdog of every SubDevice.
@@ -152,7 +154,7 @@ impl Default for Bus {
             priority: 80,
             spin: Spin::Auto,
             awake: false,
-            op_timeout_ns: 10_000_000_000,
+            op_timeout_ns: None,
             enable_timeout_ns: 5_000_000_000,
             watchdog_ns: 100_000_000,
             clock_window_ns: 10_000,
@@ -357,6 +359,16 @@ impl Machine {
         let mut groups = self.stop.groups.iter();
         let named = groups.position(|group| group.devices.contains(&device));
         named.map_or(GroupIndex::MACHINE, |index| GroupIndex(index + 1))
+    }
+
+    /// Returns the time-out of the way to PreOp. ethercrab has one for all devices: the longest.
+    #[must_use]
+    pub fn pre_op_timeout(&self) -> Duration {
+        let all = self.devices.iter().map(|device| {
+            let timeouts = StateTimeouts::new(&device.device.info);
+            timeouts.pre_op.max(timeouts.back_to_init)
+        });
+        all.max().unwrap_or(StateTimeouts::DEFAULT.back_to_init)
     }
 
     /// Returns the settings of the cycle.

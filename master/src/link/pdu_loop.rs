@@ -30,9 +30,6 @@ const IDLE_STEP: Nanos = 20_000;
 /// The minimum timeout of a datagram; a busy host answers late.
 const PDU_TIMEOUT: Duration = Duration::from_millis(30);
 
-/// The timeout for all SubDevices to reach a state in ethercrab's part of the bring-up.
-pub(crate) const STATE_TIMEOUT: Duration = Duration::from_secs(5);
-
 /// Cycles of static drift compensation; the cyclic exchange continues the compensation.
 const STATIC_SYNC_CYCLES: u32 = 1_000;
 
@@ -57,9 +54,10 @@ impl std::fmt::Debug for PduLoop {
 /// `'static`.
 ///
 /// During operation, a datagram leaves in one cycle and returns in the next. Its timeout must
-/// therefore exceed a few cycles.
+/// therefore exceed a few cycles. `pre_op` is the time-out of each SubDevice to PreOp in ethercrab's
+/// part of the bring-up.
 #[must_use]
-pub fn main_device(cycle_ns: Nanos) -> (&'static MainDevice<'static>, PduLoop) {
+pub fn main_device(cycle_ns: Nanos, pre_op: Duration) -> (&'static MainDevice<'static>, PduLoop) {
     let storage: &'static PduStorage<FRAMES, FRAME_BYTES> = Box::leak(Box::new(PduStorage::new()));
     let Ok((tx, rx, pdu_loop)) = storage.try_split() else {
         unreachable!("a new storage splits once");
@@ -68,7 +66,7 @@ pub fn main_device(cycle_ns: Nanos) -> (&'static MainDevice<'static>, PduLoop) {
         pdu: Duration::from_nanos(cycle_ns.saturating_mul(5)).max(PDU_TIMEOUT),
         // Timeouts of whole operations must exceed the repetition of a lost datagram.
         eeprom: Duration::from_secs(1),
-        state_transition: STATE_TIMEOUT,
+        state_transition: pre_op,
         wait_loop_delay: Duration::from_micros(200),
         ..Timeouts::default()
     };

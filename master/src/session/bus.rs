@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::thread;
 
 use super::STACK;
-use crate::acyclic::DatagramClient;
+use crate::acyclic::{DatagramClient, StateTimeouts};
 use crate::cancel::CancelToken;
 use crate::clock::Clock;
 use crate::link::Link;
@@ -57,7 +57,7 @@ pub fn run_on_link<T>(
     stop: &CancelToken,
     work: impl AsyncFnOnce(DatagramClient) -> T,
 ) -> Result<T, Error> {
-    let (main_device, mut port) = main_device(0);
+    let (main_device, mut port) = main_device(0, StateTimeouts::DEFAULT.back_to_init);
     let run = AssertUnwindSafe(|| {
         let wire = DatagramClient::new(main_device);
         let work = Box::pin(work(wire));

@@ -92,7 +92,7 @@ impl RunBuilder<'_> {
             controller,
         } = self;
         let (image, ..) = plan(machine)?;
-        let (main_device, mut port) = main_device(machine.bus.cycle_ns);
+        let (main_device, mut port) = main_device(machine.bus.cycle_ns, machine.pre_op_timeout());
         let carried = BringUpIo {
             clock: options.clock,
             stop: &stop,

@@ -12,8 +12,8 @@ use std::time::Duration;
 use ecaxis_axis::{Command, CommandError};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 
-use crate::acyclic::{AlState, DeviceRef, al};
-use crate::bringup::{Bus, clocks};
+use crate::acyclic::{AlState, DeviceRef, Transition, al};
+use crate::bringup::{Bus, BusDevice, clocks};
 use crate::cancel::CancelToken;
 use crate::clock::{self, Nanos};
 use crate::config::steps::enables;
@@ -148,9 +148,17 @@ impl Supervisor {
 
     async fn run_to_end(&mut self, ended: &mut ProgramOutcome) -> Result<(), Error> {
         self.await_phase().await?;
-        let devices = self.bus.addresses();
-        let timeout = Duration::from_nanos(self.machine.bus.op_timeout_ns);
-        al::change_state(&self.wire, &devices, AlState::Op, timeout).await?;
+        let timeout = self.machine.bus.op_timeout_ns.map(Duration::from_nanos);
+        let devices = self.bus.devices.iter();
+        let transitions = devices.map(|device| {
+            let own = device.transition(AlState::Op, false);
+            Transition {
+                timeout: timeout.unwrap_or(own.timeout),
+                ..own
+            }
+        });
+        let transitions: Vec<_> = transitions.collect();
+        al::change_states(&self.wire, &transitions, AlState::Op).await?;
         self.report(Progress::Step(crate::bringup::Step::State(AlState::Op)));
         self.order(RtCommand::Guard).await;
         if !self.enable {
@@ -377,19 +385,19 @@ impl Supervisor {
             self.witness(error).await;
         }
         self.pass_events_on();
-        let stopped = |device: DeviceIndex| self.is_stopped(self.machine.group_of(device));
-        let devices = (0..).map(DeviceIndex).zip(self.bus.addresses());
-        let (stopped, others): (Vec<_>, Vec<_>) = devices.partition(|(device, _)| stopped(*device));
-        let addresses = |devices: Vec<(DeviceIndex, DeviceRef)>| -> Vec<DeviceRef> {
-            devices.into_iter().map(|(_, at)| at).collect()
-        };
-        let (stopped, others) = (addresses(stopped), addresses(others));
+        let is_stopped = |device: DeviceIndex| self.is_stopped(self.machine.group_of(device));
+        let (stopped, others): (Vec<_>, Vec<_>) = self
+            .bus
+            .devices
+            .enumerate()
+            .partition(|(device, _)| is_stopped(*device));
         let mut lowered = Ok(());
         for state in [AlState::SafeOp, AlState::PreOp, AlState::Init] {
             if state == AlState::Init {
                 self.end_sync().await;
             }
-            match al::lower_state(&self.wire, &others, state, al::BACK_TIMEOUT).await {
+            let (others, stopped) = (transitions(&others, state), transitions(&stopped, state));
+            match al::lower_state(&self.wire, &others, state).await {
                 Ok(()) => self.report(Progress::Step(crate::bringup::Step::State(state))),
                 Err(error) => {
                     let silent = al::is_wire(&error);
@@ -403,8 +411,7 @@ impl Supervisor {
                 }
             }
             // Stopped groups follow as far as they can; their errors do not count.
-            if let Err(error) = al::lower_state(&self.wire, &stopped, state, al::BACK_TIMEOUT).await
-            {
+            if let Err(error) = al::lower_state(&self.wire, &stopped, state).await {
                 tracing::debug!("{error}");
             }
         }
@@ -496,4 +503,13 @@ impl Supervisor {
     fn axis_name(&self, axis: AxisIndex) -> String {
         self.device_of(axis).name
     }
+}
+
+/// Returns the changes of these devices back to a state.
+fn transitions<'d>(
+    devices: &[(DeviceIndex, &'d BusDevice)],
+    state: AlState,
+) -> Vec<Transition<'d>> {
+    let devices = devices.iter();
+    devices.map(|(_, d)| d.transition(state, true)).collect()
 }

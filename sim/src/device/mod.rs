@@ -282,6 +282,11 @@ impl SimDevice {
         self.esc.latch_input(n, level, local);
     }
 
+    /// Sets [`DeviceOptions::state_change_ns`]. The time to read AL control stays.
+    pub fn set_state_change(&mut self, ns: Nanos) {
+        self.state_change_ns = ns.max(self.state_notice_ns);
+    }
+
     /// Stops the application, like a crashed processor with a running controller, or resumes it. A
     /// stopped application does not trigger the PDI watchdog.
     pub fn set_hanging(&mut self, hangs: bool, now: Nanos) {

@@ -186,7 +186,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
             emergency: Vec::new(),
         },
         link,
-        port: main_device(cycle_ns).1,
+        port: main_device(cycle_ns, Duration::ZERO).1,
         exchange: Exchange::new(&plan, Some(&clock), &members, exchange),
         axes: slots.into(),
         signals,

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use ecaxis_master::acyclic::StateTimeouts;
 use ecaxis_master::config::{
     self, Action, Bus, DeviceConfig, ExchangeMode, Machine, Nic, Step, duration,
 };
@@ -128,7 +129,22 @@ fn bus(machine: &Machine, out: &mut Document) {
             "a clock farther off is warned of (0x092C)",
         );
     }
-    row("op_timeout", &time(bus.op_timeout_ns), "from SafeOp to Op");
+    match bus.op_timeout_ns {
+        Some(timeout) => row("op_timeout", &time(timeout), "from SafeOp to Op"),
+        None => {
+            let all = machine.devices.iter().map(|device| {
+                let timeouts = StateTimeouts::new(&device.device.info);
+                u64::try_from(timeouts.safe_op_op.as_nanos()).unwrap_or(u64::MAX)
+            });
+            let (shortest, longest) = (all.clone().min(), all.max());
+            let shown = match (shortest, longest) {
+                (Some(a), Some(b)) if a != b => format!("{} to {}", time(a), time(b)),
+                (_, Some(one)) => time(one),
+                _ => "10 s".to_owned(),
+            };
+            row("op_timeout", &shown, "from SafeOp to Op");
+        }
+    }
     let meaning = "until a drive reports Operation enabled";
     row("enable_timeout", &time(bus.enable_timeout_ns), meaning);
     out.section("bus", table);

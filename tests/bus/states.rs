@@ -1,0 +1,99 @@
+//! State changes as ETG.1000.6, ETG.1020 and ETG.2000 define them, on the whole bus.
+
+use std::sync::Arc;
+
+use ecaxis_master::cancel::CancelToken;
+use ecaxis_master::config::Machine;
+use ecaxis_master::link::sim::SimLink;
+use ecaxis_master::session::{self, Outcome, simulated_bus};
+use ecaxis_sim::Segment;
+use ecaxis_test_support::bench::Bench;
+use ecaxis_test_support::{Heard, virtual_time};
+
+const MS: u64 = 1_000_000;
+
+/// Runs a machine on its simulated bus, which `change` changes first.
+fn run_changed(machine: Machine, change: impl FnOnce(&mut Segment)) -> (Outcome, Heard) {
+    let options = virtual_time();
+    options.clock.enter();
+    let mut bus = simulated_bus(&machine, 1, None, None).expect("a bus");
+    change(&mut bus);
+    let mut heard = Heard::default();
+    let link = Box::new(SimLink::new(bus));
+    let stop = Arc::<CancelToken>::default();
+    let outcome = session::run_on(link, machine, options, stop, &mut heard);
+    (outcome, heard)
+}
+
+/// Returns a drive of `configs/esi` and a drive whose ESI has these time-outs.
+fn drives(bus: &str, timeouts: &str) -> Machine {
+    let bench = Bench::new();
+    bench.write("own.xml", &bench.read("esi/EPOS4.xml"));
+    bench.change("own.xml", |esi| {
+        let info = format!(
+            "<Info><StateMachine><Timeout>{timeouts}</Timeout></StateMachine></Info><GroupType>"
+        );
+        esi.replacen("<GroupType>", &info, 1)
+    });
+    let mut text = format!("[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n{bus}");
+    for (position, (name, file)) in [("x", "esi/EPOS4.xml"), ("y", "own.xml")]
+        .into_iter()
+        .enumerate()
+    {
+        text += &format!(
+            "[[device]]\nname = \"{name}\"\nesi = \"{file}\"\nposition = {position}\nmode = \"csp\"\n\
+             [device.axis]\nunit = \"turn\"\nper_turn = 1.0\nencoder = 2000\n\
+             limits = {{ position = [-100.0, 100.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 1.0 }}\n"
+        );
+    }
+    bench.machine(&(text + "[[step]]\nmove = { x = 1.0, y = 1.0 }\n"))
+}
+
+/// Runs [`drives`]; `y` needs `ns` for each state change.
+fn run_slow(bus: &str, timeouts: &str, ns: u64) -> Result<(), String> {
+    let (outcome, _) = run_changed(drives(bus, timeouts), |segment| {
+        let slow = segment.device_mut(1).expect("two drives");
+        slow.set_state_change(ns);
+    });
+    outcome.result.map_err(|error| error.to_string())
+}
+
+/// ETG.2000, `Info/StateMachine/Timeout`: the time-outs of a device are those of its ESI. ETG.1020:
+/// otherwise 10 s to SafeOp, which is enough for this device.
+#[test]
+fn state_change_times_out_after_the_time_of_the_esi() {
+    let short = "<SafeopOpTimeout>200</SafeopOpTimeout>";
+    let error = run_slow("", short, 300 * MS).expect_err("too slow");
+    assert!(
+        error.contains("`y`") && error.contains("did not reach SafeOp within 200 ms, is in PreOp"),
+        "{error}"
+    );
+    let back = "<BackToSafeopTimeout>400</BackToSafeopTimeout>";
+    assert_eq!(run_slow("", back, 300 * MS), Ok(()));
+}
+
+/// ETG.2000, `Info/StateMachine/Timeout`: longer times than the defaults of ETG.1020 (3 s to PreOp,
+/// 10 s to SafeOp and Op, 5 s back to Init, 200 ms back to SafeOp).
+#[test]
+fn state_change_may_take_as_long_as_the_esi_says() {
+    let long = "<PreopTimeout>30000</PreopTimeout><SafeopOpTimeout>30000</SafeopOpTimeout>\
+                <BackToInitTimeout>20000</BackToInitTimeout>\
+                <BackToSafeopTimeout>20000</BackToSafeopTimeout>";
+    assert_eq!(run_slow("", long, 12_000 * MS), Ok(()));
+    // The machine file's time-out replaces that of the ESI.
+    let error = run_slow("op_timeout = \"2s\"\n", long, 12_000 * MS).expect_err("too slow");
+    assert!(
+        error.contains("`y`") && error.contains("did not reach Op within 2000 ms, is in SafeOp"),
+        "{error}"
+    );
+}
+
+/// ETG.1020: the default of 200 ms back to SafeOp.
+#[test]
+fn way_back_to_safe_op_has_its_own_time_out() {
+    let error = run_slow("", "<PreopTimeout>4000</PreopTimeout>", 300 * MS).expect_err("too slow");
+    assert!(
+        error.contains("`y`") && error.contains("did not reach SafeOp within 200 ms, is in Op"),
+        "{error}"
+    );
+}
