@@ -8,7 +8,8 @@ use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::session::{self, Outcome, simulated_bus};
 use ecaxis_sim::Segment;
 use ecaxis_test_support::bench::Bench;
-use ecaxis_test_support::{Heard, virtual_time};
+use ecaxis_test_support::recordings::{Datagram, FPWR, LRW, datagrams};
+use ecaxis_test_support::{Heard, recorded, run_well, virtual_time};
 
 const MS: u64 = 1_000_000;
 
@@ -96,4 +97,73 @@ fn way_back_to_safe_op_has_its_own_time_out() {
         error.contains("`y`") && error.contains("did not reach SafeOp within 200 ms, is in Op"),
         "{error}"
     );
+}
+
+/// Returns what was written to a station: the register, and the byte at `byte` of its data.
+fn written(datagrams: &[Datagram], station: u16, registers: &[(u16, usize)]) -> Vec<(u16, u8)> {
+    let sent = datagrams
+        .iter()
+        .filter(|d| d.sent && d.command == FPWR && d.station() == station);
+    let found = sent.filter_map(|datagram| {
+        let (register, byte) = registers.iter().find(|(r, _)| *r == datagram.register())?;
+        Some((*register, *datagram.data.get(*byte)?))
+    });
+    found.collect()
+}
+
+/// ETG.2000, `Sm` attribute `OpOnly` (ETG.1500, feature 104): the SyncManager is disabled outside Op.
+/// ETG.1000.4: without its FMMU, a device adds nothing for outputs to the working counter of LRW.
+#[test]
+fn op_only_sync_manager_is_enabled_in_op_only() {
+    let bench = Bench::new();
+    bench.write("own.xml", &bench.read("esi/IO8.xml"));
+    bench.change("own.xml", |esi| {
+        let own = esi.replace("Enable=\"1\">Outputs", "Enable=\"1\" OpOnly=\"1\">Outputs");
+        // Without device emulation, the device refuses Op while the SyncManager is disabled.
+        own.replace("<ConfigData>0401", "<ConfigData>0400")
+    });
+    let machine = bench.machine(
+        "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n\
+         [[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"\nposition = 0\nmode = \"csp\"\n\
+         [device.axis]\nunit = \"turn\"\nper_turn = 1.0\nencoder = 2000\n\
+         limits = { position = [-100.0, 100.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 1.0 }\n\
+         [[device]]\nname = \"io\"\nesi = \"own.xml\"\nposition = 1\n\
+         [[step]]\nset = { \"io.Output 3\" = 1 }\n[[step]]\nmove = { x = 1.0 }\n",
+    );
+    let folder = tempfile::tempdir().expect("a folder");
+    let (options, recording) = recorded(virtual_time(), folder.path());
+    let summary = run_well(machine, options);
+    assert_eq!(summary.counters.wkc_errors, 0);
+    let datagrams = datagrams(&recording);
+
+    // The activation of SyncManager 0 (0x0806) and of FMMU 0 (0x060C), and AL control.
+    let registers = [
+        (0x0800, 6),
+        (0x0600, 12),
+        (0x0806, 0),
+        (0x060c, 0),
+        (0x0120, 0),
+    ];
+    assert_eq!(
+        written(&datagrams, 0x1001, &registers),
+        [
+            (0x0120, 2),
+            (0x0800, 0),
+            (0x0600, 0),
+            (0x0120, 4),
+            (0x0806, 1),
+            (0x060c, 1),
+            (0x0120, 8),
+            (0x0120, 4),
+            (0x060c, 0),
+            (0x0806, 0),
+            (0x0120, 2),
+            (0x0120, 1),
+        ]
+    );
+    let logical = datagrams.iter().filter(|d| !d.sent && d.command == LRW);
+    let mut counters: Vec<u16> = logical.map(|d| d.working_counter).collect();
+    counters.dedup();
+    // SafeOp: 3 of the drive and 1 of the inputs; Op: and 2 of the outputs.
+    assert_eq!(counters.get(..3), Some(&[4, 6, 4][..]), "{counters:?}");
 }

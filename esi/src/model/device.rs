@@ -6,6 +6,7 @@ use super::{
     DcMode, Dictionary, Fmmu, FmmuUse, LocalName, Mailbox, Pdo, Position, Slots, SmMapping, SmUse,
     SyncManager, SyncUnit,
 };
+use crate::layout::SmLayout;
 
 /// Identity object 0x1018 without the serial number.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
@@ -117,6 +118,21 @@ impl Device {
         u8::try_from(all.position(|sm| sm.usage == SmUse::MBoxIn)?).ok()
     }
 
+    /// Returns which parts of process data are enabled in Op only: the SyncManager, and the FMMU, also
+    /// where only its own element says so.
+    #[must_use]
+    pub fn op_only(&self, sm: &SmLayout) -> OpOnly {
+        let manager = self.sync_managers.get(usize::from(sm.sm));
+        let sync_manager = manager.is_some_and(|sm| sm.op_only);
+        let fmmu = sm
+            .fmmu
+            .and_then(|number| self.fmmus.get(usize::from(number)));
+        OpOnly {
+            sync_manager,
+            fmmu: sync_manager || fmmu.is_some_and(|fmmu| fmmu.op_only),
+        }
+    }
+
     /// Returns the FMMU that maps the mailbox status into the process image (`Fmmu` of
     /// `MBoxState`), and the SyncManager whose status it maps.
     #[must_use]
@@ -126,6 +142,15 @@ impl Device {
         let fmmu = all.position(|fmmu| fmmu.usage == FmmuUse::MBoxState)?;
         Some((u8::try_from(fmmu).ok()?, sm))
     }
+}
+
+/// The parts of process data that are enabled in Op only.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct OpOnly {
+    /// The SyncManager.
+    pub sync_manager: bool,
+    /// The FMMU.
+    pub fmmu: bool,
 }
 
 /// `HideType`. Without a product code in the file, the device's own product code applies.

@@ -15,6 +15,9 @@ const FMMU_SIZE: u16 = 16;
 /// An FMMU that maps nothing, as after a reset.
 const OFF: [u8; FMMU_SIZE as usize] = [0; FMMU_SIZE as usize];
 const STATUS: u16 = 5;
+/// The activation bytes of a SyncManager and of an FMMU.
+const SM_ACTIVATE: u16 = 6;
+const FMMU_ACTIVATE: u16 = 12;
 
 /// The state in which start-up SDOs are sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -209,11 +212,12 @@ fn format_value(data: &[u8]) -> String {
 }
 
 /// Configures the SyncManagers of the process data with one FMMU each, and the FMMU of the mailbox
-/// status at `status`. Outputs and inputs start at the same logical address.
+/// status at `status`. Outputs and inputs start at the same logical address. What the ESI enables in
+/// Op only stays disabled.
 pub(super) async fn map_process_data(
     wire: &impl MailboxTransport,
     config: &DeviceConfig,
-    device: &BusDevice,
+    device: &mut BusDevice,
     region: Option<DeviceRegion>,
     status: Option<u32>,
 ) -> Result<(), Error> {
@@ -222,14 +226,27 @@ pub(super) async fn map_process_data(
 
     let layout = &config.selection.layout;
     let mut fmmus = Vec::new();
+    let mut op_only_fmmus = Vec::new();
+    device.op_only.clear();
     for (sms, kind) in [(&layout.outputs, WRITE), (&layout.inputs, READ)] {
         let mut logical = region.map_or(0, |region| region.logical);
         for sm in sms {
             let register = registers::SYNC_MANAGER + registers::SYNC_MANAGER_LEN * u16::from(sm.sm);
             let step = "configuring SyncManagers";
-            write(wire, &device.at, step, register, &sync_manager(sm)).await?;
+            let op_only = config.device.op_only(sm);
+            let mut manager = sync_manager(sm);
+            if op_only.sync_manager && sm.len > 0 {
+                manager[usize::from(SM_ACTIVATE)] = 0;
+                device.op_only.push(register + SM_ACTIVATE);
+            }
+            write(wire, &device.at, step, register, &manager).await?;
             if sm.len > 0 {
-                fmmus.push(fmmu(logical, sm.start_address, sm.len, kind));
+                let mut mapped = fmmu(logical, sm.start_address, sm.len, kind);
+                if op_only.fmmu {
+                    mapped[usize::from(FMMU_ACTIVATE)] = 0;
+                    op_only_fmmus.push(fmmus.len());
+                }
+                fmmus.push(mapped);
                 logical = logical.saturating_add(u32::from(sm.len));
             }
         }
@@ -246,6 +263,35 @@ pub(super) async fn map_process_data(
         let register =
             registers::FMMU + FMMU_SIZE * u16::try_from(i).unwrap_or(u16::MAX / FMMU_SIZE);
         write(wire, &device.at, "configuring FMMUs", register, fmmu).await?;
+        if op_only_fmmus.contains(&i) {
+            device.op_only.push(register + FMMU_ACTIVATE);
+        }
+    }
+    Ok(())
+}
+
+/// Enables what is enabled in Op only, SyncManagers before FMMUs, or disables it in reverse order:
+/// no output passes an FMMU to memory without a SyncManager.
+pub(crate) async fn enable_op_only(
+    wire: &impl MailboxTransport,
+    device: &BusDevice,
+    enable: bool,
+) -> Result<(), Error> {
+    let step = if enable {
+        "enabling OpOnly SyncManagers"
+    } else {
+        "disabling OpOnly SyncManagers"
+    };
+    let write =
+        async |register: u16| write(wire, &device.at, step, register, &[u8::from(enable)]).await;
+    if enable {
+        for register in &device.op_only {
+            write(*register).await?;
+        }
+    } else {
+        for register in device.op_only.iter().rev() {
+            write(*register).await?;
+        }
     }
     Ok(())
 }

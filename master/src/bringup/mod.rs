@@ -41,6 +41,7 @@ pub(crate) use identify::name_at;
 mod watchdog;
 
 use device::StartupPhase;
+pub(crate) use device::enable_op_only;
 pub use device::{SdoOutcome, write_startup_sdo};
 
 /// The size of ethercrab's own process image, which is not used.
@@ -69,6 +70,8 @@ pub struct BusDevice {
     pub propagation_delay: u32,
     /// DL status (0x0110) after the scan: which ports are in use.
     pub dl_status: u16,
+    /// The activation bytes that are 1 in Op only: SyncManagers, then FMMUs.
+    pub op_only: Vec<u16>,
 }
 
 /// A segment in SafeOp, ready for cyclic exchange.
@@ -227,6 +230,7 @@ pub async fn bring_up(
             dl_status: enumerate::at(&wire, position, "reading its ports", registers::DL_STATUS)
                 .await
                 .map_or(0, u16::from_le_bytes),
+            op_only: Vec::new(),
         });
     }
 
@@ -267,7 +271,11 @@ async fn set_up(
         image = without;
     }
 
-    let regions = machine.devices.iter().zip(&*devices).zip(&image.regions);
+    let regions = machine
+        .devices
+        .iter()
+        .zip(devices.iter_mut())
+        .zip(&image.regions);
     for (index, ((config, device), region)) in (0..).map(DeviceIndex).zip(regions) {
         let status = image.mailboxes.as_ref().and_then(|m| m.logical_of(index));
         device::map_process_data(wire, config, device, *region, status).await?;

@@ -73,7 +73,7 @@ use crate::file;
 pub use crate::rt::config::{Condition, ExchangeMode, GroupStopScope};
 use crate::rt::config::{GroupConfig, RtConfig};
 pub use crate::rt::controller::{AxisRef, InputRef, OutputRef};
-use crate::rt::image::ProcessData;
+use crate::rt::image::{OpOnly, ProcessData};
 pub use crate::rt::spin::Spin;
 
 /// The maximum number of SubDevices on a bus; a power of two, as ethercrab's group needs.
@@ -221,6 +221,13 @@ pub struct DeviceConfig {
     pub sim: sim::SimSetup,
     /// The line of its `[[device]]` in the machine file.
     pub line: u32,
+}
+
+impl DeviceConfig {
+    /// Returns `true` if all these SyncManagers, or their FMMUs, are enabled in Op only.
+    fn is_op_only(&self, sms: &[esi::layout::SmLayout]) -> bool {
+        !sms.is_empty() && sms.iter().all(|sm| self.device.op_only(sm).fmmu)
+    }
 }
 
 /// How a device is located on the bus.
@@ -383,6 +390,10 @@ impl Machine {
                 group: self.group_of(index),
                 lrw: !device.device.use_lrd_lwr,
                 mailbox: device.device.mailbox_status_fmmu().is_some(),
+                op_only: OpOnly {
+                    outputs: device.is_op_only(&layout.outputs),
+                    inputs: device.is_op_only(&layout.inputs),
+                },
             }
         });
         let rest = GroupConfig::machine(stop.others);

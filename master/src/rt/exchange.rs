@@ -434,6 +434,7 @@ impl Exchange {
             DeviceAnswer::Missing
         };
         self.device_answers.fill(alone);
+        let op_expected = self.op_expected;
         let mut ambiguous = false;
         let mut all_right = true;
         for group in &mut self.group_results {
@@ -447,7 +448,9 @@ impl Exchange {
             let slot = datagram.slot;
             let answer = frame_set.answer(slot.frame);
             let wkc = answer.map_or(0, |answer| slot.wkc(answer));
-            let right = answer.is_some() && wkc == datagram.expected_wkc;
+            let right = answer.is_some()
+                && (wkc == datagram.expected_wkc
+                    || !op_expected && wkc == datagram.expected_wkc_before_op);
             let (begin, end) = datagram.devices;
             let device_answer = match answer {
                 None => DeviceAnswer::Missing,

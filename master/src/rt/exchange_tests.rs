@@ -55,6 +55,7 @@ fn axis(group: usize) -> ProcessData {
         group: GroupIndex(group),
         lrw: true,
         mailbox: false,
+        op_only: Default::default(),
     }
 }
 

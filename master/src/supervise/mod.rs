@@ -13,7 +13,7 @@ use ecaxis_axis::{Command, CommandError};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 
 use crate::acyclic::{AlState, DeviceRef, Transition, al};
-use crate::bringup::{Bus, BusDevice, clocks};
+use crate::bringup::{Bus, BusDevice, clocks, enable_op_only};
 use crate::cancel::CancelToken;
 use crate::clock::{self, Nanos};
 use crate::config::steps::enables;
@@ -158,6 +158,9 @@ impl Supervisor {
             }
         });
         let transitions: Vec<_> = transitions.collect();
+        for device in self.bus.devices.iter() {
+            enable_op_only(&self.wire, device, true).await?;
+        }
         al::change_states(&self.wire, &transitions, AlState::Op).await?;
         self.report(Progress::Step(crate::bringup::Step::State(AlState::Op)));
         self.order(RtCommand::Guard).await;
@@ -414,8 +417,20 @@ impl Supervisor {
             if let Err(error) = al::lower_state(&self.wire, &stopped, state).await {
                 tracing::debug!("{error}");
             }
+            if state == AlState::SafeOp {
+                self.disable_op_only().await;
+            }
         }
         result.and(lowered)
+    }
+
+    /// Disables the SyncManagers that are enabled in Op only, as far as the devices answer.
+    async fn disable_op_only(&self) {
+        for device in self.bus.devices.iter() {
+            if let Err(error) = enable_op_only(&self.wire, device, false).await {
+                tracing::debug!("{error}");
+            }
+        }
     }
 
     /// Stops SYNC0. PreOp does not need it, and in Init it would look like a running machine.

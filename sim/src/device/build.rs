@@ -151,6 +151,10 @@ impl Objects {
                 sm: usize::from(sm.sm),
                 direction: sm.direction,
                 mode: sm.mode,
+                op_only: device
+                    .sync_managers
+                    .get(usize::from(sm.sm))
+                    .is_some_and(|sm| sm.op_only),
                 map: Vec::new(),
                 len: 0,
             })

@@ -152,10 +152,13 @@ impl SimDevice {
             AlState::Boot => self.check_mailbox(code::INVALID_MAILBOX_BOOT),
             AlState::SafeOp if self.is_stopped() => Err(code::NO_VALID_FIRMWARE),
             AlState::SafeOp if rising => {
-                self.check_process_data()?;
+                self.check_process_data(to)?;
                 self.check_sync()
             }
-            AlState::Op => self.check_sync(),
+            AlState::Op => {
+                self.check_process_data(to)?;
+                self.check_sync()
+            }
             _ => Ok(()),
         }
     }
@@ -184,8 +187,8 @@ impl SimDevice {
     }
 
     /// Checks the SyncManagers against the mapping of the device. A buffered SyncManager takes
-    /// three times its length.
-    fn check_process_data(&self) -> Result<(), u16> {
+    /// three times its length. An `OpOnly` SyncManager (ETG.2000) may be disabled in SafeOp.
+    fn check_process_data(&self, state: AlState) -> Result<(), u16> {
         for data in &self.process {
             let outputs = data.direction == Direction::Rx;
             let code = if outputs {
@@ -206,6 +209,9 @@ impl SimDevice {
                 if sm.enabled && sm.len > 0 {
                     return Err(code);
                 }
+                continue;
+            }
+            if data.op_only && state != AlState::Op && !sm.enabled {
                 continue;
             }
             let good = sm.enabled
@@ -339,7 +345,7 @@ impl SimDevice {
         if self.al.state < AlState::SafeOp || !minds {
             return;
         }
-        if sms && let Err(code) = self.check_process_data() {
+        if sms && let Err(code) = self.check_process_data(self.al.state) {
             self.fall_to(AlState::PreOp, code, DeviceError::BusDown);
         } else if sync && self.al.state == AlState::Op && !self.sync0_decides() {
             self.fall_to(

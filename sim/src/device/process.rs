@@ -19,6 +19,8 @@ pub(super) struct ProcessData {
     pub(super) direction: Direction,
     /// The buffer mode in the ESI.
     pub(super) mode: Mode,
+    /// True if the SyncManager may be disabled outside Op.
+    pub(super) op_only: bool,
     pub(super) map: Vec<Mapped>,
     /// The length in bytes.
     pub(super) len: usize,

@@ -18,7 +18,7 @@ use ecaxis_master::rt::channel::{HostEndpoint, RtCommand, channel};
 use ecaxis_master::rt::config::{ExchangeMode, GroupConfig, RtConfig};
 use ecaxis_master::rt::cycle::{EngineConfig, Signals, first_snapshot};
 use ecaxis_master::rt::exchange::{Exchange, ExchangeDevice};
-use ecaxis_master::rt::image::{self, AxisBits, ImagePlan, ProcessData};
+use ecaxis_master::rt::image::{self, AxisBits, ImagePlan, OpOnly, ProcessData};
 use ecaxis_master::rt::phase::{ClockPlan, Phase};
 use ecaxis_master::rt::setpoint_generator::GeneratorRequest;
 use ecaxis_master::rt::spin::Spin;
@@ -106,6 +106,10 @@ const DRIVE: ProcessData = ProcessData {
     group: GroupIndex::MACHINE,
     lrw: true,
     mailbox: false,
+    op_only: OpOnly {
+        outputs: false,
+        inputs: false,
+    },
 };
 
 fn plan(axes: usize) -> Result<ImagePlan, RigError> {

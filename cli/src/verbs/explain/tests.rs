@@ -11,6 +11,7 @@ fn frame_bytes_match_a_manual_count() {
             group: GroupIndex(0),
             lrw: true,
             mailbox: false,
+            op_only: image::OpOnly::default(),
         };
         let plan = image::plan(&vec![axis; axes]).unwrap();
         let frames = frame_bytes(&plan, true);

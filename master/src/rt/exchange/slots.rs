@@ -17,6 +17,8 @@ pub(super) struct ProcessDatagram {
     /// Offset in the image.
     pub(super) image: usize,
     pub(super) expected_wkc: u16,
+    /// The counter while no device is in Op.
+    pub(super) expected_wkc_before_op: u16,
     /// The range of its devices in [`Exchange`](super::Exchange)'s `order`: the first, and one past
     /// the last.
     pub(super) devices: (usize, usize),
@@ -63,6 +65,7 @@ impl DatagramSlots {
                 group: datagram.group,
                 image: datagram.offset,
                 expected_wkc: datagram.expected_wkc,
+                expected_wkc_before_op: datagram.expected_wkc - datagram.op_only_wkc,
                 devices: (first, end),
             }
         });

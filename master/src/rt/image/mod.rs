@@ -7,7 +7,8 @@ use ecaxis_esi::layout::{Field, Layout};
 pub mod plan;
 
 pub use plan::{
-    Access, DatagramPlan, DeviceRegion, ImagePlan, MailboxPlan, ProcessData, TooLarge, of, plan,
+    Access, DatagramPlan, DeviceRegion, ImagePlan, MailboxPlan, OpOnly, ProcessData, TooLarge, of,
+    plan,
 };
 
 /// The bits of one object in the image.

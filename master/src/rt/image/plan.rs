@@ -26,6 +26,14 @@ pub struct ProcessData {
     pub lrw: bool,
     /// True if it has an FMMU for the status of its mailbox.
     pub mailbox: bool,
+    pub op_only: OpOnly,
+}
+
+/// The directions of a SubDevice that are enabled in Op only (ETG.2000, `OpOnly`).
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct OpOnly {
+    pub outputs: bool,
+    pub inputs: bool,
 }
 
 /// The position of one SubDevice's outputs and inputs. Both start at the same logical address, so
@@ -67,6 +75,8 @@ pub struct DatagramPlan {
     /// Sum over its SubDevices. In an LRW, inputs count 1 and outputs 2; otherwise each counts 1
     /// (ETG.1000.4).
     pub expected_wkc: u16,
+    /// The part of `expected_wkc` that is missing while no SubDevice is in Op.
+    pub op_only_wkc: u16,
 }
 
 /// The mapping of mailbox status: one byte each, the SyncManager's status register. It lies outside
@@ -194,6 +204,10 @@ fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge>
             return Err(TooLarge { device: index, len });
         }
         let (reads, writes) = (u16::from(inp > 0), u16::from(out > 0));
+        let (late_reads, late_writes) = (
+            reads * u16::from(device.op_only.inputs),
+            writes * u16::from(device.op_only.outputs),
+        );
         let mut datagram = DatagramPlan {
             frame: 0,
             group: device.group,
@@ -202,6 +216,7 @@ fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge>
             offset: image.len,
             len,
             expected_wkc: reads + 2 * writes,
+            op_only_wkc: late_reads + 2 * late_writes,
         };
         let first = image.datagrams.len();
         let frame = match image.datagrams.last_mut() {
@@ -213,6 +228,7 @@ fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge>
             {
                 last.len += len;
                 last.expected_wkc += datagram.expected_wkc;
+                last.op_only_wkc += datagram.op_only_wkc;
                 frames.room -= len;
                 last.frame
             }
@@ -222,13 +238,17 @@ fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge>
                 datagram.frame
             }
             _ => {
-                for (access, len) in [(Access::Outputs, out), (Access::Inputs, inp)] {
+                for (access, len, op_only_wkc) in [
+                    (Access::Outputs, out, late_writes),
+                    (Access::Inputs, inp, late_reads),
+                ] {
                     if len > 0 {
                         image.datagrams.push(DatagramPlan {
                             frame: frames.place(len),
                             access,
                             len,
                             expected_wkc: 1,
+                            op_only_wkc,
                             ..datagram
                         });
                     }
@@ -287,6 +307,7 @@ mod tests {
             group: GroupIndex(0),
             lrw: true,
             mailbox: false,
+            op_only: OpOnly::default(),
         });
         each.collect()
     }
@@ -311,6 +332,7 @@ mod tests {
                 offset: 0,
                 len: 16,
                 expected_wkc: 3 + 1 + 2,
+                op_only_wkc: 0,
             }]
         );
         assert_eq!(image.regions[DeviceIndex(1)].map(|r| r.offset), Some(14));
@@ -354,6 +376,23 @@ mod tests {
         assert_eq!(*image.groups, [1, 0, 2, 1, 1].map(GroupIndex));
     }
 
+    /// ETG.1000.4, working counter: a disabled FMMU contributes neither 2 for outputs nor 1 for
+    /// inputs. ETG.2000: `OpOnly` SyncManagers are disabled outside Op.
+    #[test]
+    fn op_only_directions_count_in_op_only() {
+        let mut devices = lrw(&[(12, 13), (1, 1), (1, 1)]);
+        devices[1].op_only.outputs = true;
+        let counters = |devices: &[ProcessData]| {
+            let image = plan(devices).expect("fits");
+            let datagrams = image.datagrams.iter();
+            let counters = datagrams.map(|d| (d.expected_wkc, d.op_only_wkc));
+            counters.collect::<Vec<_>>()
+        };
+        assert_eq!(counters(&devices), [(9, 2)]);
+        devices[1].lrw = false;
+        assert_eq!(counters(&devices), [(3, 0), (1, 1), (1, 0), (3, 0)]);
+    }
+
     #[test]
     fn device_without_lrw_uses_two_datagrams_at_the_same_position() {
         let mut devices = lrw(&[(12, 13), (4, 6), (0, 2), (12, 13)]);
@@ -395,7 +434,7 @@ mod tests {
         ) {
             let devices: Vec<ProcessData> = devices
                 .into_iter()
-                .map(|(out_len, in_len, group, lrw, mailbox)| ProcessData { out_len, in_len, group: GroupIndex(group), lrw, mailbox })
+                .map(|(out_len, in_len, group, lrw, mailbox)| ProcessData { out_len, in_len, group: GroupIndex(group), lrw, mailbox, op_only: OpOnly::default() })
                 .collect();
             let image = plan(&devices).expect("none is too large");
             for frame in 0..image.frames() {
