@@ -12,6 +12,8 @@
 
 /// ESC type; revision, build, FMMUs, SyncManagers, RAM and ports follow.
 pub const TYPE: u16 = 0x0000;
+/// The number of FMMUs.
+pub const FMMU_COUNT: u16 = 0x0004;
 /// ESC features supported.
 pub const FEATURES: u16 = 0x0008;
 /// Configured station address.

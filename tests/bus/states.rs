@@ -9,7 +9,7 @@ use ecaxis_master::session::{self, Outcome, simulated_bus};
 use ecaxis_sim::Segment;
 use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::recordings::{Datagram, FPWR, LRW, datagrams};
-use ecaxis_test_support::{Heard, recorded, run_well, virtual_time};
+use ecaxis_test_support::{Heard, recorded, run, run_well, virtual_time};
 
 const MS: u64 = 1_000_000;
 
@@ -128,7 +128,7 @@ fn op_only_sync_manager_is_enabled_in_op_only() {
          [device.axis]\nunit = \"turn\"\nper_turn = 1.0\nencoder = 2000\n\
          limits = { position = [-100.0, 100.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 1.0 }\n\
          [[device]]\nname = \"io\"\nesi = \"own.xml\"\nposition = 1\n\
-         [[step]]\nset = { \"io.Output 3\" = 1 }\n[[step]]\nmove = { x = 1.0 }\n",
+         [[step]]\nset = { io.\"Output 3\" = true }\n[[step]]\nmove = { x = 1.0 }\n",
     );
     let folder = tempfile::tempdir().expect("a folder");
     let (options, recording) = recorded(virtual_time(), folder.path());
@@ -166,4 +166,91 @@ fn op_only_sync_manager_is_enabled_in_op_only() {
     counters.dedup();
     // SafeOp: 3 of the drive and 1 of the inputs; Op: and 2 of the outputs.
     assert_eq!(counters.get(..3), Some(&[4, 6, 4][..]), "{counters:?}");
+}
+
+/// Runs one device whose ESI is a changed one of `configs/esi`, next to nothing else. Returns the
+/// datagrams, or the error.
+fn run_alone(
+    file: &str,
+    rest: &str,
+    change: impl FnOnce(&str) -> String,
+) -> Result<Vec<Datagram>, String> {
+    let bench = Bench::new();
+    bench.write("own.xml", &bench.read(&format!("esi/{file}")));
+    bench.change("own.xml", change);
+    let machine = bench.machine(&format!(
+        "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n\
+         [[device]]\nname = \"x\"\nesi = \"own.xml\"\nposition = 0\n{rest}"
+    ));
+    let folder = tempfile::tempdir().expect("a folder");
+    let (options, recording) = recorded(virtual_time(), folder.path());
+    let (outcome, _) = run(machine, options);
+    outcome.result.map_err(|error| error.to_string())?;
+    let summary = outcome.summary.expect("a summary");
+    assert_eq!(summary.counters.wkc_errors, 0);
+    Ok(datagrams(&recording))
+}
+
+const DRIVE: &str = "mode = \"csp\"\n[device.axis]\nunit = \"turn\"\nper_turn = 1.0\nencoder = 2000\n\
+    limits = { position = [-100.0, 100.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 1.0 }\n\
+    [[step]]\nmove = { x = 1.0 }\n";
+const TERMINAL: &str = "[[step]]\nset = { x.\"Output 3\" = true }\n[[step]]\ndwell = \"20ms\"\n";
+
+/// ETG.1000.6, 6.4: the mailbox SyncManagers are enabled before PreOp is requested, whatever the
+/// ESI's `Enable` says. A device whose mailbox is disabled refuses PreOp (0x0016).
+#[test]
+fn mailbox_sync_managers_are_enabled_whatever_the_esi_says() {
+    let done = run_alone("EPOS4.xml", DRIVE, |esi| {
+        let own = esi.replace("Enable=\"1\">MBoxOut", "Enable=\"0\">MBoxOut");
+        own.replace("Enable=\"1\">MBoxIn", "Enable=\"0\">MBoxIn")
+    });
+    let datagrams = done.expect("comes up");
+    let enabled = written(&datagrams, 0x1000, &[(0x0806, 0), (0x080e, 0)]);
+    assert_eq!(enabled, [(0x0806, 1), (0x080e, 1)]);
+}
+
+/// ETG.2000: `Fmmu` elements are optional; the SyncManagers' texts say what they carry.
+#[test]
+fn device_without_fmmu_elements_is_mapped_by_its_sync_managers() {
+    for (file, rest) in [("IO8.xml", TERMINAL), ("EPOS4.xml", DRIVE)] {
+        let done = run_alone(file, rest, |esi| {
+            let lines = esi.lines().filter(|line| !line.contains("<Fmmu>"));
+            lines.collect::<Vec<_>>().join("\n")
+        });
+        let datagrams = done.unwrap_or_else(|error| panic!("{file}: {error}"));
+        // Writing from FMMU 0, reading from FMMU 1.
+        let kinds = written(&datagrams, 0x1000, &[(0x0600, 11), (0x0610, 11)]);
+        assert_eq!(kinds, [(0x0600, 2), (0x0610, 1)], "{file}");
+    }
+}
+
+/// Runs a terminal with two FMMUs (0x0004) and a second SyncManager of outputs at this address.
+fn run_two_outputs(start: &str) -> Result<Vec<Datagram>, String> {
+    run_alone("IO8.xml", TERMINAL, |esi| {
+        let sm = format!(
+            "<Sm DefaultSize=\"1\" StartAddress=\"{start}\" ControlByte=\"#x44\" Enable=\"1\">Outputs</Sm>\n\
+             <RxPdo Fixed=\"1\" Mandatory=\"1\" Sm=\"2\"><Index>#x1601</Index><Name>Lamps</Name>\
+             <Entry><Index>#x7010</Index><SubIndex>1</SubIndex><BitLen>8</BitLen><Name>Lamps</Name>\
+             <DataType>USINT</DataType></Entry></RxPdo>\n<RxPdo "
+        );
+        esi.replacen("<RxPdo ", &sm, 1)
+    })
+}
+
+/// ETG.1000.4, FMMU: one FMMU maps one contiguous area, whatever SyncManagers control it.
+#[test]
+fn adjoining_sync_managers_share_an_fmmu_if_there_are_too_few() {
+    let datagrams = run_two_outputs("#x1001").expect("comes up");
+    // Length, and the low byte of the physical address.
+    let lengths = written(&datagrams, 0x1000, &[(0x0600, 4), (0x0610, 4)]);
+    assert_eq!(lengths, [(0x0600, 2), (0x0610, 1)]);
+    let kinds = written(&datagrams, 0x1000, &[(0x0600, 11), (0x0610, 11)]);
+    assert_eq!(kinds, [(0x0600, 2), (0x0610, 1)]);
+
+    let error = run_two_outputs("#x1010").expect_err("too few");
+    assert!(
+        error.contains("`x`")
+            && error.contains("need 3 FMMUs, the controller has 2 (register 0x0004)"),
+        "{error}"
+    );
 }

@@ -110,6 +110,9 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         Cause::MailboxMoved { .. } => {
             "the device's EEPROM is not of this ESI file: use the ESI file of its firmware".to_owned()
         }
+        Cause::Fmmus { .. } => {
+            "choose fewer PDOs, so that fewer SyncManagers carry process data (`assignment`, `pdo`)".to_owned()
+        }
         Cause::NoStart => {
             "frames are lost or the computer is overloaded: check cables, and stop other programs".to_owned()
         }

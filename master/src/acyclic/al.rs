@@ -196,7 +196,7 @@ pub async fn lower_state(
 }
 
 /// Acknowledges an error that the device still has, then requests a state.
-async fn request(
+pub(crate) async fn request(
     wire: &impl MailboxTransport,
     device: &DeviceRef,
     wanted: AlState,

@@ -12,9 +12,6 @@ use crate::report::{Cause, Error};
 use crate::rt::image::DeviceRegion;
 
 const FMMU_SIZE: u16 = 16;
-/// An FMMU that maps nothing, as after a reset.
-const OFF: [u8; FMMU_SIZE as usize] = [0; FMMU_SIZE as usize];
-const STATUS: u16 = 5;
 /// The activation bytes of a SyncManager and of an FMMU.
 const SM_ACTIVATE: u16 = 6;
 const FMMU_ACTIVATE: u16 = 12;
@@ -211,9 +208,28 @@ fn format_value(data: &[u8]) -> String {
     format!("0x{value:0width$x}", width = data.len() * 2)
 }
 
+/// The logical memory of one FMMU.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Mapping {
+    logical: u32,
+    physical: u16,
+    len: u16,
+    /// [`READ`] or [`WRITE`].
+    kind: u8,
+    /// Enabled in Op only.
+    op_only: bool,
+}
+
+const READ: u8 = 1;
+const WRITE: u8 = 2;
+
 /// Configures the SyncManagers of the process data with one FMMU each, and the FMMU of the mailbox
-/// status at `status`. Outputs and inputs start at the same logical address. What the ESI enables in
-/// Op only stays disabled.
+/// status at `status`. Outputs and inputs start at the same logical address. SyncManagers whose
+/// areas adjoin share an FMMU if the controller has too few. The mailbox status gets an FMMU only if
+/// one is left. What the ESI enables in Op only stays disabled.
+///
+/// # Errors
+/// [`Cause::Fmmus`] if the controller has too few FMMUs.
 pub(super) async fn map_process_data(
     wire: &impl MailboxTransport,
     config: &DeviceConfig,
@@ -221,12 +237,8 @@ pub(super) async fn map_process_data(
     region: Option<DeviceRegion>,
     status: Option<u32>,
 ) -> Result<(), Error> {
-    const READ: u8 = 1;
-    const WRITE: u8 = 2;
-
     let layout = &config.selection.layout;
-    let mut fmmus = Vec::new();
-    let mut op_only_fmmus = Vec::new();
+    let mut mappings = Vec::new();
     device.op_only.clear();
     for (sms, kind) in [(&layout.outputs, WRITE), (&layout.inputs, READ)] {
         let mut logical = region.map_or(0, |region| region.logical);
@@ -241,33 +253,76 @@ pub(super) async fn map_process_data(
             }
             write(wire, &device.at, step, register, &manager).await?;
             if sm.len > 0 {
-                let mut mapped = fmmu(logical, sm.start_address, sm.len, kind);
-                if op_only.fmmu {
-                    mapped[usize::from(FMMU_ACTIVATE)] = 0;
-                    op_only_fmmus.push(fmmus.len());
-                }
-                fmmus.push(mapped);
+                mappings.push(Mapping {
+                    logical,
+                    physical: sm.start_address,
+                    len: sm.len,
+                    kind,
+                    op_only: op_only.fmmu,
+                });
                 logical = logical.saturating_add(u32::from(sm.len));
             }
         }
     }
-    if let (Some(logical), Some((number, sm))) = (status, config.device.mailbox_status_fmmu()) {
-        // The ESI's number, unless the process data already uses it.
-        let number = usize::from(number).max(fmmus.len());
-        fmmus.resize(number, OFF);
-        let register =
-            registers::SYNC_MANAGER + registers::SYNC_MANAGER_LEN * u16::from(sm) + STATUS;
-        fmmus.push(fmmu(logical, register, 1, READ));
+    let step = "configuring FMMUs";
+    let status = status.zip(config.device.mailbox_status_fmmu());
+    if mappings.is_empty() && status.is_none() {
+        return Ok(());
     }
-    for (i, fmmu) in fmmus.iter().enumerate().filter(|(_, fmmu)| **fmmu != OFF) {
-        let register =
-            registers::FMMU + FMMU_SIZE * u16::try_from(i).unwrap_or(u16::MAX / FMMU_SIZE);
-        write(wire, &device.at, "configuring FMMUs", register, fmmu).await?;
-        if op_only_fmmus.contains(&i) {
+    let [available] = read(wire, &device.at, step, registers::FMMU_COUNT).await?;
+    let available = usize::from(available);
+    if mappings.len() > available {
+        share_fmmus(&mut mappings);
+    }
+    if mappings.len() > available {
+        let needed = mappings.len();
+        let cause = Cause::Fmmus { needed, available };
+        return Err(cause.with_device(&device.at).with_action(step));
+    }
+    for (number, mapping) in mappings.iter().enumerate() {
+        let register = fmmu_register(number);
+        write(wire, &device.at, step, register, &fmmu(mapping)).await?;
+        if mapping.op_only {
             device.op_only.push(register + FMMU_ACTIVATE);
         }
     }
+    if let Some((logical, (number, sm))) = status {
+        // The ESI's number, unless the process data already uses it.
+        let own = usize::from(number).max(mappings.len());
+        let number = if own < available { own } else { mappings.len() };
+        let mapping = Mapping {
+            logical,
+            physical: registers::SYNC_MANAGER_STATUS + registers::SYNC_MANAGER_LEN * u16::from(sm),
+            len: 1,
+            kind: READ,
+            op_only: false,
+        };
+        if number < available {
+            let register = fmmu_register(number);
+            write(wire, &device.at, step, register, &fmmu(&mapping)).await?;
+        }
+    }
     Ok(())
+}
+
+/// Joins mappings that adjoin in logical and in physical memory.
+fn share_fmmus(mappings: &mut Vec<Mapping>) {
+    mappings.dedup_by(|next, last| {
+        let len = u32::from(last.len);
+        let adjoins = (next.kind, next.op_only) == (last.kind, last.op_only)
+            && u32::from(next.physical) == u32::from(last.physical) + len
+            && u64::from(next.logical) == u64::from(last.logical) + u64::from(len);
+        let sum = last.len.checked_add(next.len);
+        if let (true, Some(sum)) = (adjoins, sum) {
+            last.len = sum;
+            return true;
+        }
+        false
+    });
+}
+
+fn fmmu_register(number: usize) -> u16 {
+    registers::FMMU + FMMU_SIZE * u16::try_from(number).unwrap_or(u16::MAX / FMMU_SIZE)
 }
 
 /// Enables what is enabled in Op only, SyncManagers before FMMUs, or disables it in reverse order:
@@ -303,12 +358,13 @@ fn sync_manager(sm: &SmLayout) -> [u8; registers::SYNC_MANAGER_LEN as usize] {
     [p0, p1, n0, n1, sm.control_byte, 0, u8::from(sm.len > 0), 0]
 }
 
-fn fmmu(logical: u32, physical: u16, len: u16, kind: u8) -> [u8; FMMU_SIZE as usize] {
-    let [l0, l1, l2, l3] = logical.to_le_bytes();
-    let [n0, n1] = len.to_le_bytes();
-    let [p0, p1] = physical.to_le_bytes();
-    // Start bit 0 to stop bit 7; physical start bit 0; enabled.
-    [l0, l1, l2, l3, n0, n1, 0, 7, p0, p1, 0, kind, 1, 0, 0, 0]
+fn fmmu(mapping: &Mapping) -> [u8; FMMU_SIZE as usize] {
+    let [l0, l1, l2, l3] = mapping.logical.to_le_bytes();
+    let [n0, n1] = mapping.len.to_le_bytes();
+    let [p0, p1] = mapping.physical.to_le_bytes();
+    let (kind, on) = (mapping.kind, u8::from(!mapping.op_only));
+    // Start bit 0 to stop bit 7; physical start bit 0.
+    [l0, l1, l2, l3, n0, n1, 0, 7, p0, p1, 0, kind, on, 0, 0, 0]
 }
 
 /// Writes a register; fails if the device does not answer.
@@ -332,4 +388,40 @@ pub(super) async fn read<const N: usize>(
 ) -> Result<[u8; N], Error> {
     let registers = Registers { wire, device, step };
     registers.read(register).await
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// ETG.1000.4, FMMU: one FMMU maps one contiguous physical area to one contiguous logical area,
+    /// in one direction.
+    #[test]
+    fn share_fmmus_joins_adjoining_areas_of_one_direction() {
+        let mapping = |logical, physical, len, kind| Mapping {
+            logical,
+            physical,
+            len,
+            kind,
+            op_only: false,
+        };
+        let mut all = vec![
+            mapping(0x1_0000, 0x0f00, 1, WRITE),
+            mapping(0x1_0001, 0x0f01, 1, WRITE),
+            mapping(0x1_0002, 0x0f03, 1, WRITE),
+            mapping(0x1_0000, 0x1000, 2, READ),
+            mapping(0x1_0002, 0x1002, 4, READ),
+        ];
+        share_fmmus(&mut all);
+        let joined = [
+            mapping(0x1_0000, 0x0f00, 2, WRITE),
+            mapping(0x1_0002, 0x0f03, 1, WRITE),
+            mapping(0x1_0000, 0x1000, 6, READ),
+        ];
+        assert_eq!(all, joined);
+        all[1].op_only = true;
+        all[1].physical = 0x0f02;
+        share_fmmus(&mut all);
+        assert_eq!(all.len(), 3, "one is disabled outside Op");
+    }
 }

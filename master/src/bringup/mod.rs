@@ -179,10 +179,8 @@ pub async fn bring_up(
             _ => error,
         })?;
 
-    let group = match main_device
-        .init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now)
-        .await
-    {
+    let scan = main_device.init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now);
+    let group = match mailbox::enable_during(&wire, machine, scan).await {
         Ok(group) => group,
         Err(error) => return Err(identify::explain_scan(&wire, machine, error).await),
     };

@@ -201,6 +201,10 @@ pub enum Cause {
         "starting SYNC0: writing the start time to all devices takes longer than the time until the start"
     )]
     NoStart,
+    #[error(
+        "its process data need {needed} FMMUs, the controller has {available} (register 0x0004)"
+    )]
+    Fmmus { needed: usize, available: usize },
     #[error("the mailbox is at {actual}, the ESI says {expected}")]
     MailboxMoved { expected: String, actual: String },
     #[error("no process data comes back in SafeOp: {}", al_note(*al_status))]

@@ -216,7 +216,11 @@ impl SimDevice {
         let ram_kib = count((ram_end - PROCESS_RAM).div_ceil(1024));
         let needs = ChipRequirements {
             ports: Medium::descriptor(Medium::from_physics(&device.physics)),
-            fmmus: count(device.fmmus.len()),
+            // Without `Fmmu` elements, one for each SyncManager of the process data.
+            fmmus: count(match device.fmmus.len() {
+                0 => process.len(),
+                fmmus => fmmus,
+            }),
             sync_managers: count(device.sync_managers.len()),
             ram_kib,
             clock: is_drive || uses_dc(device),
