@@ -254,3 +254,36 @@ fn adjoining_sync_managers_share_an_fmmu_if_there_are_too_few() {
         "{error}"
     );
 }
+
+/// ETG.1020, explicit device identification: the device answers a request in AL control by bit 5 of
+/// AL status. A device whose ESI has `IdentificationReg134` (ETG.2000) has a second for that.
+#[test]
+fn explicit_identification_waits_for_a_slow_device() {
+    for (declared, comes_up) in [("1", true), ("0", false)] {
+        let bench = Bench::new();
+        bench.write("own.xml", &bench.read("esi/EPOS4.xml"));
+        bench.change("own.xml", |esi| {
+            let info = format!(
+                "<Info><StateMachine><Timeout><BackToSafeopTimeout>1000</BackToSafeopTimeout></Timeout>\
+                 </StateMachine><IdentificationReg134>{declared}</IdentificationReg134></Info><GroupType>"
+            );
+            esi.replacen("<GroupType>", &info, 1)
+        });
+        let machine = bench.machine(&format!(
+            "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n\
+             [[device]]\nname = \"x\"\nesi = \"own.xml\"\nid = 7\n{DRIVE}"
+        ));
+        let (outcome, _) = run_changed(machine, |segment| {
+            let slow = segment.device_mut(0).expect("a drive");
+            slow.set_state_change(300 * MS);
+        });
+        let result = outcome.result.map_err(|error| error.to_string());
+        assert_eq!(result.is_ok(), comes_up, "{declared}: {result:?}");
+        if let Err(error) = result {
+            assert!(
+                error.contains("no SubDevice has device identification 7"),
+                "{error}"
+            );
+        }
+    }
+}

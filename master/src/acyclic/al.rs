@@ -23,6 +23,12 @@ pub const SAFE_OP_TIMEOUT: Duration = Duration::from_secs(10);
 /// The ETG.1020 default for a transition to a lower state.
 pub const BACK_TIMEOUT: Duration = Duration::from_secs(5);
 
+/// The time in which a device answers the request of its identification if ESI or EEPROM say that it
+/// has one.
+pub const IDENTIFICATION_TIMEOUT: Duration = Duration::from_secs(1);
+/// The time for every other device.
+pub const SHORT_IDENTIFICATION_TIMEOUT: Duration = Duration::from_millis(10);
+
 /// A state of the EtherCAT state machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum AlState {
@@ -309,26 +315,30 @@ async fn write_control(
 
 /// Reads the explicit device identification (ETG.1020, "Explicit Device Identification"). It is
 /// requested in AL control and answered in AL status code. Returns `None` if the device does not
-/// support it.
+/// answer in time or emulates its states: such a controller would answer with its own request.
 pub async fn read_explicit_id(
     wire: &impl MailboxTransport,
     station: u16,
+    timeout: Duration,
 ) -> Result<Option<u16>, DatagramError> {
     let Some((state, _)) = read_status(wire, station).await? else {
         return Ok(None);
     };
+    if emulated(wire, station).await {
+        return Ok(None);
+    }
     let whole = async {
         write_control(wire, station, state & 0x0f | ID_REQUEST).await?;
-        let mut id = None;
-        for _ in 0..20 {
+        let end = wire
+            .now()
+            .saturating_add(u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX));
+        let id = loop {
             match read_status(wire, station).await? {
-                Some((status, code)) if status & ID_REQUEST != 0 => {
-                    id = Some(code);
-                    break;
-                }
+                Some((status, code)) if status & ID_REQUEST != 0 => break Some(code),
+                _ if wire.now() >= end => break None,
                 _ => wire.delay(POLL).await,
             }
-        }
+        };
         write_control(wire, station, state & 0x0f).await?;
         Ok(id)
     };
@@ -336,14 +346,15 @@ pub async fn read_explicit_id(
     wire.stop().shield(whole).await
 }
 
-/// Returns the index of the first of these devices with this explicit device identification.
+/// Returns the index of the first of these devices with this explicit device identification. Each
+/// station has its own time-out.
 pub async fn find_explicit_id(
     wire: &impl MailboxTransport,
-    stations: impl Iterator<Item = u16>,
+    stations: impl Iterator<Item = (u16, Duration)>,
     id: u16,
 ) -> Option<usize> {
-    for (index, station) in stations.enumerate() {
-        if read_explicit_id(wire, station).await == Ok(Some(id)) {
+    for (index, (station, timeout)) in stations.enumerate() {
+        if read_explicit_id(wire, station, timeout).await == Ok(Some(id)) {
             return Some(index);
         }
     }

@@ -1,6 +1,6 @@
 //! Operations on one device of a segment: locating it, reading its EEPROM, opening its mailbox.
 
-use ecaxis_esi::sii::{self, Sii};
+use ecaxis_esi::sii::{self, General, Sii};
 
 use super::DatagramClient;
 use super::eeprom::{EepromAccess, EepromError, with_eeprom};
@@ -24,9 +24,7 @@ pub async fn locate(
     address(wire, &mut all).await?;
     let at = match at {
         Locator::Id(id) => {
-            let stations = all.iter().map(|found| found.station);
-            let found = al::find_explicit_id(wire, stations, id).await;
-            let found = found.and_then(|index| all.get(index));
+            let found = find_explicit_id(wire, &all, id).await;
             found.map_or(at, |found| Locator::Position(found.position))
         }
         at => at,
@@ -34,6 +32,32 @@ pub async fn locate(
     let found = select(&all, at)?;
     let name = name.map_or_else(|| format!("device {}", found.position), ToOwned::to_owned);
     Ok((found.clone(), found.named(name)))
+}
+
+/// Returns the device with this identification. Devices that do not answer at once are asked again,
+/// with more time, if their EEPROM says that they have one.
+async fn find_explicit_id<'f>(
+    wire: &DatagramClient,
+    all: &'f [EnumeratedDevice],
+    id: u16,
+) -> Option<&'f EnumeratedDevice> {
+    let short = al::SHORT_IDENTIFICATION_TIMEOUT;
+    let stations = all.iter().map(|found| (found.station, short));
+    if let Some(index) = al::find_explicit_id(wire, stations, id).await {
+        return all.get(index);
+    }
+    for found in all {
+        let device = found.named(format!("device {}", found.position));
+        let sii = read_sii(wire, &device, EepromAccess::of(found.state)).await;
+        let general = sii.ok().and_then(|sii| sii.general);
+        let answers =
+            general.is_some_and(|general| general.flags & General::IDENTIFICATION_AL_STATUS != 0);
+        let long = al::IDENTIFICATION_TIMEOUT;
+        if answers && al::read_explicit_id(wire, found.station, long).await == Ok(Some(id)) {
+            return Some(found);
+        }
+    }
+    None
 }
 
 /// Reads the content of a device's EEPROM.

@@ -1,6 +1,8 @@
 //! Identifies the SubDevices on the bus and compares them with the machine file.
 
-use ecaxis_esi::model::Identity;
+use std::time::Duration;
+
+use ecaxis_esi::model::{Identification, Identity};
 use ethercrab::error::{Error, TimeoutError};
 use ethercrab::{MainDevice, SubDeviceIdentity};
 
@@ -119,7 +121,11 @@ pub(super) async fn assign(
             }
             Locator::Alias(alias) => found.iter().position(|f| f.alias == alias),
             Locator::Id(id) => {
-                al::find_explicit_id(wire, found.iter().map(|f| f.station), id).await
+                let stations = found.iter().map(|f| {
+                    let timeout = identification_timeout(machine, f.identity);
+                    (f.station, timeout)
+                });
+                al::find_explicit_id(wire, stations, id).await
             }
         };
         match position {
@@ -190,6 +196,21 @@ pub(super) async fn assign(
         }
     }
     Ok(order)
+}
+
+/// Returns the time in which a device answers the request of its identification. It is long only if
+/// an ESI of the machine says that the device has one.
+fn identification_timeout(machine: &Machine, found: Identity) -> Duration {
+    let model = |identity: Identity| (identity.vendor, identity.product);
+    let mut same = machine
+        .devices
+        .iter()
+        .filter(|config| model(config.selection.identity) == model(found));
+    if same.any(|config| config.device.info.identification == Identification::Reg134) {
+        al::IDENTIFICATION_TIMEOUT
+    } else {
+        al::SHORT_IDENTIFICATION_TIMEOUT
+    }
 }
 
 /// Returns the devices whose positions are missing on the bus. A device missing in the middle of a

@@ -331,7 +331,7 @@ async fn explicit_id(wire: &DatagramClient, device: &Device) -> Result<Option<u1
         return Ok(None);
     };
     if general.flags & General::IDENTIFICATION_AL_STATUS != 0 && !device.found.error {
-        let id = al::read_explicit_id(wire, device.found.station).await;
+        let id = al::read_explicit_id(wire, device.found.station, al::IDENTIFICATION_TIMEOUT).await;
         return id.map_err(|error| Error::from(Cause::Datagram(error)).with_action(STEP));
     }
     if general.flags & General::IDENTIFICATION_ADDRESS != 0 {
