@@ -9,7 +9,7 @@ use ecaxis_master::session::{self, Outcome, simulated_bus};
 use ecaxis_sim::Segment;
 use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::recordings::{Datagram, FPWR, LRW, datagrams};
-use ecaxis_test_support::{Heard, recorded, run, run_well, virtual_time};
+use ecaxis_test_support::{Heard, faults, recorded, run, run_well, virtual_time};
 
 const MS: u64 = 1_000_000;
 
@@ -285,5 +285,31 @@ fn explicit_identification_waits_for_a_slow_device() {
                 "{error}"
             );
         }
+    }
+}
+
+/// CiA 402-2, 0x60C2: interpolation time period, optional. A drive that refuses the cycle and keeps
+/// another one comes up with a warning; a drive without the object (0x06020000) without one.
+#[test]
+fn refused_interpolation_time_is_a_warning() {
+    for (code, warned) in [
+        (0x0609_0030_u32, true),
+        (0x0800_0022, true),
+        (0x0602_0000, false),
+    ] {
+        let bench = Bench::new();
+        let machine = bench.machine(&format!(
+            "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n\
+             [[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"\nposition = 0\n{DRIVE}"
+        ));
+        let script = format!(
+            "[[fault]]\nkind = \"sdo-abort\"\nindex = 0x60c2\nsub = 1\ncode = 0x{code:08x}\n"
+        );
+        let (outcome, heard) = run(machine, faults(&script));
+        let result = outcome.result.map_err(|error| error.to_string());
+        assert_eq!(result, Ok(()), "0x{code:08x}");
+        let warnings = heard.warnings();
+        let about = |text: &&String| text.contains("refuses the interpolation time");
+        assert_eq!(warnings.iter().any(|w| about(&w)), warned, "{warnings:?}");
     }
 }

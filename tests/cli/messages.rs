@@ -155,11 +155,11 @@ fn every_bus_failure_has_code_device_step_cause_and_hint() {
             &["`y`", "identify", "IDX.xml", "0x00000099"],
         ),
         (
-            fault("kind = \"sdo-abort\"\ndevice = 0\nindex = 0x60c2\nsub = 1\ncode = 0x06090030"),
+            fault("kind = \"sdo-abort\"\ndevice = 0\nindex = 0x6060\nsub = 0\ncode = 0x06090030"),
             &[
                 "`x`",
                 "start-up SDO",
-                "0x60c2:01",
+                "0x6060:00",
                 "0x06090030",
                 "out of range",
             ],

@@ -57,7 +57,7 @@ fn no_line_is_wider_than_the_terminal() {
     std::fs::write(&silent, script).expect("written");
     let abort = folder.path().join("abort.toml");
     let script =
-        "[[fault]]\nkind = \"sdo-abort\"\ndevice = 0\nindex = 0x60c2\nsub = 1\ncode = 0x06090030\n";
+        "[[fault]]\nkind = \"sdo-abort\"\ndevice = 0\nindex = 0x6060\nsub = 0\ncode = 0x06090030\n";
     std::fs::write(&abort, script).expect("written");
     let (silent, abort) = (silent.display(), abort.display());
     let table = [

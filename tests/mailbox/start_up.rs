@@ -20,6 +20,7 @@ fn sdo((index, sub): (u16, u8), data: &[u8], name: &str) -> StartupSdo {
         data: data.to_vec(),
         name: name.to_owned(),
         origin: "a test".to_owned(),
+        optional: false,
     }
 }
 

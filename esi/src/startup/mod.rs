@@ -44,6 +44,8 @@ pub struct StartupSdo {
     pub name: String,
     /// The element or key from which the SDO originates.
     pub origin: String,
+    /// True if the device may refuse the SDO and keep its own value.
+    pub optional: bool,
 }
 
 /// The transitions up to Op, in order.
@@ -182,7 +184,16 @@ impl<'d> List<'d> {
             data,
             name: self.name(index, sub),
             origin: origin.to_owned(),
+            optional: false,
         });
+    }
+
+    /// Adds an SDO that the device may refuse.
+    fn push_optional(&mut self, index: u16, sub: u8, data: Vec<u8>, origin: &str) {
+        self.push(index, sub, data, origin);
+        if let Some(sdo) = self.sdos.last_mut() {
+            sdo.optional = true;
+        }
     }
 
     /// Adds a complete access download of the whole object from subindex 0, which occupies two
@@ -248,7 +259,7 @@ fn module_list(device: &Device, selection: &Selection, list: &mut List<'_>) {
     list.push(MODULE_LIST, 0, vec![count], &whole);
 }
 
-/// Adds 0x60C2. CSP and CSV interpolate set-points over the bus cycle, and an axis may switch to
+/// Adds 0x60C2, which the device may refuse. CSP and CSV interpolate set-points over the bus cycle, and an axis may switch to
 /// them during operation. In CST alone, the EPOS4 application notes set the time to zero, so a
 /// stored time does not remain. Zero is written only if the dictionary permits zero.
 fn interpolation_time(
@@ -284,14 +295,14 @@ fn interpolation_time(
                 })
         });
         if zero_allowed {
-            list.push(INTERPOLATION_TIME, 1, vec![0], "mode cst");
+            list.push_optional(INTERPOLATION_TIME, 1, vec![0], "mode cst");
             list.knows_period = true;
         }
         return Ok(());
     }
     let (value, exponent) = interpolation::interpolation_time(objects.dictionary, choice.cycle_ns)?;
-    list.push(INTERPOLATION_TIME, 1, vec![value], "bus.cycle");
-    list.push(
+    list.push_optional(INTERPOLATION_TIME, 1, vec![value], "bus.cycle");
+    list.push_optional(
         INTERPOLATION_TIME,
         2,
         exponent.to_le_bytes().to_vec(),
@@ -359,6 +370,7 @@ fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list
             data: cmd.data.clone(),
             name: list.name(cmd.index, cmd.sub),
             origin: format!("{origin} InitCmd (line {})", cmd.position.line),
+            optional: false,
         });
     }
 }

@@ -6,8 +6,9 @@ use ecaxis_esi::{StartupSdo, address};
 
 use super::{BusDevice, Step};
 use crate::acyclic::{DeviceRef, Registers};
+use crate::config::duration::show;
 use crate::config::{DeviceConfig, StartupOptions};
-use crate::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, object_name};
+use crate::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, abort_text, object_name};
 use crate::report::{Cause, Error};
 use crate::rt::image::DeviceRegion;
 
@@ -53,9 +54,18 @@ pub(super) async fn start_up(
             .with_action("emptying the mailbox")
     })?;
     let mut held = 0;
+    let mut refused = None;
     for (done, sdo) in list.iter().enumerate() {
         let way = config.startup.way(sdo.index, sdo.sub);
-        match write_startup_sdo(wire, &device.at, coe, sdo, way).await? {
+        let outcome = match write_startup_sdo(wire, &device.at, coe, sdo, way).await {
+            Err(error) if sdo.optional => {
+                let code = abort_code(&error).ok_or(error)?;
+                refused.get_or_insert(code);
+                continue;
+            }
+            outcome => outcome?,
+        };
+        match outcome {
             SdoOutcome::Held => held += 1,
             SdoOutcome::Unreadable => progress(Step::Warning(format!(
                 "{}: {} cannot be read, so it is not verified",
@@ -70,6 +80,16 @@ pub(super) async fn start_up(
             of: list.len(),
         });
     }
+    if let Some(code) = refused {
+        let wanted: Vec<_> = list.iter().filter(|sdo| sdo.optional).copied().collect();
+        if let Some(kept) = kept_period(wire, &device.at, coe, &wanted, code).await? {
+            progress(Step::Warning(format!(
+                "{}: refuses the interpolation time of this cycle (0x60C2), {}; it keeps {kept}",
+                device.at,
+                abort_text(code)
+            )));
+        }
+    }
     if held > 0 {
         progress(Step::Held {
             device: config.name.clone(),
@@ -78,6 +98,44 @@ pub(super) async fn start_up(
         });
     }
     Ok(())
+}
+
+fn abort_code(error: &Error) -> Option<u32> {
+    match &*error.cause {
+        Cause::StartUp { source, .. } => source.abort_code(),
+        _ => None,
+    }
+}
+
+/// Returns the interpolation time that a device keeps after it has refused another one. `None` if it
+/// is the wanted one, or if the device has no such object (abort code 0x06020000 or 0x06090011).
+async fn kept_period(
+    wire: &impl MailboxTransport,
+    at: &DeviceRef,
+    coe: &mut CoeClient,
+    wanted: &[&StartupSdo],
+    code: u32,
+) -> Result<Option<String>, Error> {
+    if matches!(code, 0x0602_0000 | 0x0609_0011) {
+        return Ok(None);
+    }
+    let mut same = true;
+    let (mut value, mut exponent) = (None, Some(-3));
+    for sdo in wanted {
+        let found = read_back(wire, at, coe, sdo).await?;
+        same &= found.as_ref().is_some_and(|now| holds(sdo, now));
+        let byte = found.and_then(|now| now.first().copied());
+        match sdo.sub {
+            1 => value = byte,
+            _ => exponent = byte.map(|byte| i8::from_le_bytes([byte])),
+        }
+    }
+    let ns = value.zip(exponent).and_then(|(value, exponent)| {
+        let power = u32::try_from(9 + i32::from(exponent)).ok()?;
+        10_u64.checked_pow(power)?.checked_mul(u64::from(value))
+    });
+    let kept = ns.map_or_else(|| "its own".to_owned(), show);
+    Ok((!same).then_some(kept))
 }
 
 /// The result of one start-up SDO.

@@ -70,6 +70,7 @@ pub(super) async fn compare(
             data: vec![0; data.len()],
             name: String::new(),
             origin: "no offset to the axis' targets".to_owned(),
+            optional: false,
         };
         device::download(wire, &device.at, coe, &zero).await?;
         progress(Step::Warning(format!(

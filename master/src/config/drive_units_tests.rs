@@ -132,6 +132,7 @@ fn adopt_rescales_program_and_homing() {
         data: value.to_le_bytes().to_vec(),
         name: String::new(),
         origin: String::new(),
+        optional: false,
     };
     // 1 turn/s in mrpm, 10 turns/s² in mrpm/s.
     let startup: Vec<_> = [(0x6099, 1, 60_000), (0x609a, 0, 600_000)].map(sdo).into();

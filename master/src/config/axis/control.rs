@@ -203,6 +203,7 @@ pub(super) fn homing(
                 data: bytes[..usize::from(object.bytes)].to_vec(),
                 name,
                 origin: "`homing` of the machine file".to_owned(),
+                optional: false,
             }
         })
         .collect();
