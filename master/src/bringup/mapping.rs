@@ -1,6 +1,8 @@
 //! The device's actual PDO assignment and mapping, read back and compared with the layout that the
-//! cycle will use. With one bit of offset, a set-point would reach another object.
+//! cycle will use. With one bit of offset, a set-point would reach another object. Only the layout
+//! counts: PDOs without entries and the split of objects over PDOs and gaps may differ.
 
+use ecaxis_esi::layout::SmLayout;
 use ecaxis_esi::model::Pdo;
 
 use super::BusDevice;
@@ -11,61 +13,156 @@ use crate::report::{Cause, Error};
 /// The PDO assignment of SyncManager n is 0x1C10 + n (ETG.1000.6, Table 67).
 const ASSIGNMENT: u16 = 0x1c10;
 
+/// A PDO and its mapping entries: index, subindex and bit length of each object.
+type Contents = (u16, Vec<u32>);
+
 pub(super) async fn compare(
     wire: &impl MailboxTransport,
     config: &DeviceConfig,
     device: &mut BusDevice,
 ) -> Result<(), Error> {
     let selection = &config.selection;
-    for (sms, pdos) in [
-        (&selection.layout.outputs, &selection.rx),
-        (&selection.layout.inputs, &selection.tx),
+    for (sms, pdos, offered) in [
+        (
+            &selection.layout.outputs,
+            &selection.rx,
+            &config.device.rx_pdos,
+        ),
+        (
+            &selection.layout.inputs,
+            &selection.tx,
+            &config.device.tx_pdos,
+        ),
     ] {
         let mut assigned = Vec::new();
         for sm in sms {
-            let index = ASSIGNMENT + u16::from(sm.sm);
-            let Some(list) = read_list(wire, device, index).await? else {
+            let Some(list) = read_list(wire, device, assignment(sm)).await? else {
                 // A device with a fixed assignment may hide it; it checks the lengths itself on the
                 // way to SafeOp.
                 return Ok(());
             };
-            assigned.extend(list.into_iter().map(|pdo| (index, pdo)));
+            assigned.push((sm, list));
         }
-        for (place, (index, actual)) in assigned.iter().enumerate() {
-            let expected = pdos.get(place).map(|pdo| u32::from(pdo.index));
-            if expected != Some(*actual) {
-                return Err(differs(device, *index, place, expected, Some(*actual), 4));
+        for (sm, list) in assigned {
+            let mut actual = Vec::new();
+            for (place, value) in list.into_iter().enumerate() {
+                // An empty place of the assignment has index 0.
+                let Some(pdo) = u16::try_from(value).ok().filter(|pdo| *pdo != 0) else {
+                    continue;
+                };
+                let known = pdos.iter().chain(offered).find(|known| known.index == pdo);
+                let read = read_list(wire, device, pdo).await?;
+                let Some(contents) = read.or_else(|| known.map(entries)) else {
+                    let sub = u8::try_from(place + 1).unwrap_or(u8::MAX);
+                    let difference = Difference {
+                        place: (assignment(sm), sub),
+                        expected: "no such PDO".to_owned(),
+                        actual: format!("0x{pdo:04x}"),
+                    };
+                    return Err(difference.with_device(device));
+                };
+                actual.push((pdo, contents));
             }
-        }
-        if let (Some(missing), Some(sm)) = (pdos.get(assigned.len()), sms.last()) {
-            let index = ASSIGNMENT + u16::from(sm.sm);
-            let expected = Some(u32::from(missing.index));
-            return Err(differs(device, index, assigned.len(), expected, None, 4));
-        }
-        for pdo in pdos {
-            compare_contents(wire, device, pdo).await?;
+            let expected = pdos.iter().filter(|pdo| pdo.sm == Some(sm.sm));
+            let expected: Vec<Contents> = expected.map(|pdo| (pdo.index, entries(pdo))).collect();
+            if let Some(difference) = difference(&expected, &actual) {
+                return Err(difference.with_device(device));
+            }
         }
     }
     Ok(())
 }
 
-async fn compare_contents(
-    wire: &impl MailboxTransport,
-    device: &mut BusDevice,
-    pdo: &Pdo,
-) -> Result<(), Error> {
-    let Some(actual) = read_list(wire, device, pdo.index).await? else {
-        return Ok(());
-    };
-    let expected: Vec<u32> = pdo.entries.iter().map(|entry| entry.mapping()).collect();
-    let len = actual.len().max(expected.len());
-    for place in 0..len {
-        let (expected, actual) = (expected.get(place).copied(), actual.get(place).copied());
-        if expected != actual {
-            return Err(differs(device, pdo.index, place, expected, actual, 8));
+fn assignment(sm: &SmLayout) -> u16 {
+    ASSIGNMENT + u16::from(sm.sm)
+}
+
+fn entries(pdo: &Pdo) -> Vec<u32> {
+    pdo.entries.iter().map(|entry| entry.mapping()).collect()
+}
+
+/// An object in the process data of a SyncManager.
+#[derive(Debug, Clone, Copy)]
+struct MappedObject {
+    bit: u32,
+    /// Index, subindex and bit length.
+    mapping: u32,
+    /// The PDO and the subindex of its mapping object.
+    place: (u16, u8),
+}
+
+impl MappedObject {
+    fn show(object: Option<&Self>) -> String {
+        object.map_or_else(
+            || "nothing".to_owned(),
+            |object| format!("0x{:08x} at bit {}", object.mapping, object.bit),
+        )
+    }
+}
+
+/// Returns the objects of these PDOs without gaps, and the length in bits.
+fn lay_out(pdos: &[Contents]) -> (Vec<MappedObject>, u32) {
+    let mut objects = Vec::new();
+    let mut bit = 0_u32;
+    for (pdo, contents) in pdos {
+        for (sub, &mapping) in (1..=u8::MAX).zip(contents) {
+            // A gap has index 0.
+            if mapping >> 16 != 0 {
+                objects.push(MappedObject {
+                    bit,
+                    mapping,
+                    place: (*pdo, sub),
+                });
+            }
+            bit = bit.saturating_add(mapping & 0xff);
         }
     }
-    Ok(())
+    (objects, bit)
+}
+
+/// Where two layouts differ.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Difference {
+    /// Index and subindex in the device, or in the ESI if the device has nothing there.
+    place: (u16, u8),
+    expected: String,
+    actual: String,
+}
+
+impl Difference {
+    fn with_device(self, device: &BusDevice) -> Error {
+        let (index, sub) = self.place;
+        Cause::Mapping {
+            index,
+            sub,
+            expected: self.expected,
+            actual: self.actual,
+        }
+        .with_device(&device.at)
+    }
+}
+
+/// Returns the first difference between the layouts of two lists of PDOs.
+fn difference(expected: &[Contents], actual: &[Contents]) -> Option<Difference> {
+    let ((wanted, wanted_bits), (found, found_bits)) = (lay_out(expected), lay_out(actual));
+    let on_wire = |object: &MappedObject| (object.bit, object.mapping);
+    for n in 0..wanted.len().max(found.len()) {
+        let (wanted, found) = (wanted.get(n), found.get(n));
+        if wanted.map(on_wire) != found.map(on_wire) {
+            return Some(Difference {
+                place: found.or(wanted)?.place,
+                expected: MappedObject::show(wanted),
+                actual: MappedObject::show(found),
+            });
+        }
+    }
+    let (wanted, found) = (wanted_bits.div_ceil(8), found_bits.div_ceil(8));
+    let last = actual.last().or(expected.last())?;
+    (wanted != found).then(|| Difference {
+        place: (last.0, 0),
+        expected: format!("{wanted} bytes"),
+        actual: format!("{found} bytes"),
+    })
 }
 
 /// Returns `None` if the device has no such object or no CoE mailbox.
@@ -85,25 +182,59 @@ async fn read_list(
     })
 }
 
-fn differs(
-    device: &BusDevice,
-    index: u16,
-    place: usize,
-    expected: Option<u32>,
-    actual: Option<u32>,
-    digits: usize,
-) -> Error {
-    let show = |value: Option<u32>| {
-        value.map_or_else(
-            || "nothing".to_owned(),
-            |value| format!("0x{value:0digits$x}"),
-        )
-    };
-    Cause::Mapping {
-        index,
-        sub: u8::try_from(place + 1).unwrap_or(u8::MAX),
-        expected: show(expected),
-        actual: show(actual),
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pdo(index: u16, contents: &[u32]) -> Contents {
+        (index, contents.to_vec())
     }
-    .with_device(&device.at)
+
+    /// ETG.1000.6, PDO assignment and PDO mapping: the process data of a SyncManager are the mapped
+    /// objects of its PDOs in order. Nothing else is on the wire.
+    #[test]
+    fn layouts_are_compared_and_not_lists() {
+        const STATUS: u32 = 0x6041_0010;
+        const POSITION: u32 = 0x6064_0020;
+        let expected = [pdo(0x1a00, &[STATUS, 0x0000_0010, POSITION])];
+        for same in [
+            &[pdo(0x1a00, &[STATUS, 0x0000_0010, POSITION])][..],
+            // A PDO without entries, as some devices assign for an empty slot.
+            &[
+                pdo(0x1a10, &[]),
+                pdo(0x1a00, &[STATUS, 0x0000_0010, POSITION]),
+            ],
+            // The same objects in two PDOs, the gap in two parts.
+            &[
+                pdo(0x1a00, &[STATUS, 0x0000_0008]),
+                pdo(0x1a01, &[0x0000_0008, POSITION]),
+            ],
+        ] {
+            assert_eq!(difference(&expected, same), None, "{same:?}");
+        }
+        let differs = |actual: &[Contents]| {
+            let found = difference(&expected, actual).expect("a difference");
+            (found.place, found.expected, found.actual)
+        };
+        let position = "0x60640020 at bit 32".to_owned();
+        assert_eq!(
+            differs(&[pdo(0x1a00, &[STATUS, POSITION])]),
+            (
+                (0x1a00, 2),
+                position.clone(),
+                "0x60640020 at bit 16".to_owned()
+            )
+        );
+        assert_eq!(
+            differs(&[pdo(0x1a00, &[STATUS])]),
+            ((0x1a00, 3), position, "nothing".to_owned())
+        );
+        assert_eq!(
+            differs(&[pdo(0x1a00, &[STATUS, 0x0000_0010, POSITION, 0x0000_0008])]),
+            ((0x1a00, 0), "8 bytes".to_owned(), "9 bytes".to_owned())
+        );
+        let other = differs(&[pdo(0x1a00, &[STATUS, 0x0000_0010, 0x606c_0020])]);
+        assert_eq!(other.2, "0x606c0020 at bit 32");
+        assert_eq!(difference(&[], &[pdo(0x1600, &[])]), None);
+    }
 }
