@@ -34,6 +34,10 @@ pub struct Layout {
     pub rx: Vec<Field>,
     /// The inputs in wire order.
     pub tx: Vec<Field>,
+    /// The PDOs of the outputs in wire order.
+    pub rx_pdos: Vec<PdoLayout>,
+    /// The PDOs of the inputs in wire order.
+    pub tx_pdos: Vec<PdoLayout>,
 }
 
 /// The layout of one process data SyncManager.
@@ -56,6 +60,17 @@ impl SmLayout {
     fn is_buffered(&self) -> bool {
         self.start_address >= PROCESS_MEMORY && self.control_byte & 0x03 == 0
     }
+}
+
+/// The bits of one assigned PDO, gaps included.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PdoLayout {
+    /// The index of the PDO.
+    pub index: u16,
+    /// The offset as in [`Field::bit_offset`].
+    pub bit_offset: u32,
+    /// The length in bits.
+    pub bit_len: u32,
 }
 
 /// One mapped object. Gaps have no `Field`.
@@ -81,13 +96,15 @@ pub struct Field {
 impl Layout {
     /// Lays out `rx` and `tx`. Both are in assignment order, and each PDO names its SyncManager.
     pub fn new(device: &Device, rx: &[Pdo], tx: &[Pdo]) -> Result<Self, SelectError> {
-        let (outputs, rx) = direction(device, rx, FmmuUse::Outputs)?;
-        let (inputs, tx) = direction(device, tx, FmmuUse::Inputs)?;
+        let (outputs, rx, rx_pdos) = direction(device, rx, FmmuUse::Outputs)?;
+        let (inputs, tx, tx_pdos) = direction(device, tx, FmmuUse::Inputs)?;
         let layout = Self {
             outputs,
             inputs,
             rx,
             tx,
+            rx_pdos,
+            tx_pdos,
         };
         layout.check_addresses(device)?;
         // Digital I/O controllers without a processor latch single bytes and do not need buffers.
@@ -123,6 +140,18 @@ impl Layout {
         self.tx
             .iter()
             .find(|field| field.index == index && field.sub == sub)
+    }
+
+    /// Returns the outputs that map an object of an earlier PDO again, each after the first field
+    /// of that object. Equal fields of one PDO are not repetitions but samples (oversampling).
+    pub fn repeated_outputs(&self) -> impl Iterator<Item = (&Field, &Field)> {
+        /// Lower indices are data types, which serve as padding (ETG.1000.6, dummy mapping).
+        const FIRST_OBJECT: u16 = 0x1000;
+        self.rx.iter().filter_map(|field| {
+            let first = self.rx_field(field.index, field.sub)?;
+            let repeats = first.pdo != field.pdo && field.index >= FIRST_OBJECT;
+            repeats.then_some((first, field))
+        })
     }
 
     /// Checks that the memory of each used SyncManager is valid, including the mailbox
@@ -182,11 +211,14 @@ impl Layout {
     }
 }
 
+/// The SyncManagers, fields and PDOs of one direction.
+type DirectionLayout = (Vec<SmLayout>, Vec<Field>, Vec<PdoLayout>);
+
 fn direction(
     device: &Device,
     pdos: &[Pdo],
     usage: FmmuUse,
-) -> Result<(Vec<SmLayout>, Vec<Field>), SelectError> {
+) -> Result<DirectionLayout, SelectError> {
     let mut numbers: Vec<u8> = pdos.iter().filter_map(|pdo| pdo.sm).collect();
     numbers.sort_unstable();
     numbers.dedup();
@@ -195,7 +227,7 @@ fn direction(
         .filter(|(_, fmmu)| fmmu.usage == usage)
         .map(|(number, _)| number)
         .collect();
-    let (mut sms, mut fields) = (Vec::new(), Vec::new());
+    let (mut sms, mut fields, mut laid_out) = (Vec::new(), Vec::new(), Vec::new());
     let mut offset = 0u32;
     for number in numbers {
         let Some(sm) = device.sync_managers.get(usize::from(number)) else {
@@ -203,6 +235,7 @@ fn direction(
         };
         let start = offset;
         for pdo in pdos.iter().filter(|pdo| pdo.sm == Some(number)) {
+            let first_bit = offset;
             for entry in &pdo.entries {
                 if !entry.is_gap() {
                     fields.push(Field {
@@ -217,6 +250,11 @@ fn direction(
                 }
                 offset = offset.saturating_add(u32::from(entry.bit_len));
             }
+            laid_out.push(PdoLayout {
+                index: pdo.index,
+                bit_offset: first_bit,
+                bit_len: offset - first_bit,
+            });
         }
         let bytes = (offset - start).div_ceil(8);
         let max = sm
@@ -252,5 +290,5 @@ fn direction(
             });
         }
     }
-    Ok((sms, fields))
+    Ok((sms, fields, laid_out))
 }

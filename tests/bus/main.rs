@@ -13,6 +13,7 @@ mod mailboxes;
 mod phase;
 mod probe;
 mod program;
+mod repeats;
 mod samples;
 mod states;
 mod units;

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use ecaxis_esi as esi;
 use toml::Spanned;
 
@@ -12,6 +13,7 @@ use super::problem::{Problems, Span, suggestion, unreadable};
 use super::raw::{RawDevice, RawEntry};
 use super::{DeviceConfig, Locator, Startup, axis, drive_limits, sdo, sim};
 use crate::esi_library::{self, Library, LoadError, RevisionMatch};
+use crate::rt::config::ProcessDataCopy;
 
 /// Data shared by all devices: the ESI folder, the files read so far, and the cycle.
 pub(crate) struct EsiFiles<'f> {
@@ -222,6 +224,9 @@ pub(crate) fn check(
         drive_limits::check(axis, &raw.sdo, chosen, p);
         further_axes(chosen);
     }
+    if let Some(chosen) = chosen.as_mut() {
+        repeated_outputs(chosen);
+    }
     let sim = raw.sim.take().map(|sim| {
         let axis = match (&raw.axis, &axis) {
             (None, _) => Err(()),
@@ -252,6 +257,34 @@ pub(crate) fn check(
         sim: sim.unwrap_or_default(),
         line: p.line(&raw.span),
     })
+}
+
+/// Returns the outputs that repeat an object of another PDO of their device.
+pub(super) fn repeats(devices: &IndexVec<DeviceIndex, DeviceConfig>) -> Vec<ProcessDataCopy> {
+    let mut repeats = Vec::new();
+    for (index, device) in devices.enumerate() {
+        let fields = device.selection.layout.repeated_outputs();
+        repeats.extend(fields.map(|(first, field)| ProcessDataCopy {
+            from: (index, first.bit_offset as usize),
+            to: (index, field.bit_offset as usize),
+            bits: first.bit_len.min(field.bit_len).into(),
+        }));
+    }
+    repeats
+}
+
+/// Reports outputs that several PDOs map.
+fn repeated_outputs(selection: &mut esi::Selection) {
+    let repeats = selection.layout.repeated_outputs().map(|(first, field)| {
+        format!(
+            "{} is mapped in PDO 0x{:04x} and again in 0x{:04x}: both carry the same value",
+            esi::address(field.index, field.sub),
+            first.pdo,
+            field.pdo,
+        )
+    });
+    let notes: Vec<String> = repeats.collect();
+    selection.notes.extend(notes);
 }
 
 /// Reports which axes of a drive stay without power.

@@ -411,6 +411,8 @@ impl Machine {
             groups: std::iter::once(rest).chain(named).collect(),
             bus_lost: stop.bus_lost,
             emergency: stop.emergency.clone(),
+            copies: Vec::new(),
+            repeats: device::repeats(&self.devices),
         }
     }
 }

@@ -27,6 +27,21 @@ pub struct RtConfig {
     pub bus_lost: StopMethod,
     /// The conditions for an emergency stop; one is enough.
     pub emergency: Vec<Condition>,
+    /// Inputs that are copied to outputs in every cycle.
+    pub copies: Vec<ProcessDataCopy>,
+    /// Outputs that repeat other outputs of their device.
+    pub repeats: Vec<ProcessDataCopy>,
+}
+
+/// Bits of the process data that are copied.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ProcessDataCopy {
+    /// The source: its device, and the first bit in the inputs (or outputs) of that device.
+    pub from: (DeviceIndex, usize),
+    /// The target: its device, and the first bit in the outputs of that device.
+    pub to: (DeviceIndex, usize),
+    /// The length in bits.
+    pub bits: usize,
 }
 
 /// The cycle in which answers are evaluated.

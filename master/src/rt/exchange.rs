@@ -20,7 +20,7 @@ use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 
 pub use super::config::ExchangeMode;
 use super::image::plan::frames as frames_of;
-use super::image::{Access, ImagePlan};
+use super::image::{Access, BitCopy, ImagePlan};
 use super::phase::ClockPlan;
 use crate::clock::Nanos;
 use crate::link::pdu_loop::ETHERCAT;
@@ -84,6 +84,10 @@ pub struct Exchange {
     cycle: u32,
     outputs: Vec<u8>,
     inputs: Vec<u8>,
+    /// Copies of inputs to outputs, each with the device of the inputs.
+    copies: Vec<(DeviceIndex, BitCopy)>,
+    /// Copies of outputs to outputs.
+    repeats: Vec<BitCopy>,
 }
 
 impl Exchange {
@@ -158,6 +162,8 @@ impl Exchange {
             cycle: 0,
             outputs: vec![0; plan.len],
             inputs: vec![0; plan.len],
+            copies: plan.copies.clone(),
+            repeats: plan.repeats.clone(),
         };
         exchange.stage();
         exchange
@@ -325,6 +331,7 @@ impl Exchange {
     /// Copies outputs that have changed since [`Exchange::stage`] into the frames. Call before
     /// [`Exchange::send`]. RT: O(image).
     pub fn refresh_outputs(&mut self) {
+        self.copy_process_data();
         let Some(frame_set) = self.frame_sets.get_mut(self.staged) else {
             return;
         };
@@ -339,6 +346,19 @@ impl Exchange {
                 frame[slot.data()].copy_from_slice(&self.outputs[from]);
             }
             clear_wkc(frame, slot);
+        }
+    }
+
+    /// Copies inputs to outputs, then outputs to those that repeat them. A copy whose source device
+    /// has not answered in this cycle holds its last value.
+    fn copy_process_data(&mut self) {
+        for &(source, copy) in &self.copies {
+            if self.device_answers.get(source) == Some(&DeviceAnswer::Fresh) {
+                copy.apply(&self.inputs, &mut self.outputs);
+            }
+        }
+        for repeat in &self.repeats {
+            repeat.apply_within(&mut self.outputs);
         }
     }
 

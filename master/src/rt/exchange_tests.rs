@@ -487,3 +487,57 @@ fn an_answer_256_cycles_old_is_late() {
     assert_eq!(exchange.receive(&first), Received::Late);
     assert!(!exchange.evaluate().inputs_fresh);
 }
+
+/// The exchange itself copies: outputs follow the inputs when the next frames are staged.
+#[test]
+fn copies_and_repeats_are_in_the_next_frames() {
+    let device = axis(0);
+    let mut plan = plan(&[device; 2]).expect("fits");
+    let source = DeviceIndex(1);
+    plan.copies = vec![(
+        source,
+        BitCopy {
+            from: 12 * 8,
+            to: 8,
+            bits: 12,
+        },
+    )];
+    plan.repeats = vec![BitCopy {
+        from: 8,
+        to: 50,
+        bits: 12,
+    }];
+    let members = [1, 2].map(|station| ExchangeDevice {
+        station,
+        clock: true,
+        mailbox: None,
+    });
+    let clock = ClockPlan {
+        reference: 1,
+        cycle_ns: 1_000_000,
+        release: 0,
+    };
+    let mut exchange = Exchange::new(&plan, Some(&clock), &members, ExchangeMode::SameCycle);
+    exchange.outputs_mut().fill(0xff);
+    let answer = reflect(&mut exchange, 0, 0xa5);
+    assert_eq!(exchange.receive(&answer), Received::Current);
+    assert!(exchange.evaluate().inputs_fresh);
+    exchange.stage();
+    let outputs = exchange.outputs_mut().to_vec();
+    // 0x5a5 from bit 8, and again from bit 50; all other bits are unchanged.
+    let image = outputs
+        .iter()
+        .take(8)
+        .rev()
+        .fold(0_u64, |all, &byte| all << 8 | u64::from(byte));
+    let expected = !(0xfff << 8 | 0xfff << 50) | 0x5a5 << 8 | 0x5a5 << 50;
+    assert_eq!(image, expected, "{image:#018x}");
+
+    // Without an answer, a copy holds its value. Outputs are repeated all the same.
+    exchange.outputs_mut()[1] = 0x11;
+    exchange.send(&mut Nowhere, 0).expect("nowhere takes all");
+    exchange.evaluate();
+    exchange.stage();
+    assert_eq!(exchange.outputs_mut()[1], 0x11);
+    assert_eq!(exchange.outputs_mut()[6] >> 2, 0x11 & 0x3f);
+}

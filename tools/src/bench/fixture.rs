@@ -188,6 +188,8 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
             groups: vec![GroupConfig::machine(StopMethod::Ramp)].into(),
             bus_lost: StopMethod::QuickStop,
             emergency: Vec::new(),
+            copies: Vec::new(),
+            repeats: Vec::new(),
         },
         link,
         port: main_device(cycle_ns, Duration::ZERO).1,

@@ -4,8 +4,10 @@
 use ecaxis_esi::address;
 use ecaxis_esi::layout::{Field, Layout};
 
+mod copy;
 pub mod plan;
 
+pub use copy::BitCopy;
 pub use plan::{
     Access, DatagramPlan, DeviceRegion, ImagePlan, MailboxPlan, OpOnly, ProcessData, TooLarge, of,
     plan,
@@ -33,6 +35,16 @@ impl BitField {
             shift: u8::try_from(bit % 8).unwrap_or(0),
             len,
         })
+    }
+
+    /// Returns the field at a bit of the image; `len` is 1 to 64.
+    fn at(bit: usize, len: usize) -> Self {
+        debug_assert!((1..=64).contains(&len));
+        Self {
+            byte: bit / 8,
+            shift: (bit % 8) as u8,
+            len: len as u8,
+        }
     }
 
     /// Returns the bits as a sign-extended number. RT.

@@ -2,7 +2,8 @@
 
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 
-use crate::rt::config::RtConfig;
+use super::BitCopy;
+use crate::rt::config::{ProcessDataCopy, RtConfig};
 
 /// First logical address of the process image.
 pub const LOGICAL_BASE: u32 = 0x0001_0000;
@@ -118,6 +119,10 @@ pub struct ImagePlan {
     pub separate: Vec<DatagramPlan>,
     /// `None` if no device has an FMMU for it.
     pub mailboxes: Option<MailboxPlan>,
+    /// Inputs that are copied to outputs in every cycle, each with the device of the inputs.
+    pub copies: Vec<(DeviceIndex, BitCopy)>,
+    /// Outputs that are copied to other outputs, after everything that writes outputs.
+    pub repeats: Vec<BitCopy>,
     pub len: usize,
 }
 
@@ -134,6 +139,21 @@ impl ImagePlan {
     #[must_use]
     pub fn frames(&self) -> usize {
         frames(&self.datagrams)
+    }
+
+    /// Returns the place of a copy in the image; `None` if a device has no process data there.
+    fn bit_copy(&self, copy: &ProcessDataCopy) -> Option<BitCopy> {
+        let place = |(device, bit): (DeviceIndex, usize)| {
+            let region = self.regions.get(device)?.as_ref()?;
+            let end = (bit + copy.bits).div_ceil(8);
+            let inside = end <= region.in_len.max(region.out_len);
+            inside.then_some(region.offset * 8 + bit)
+        };
+        Some(BitCopy {
+            from: place(copy.from)?,
+            to: place(copy.to)?,
+            bits: copy.bits,
+        })
     }
 }
 
@@ -155,11 +175,17 @@ fn wire_ns(datagrams: &[DatagramPlan], devices: usize) -> u64 {
 }
 
 /// Returns the image of a machine according to its settings.
+#[allow(clippy::disallowed_methods, reason = "runs before the loop")]
 pub fn of(config: &RtConfig) -> Result<ImagePlan, TooLarge> {
     let mut image = plan(&config.devices)?;
     if wire_ns(&image.separate, config.devices.len()) > config.cycle_ns / 2 {
         image.separate.clear();
     }
+    let copies = config.copies.iter();
+    let copies = copies.filter_map(|copy| Some((copy.from.0, image.bit_copy(copy)?)));
+    image.copies = copies.collect();
+    let repeats = config.repeats.iter();
+    image.repeats = repeats.filter_map(|copy| image.bit_copy(copy)).collect();
     Ok(image)
 }
 
