@@ -257,6 +257,29 @@ fn programs_of_every_kind_allocate_nothing() {
     }
 }
 
+/// Copies of single bits, of a PDO and of bytes, while frames are lost and a source is missing.
+#[test]
+fn copies_allocate_nothing() {
+    let device = |name: &str, position: usize| {
+        format!("[[device]]\nname = \"{name}\"\nesi = \"esi/IO8.xml\"\nposition = {position}\n")
+    };
+    let copy = |from: &str, to: &str| format!("[[copy]]\nfrom = \"{from}\"\nto = \"{to}\"\n");
+    let text = axes(1)
+        + &["i", "j", "k"]
+            .map(|name| device(name, usize::from(name.as_bytes()[0] - b'h')))
+            .concat()
+        + &copy("k.Input 2", "i.Output 7")
+        + &copy("a0.bytes.1..2", "j.bytes.0..1")
+        + &copy("j.pdo.0x1A00", "k.pdo.0x1600");
+    let script = "[[fault]]\nkind = \"frame-loss\"\nat = \"1s\"\ncount = 2\n\
+                  [[fault]]\nkind = \"absent\"\ndevice = 3\nat = \"2s\"\n";
+    let (counted, remains, result) = metered(machine(&text), &faults(script), None, 10_000);
+    assert!(matches!(result, Some(Err(_))), "{result:?}");
+    assert!(remains.stats.counters.lost_frames >= 1);
+    assert!(remains.axes.iter().all(|slot| slot.last_enabled.is_some()));
+    assert_eq!(counted, 0);
+}
+
 struct Swing(AxisRef, f64);
 
 impl Controller for Swing {

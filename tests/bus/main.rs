@@ -5,8 +5,10 @@
 
 mod axes;
 mod controller;
+mod copy;
 mod cycles;
 mod demo;
+mod fsoe;
 mod homing;
 mod lrw;
 mod mailboxes;

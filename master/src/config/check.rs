@@ -6,6 +6,7 @@ use std::path::Path;
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use toml::Spanned;
 
+use super::copy::{self, OutputWriter};
 use super::device::{self, EsiFiles};
 use super::duration::show;
 use super::fields::KeyExt;
@@ -75,11 +76,23 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
     let repeat = raw.repeat.value().unwrap_or(1);
     let program = steps::check(raw.steps, raw.stop, &known, folder, cycle_s, repeat, p);
     let brakes = brake_outputs(&brakes, &known, &program.outputs, p);
+    let steps = program.outputs.iter().zip(&program.output_places);
+    let steps = steps.map(|(output, place)| {
+        let what = format!("set by the step in line {}", p.line(place));
+        OutputWriter::new(output, what)
+    });
+    let opened = brakes.iter().map(|brake| {
+        let (axis, line) = (&brake.axis, p.line(&brake.place));
+        let what = format!("the brake output of `{axis}` in line {line}");
+        OutputWriter::new(&brake.output, what)
+    });
+    let writers: Vec<_> = steps.chain(opened).collect();
+    let copies = copy::check(&raw.copies, &known, &writers, p);
     let mut devices: IndexVec<_, DeviceConfig> = devices.into_iter().collect::<Option<_>>()?;
-    for (name, output) in brakes {
-        let device = devices.iter_mut().find(|d| d.name == name);
+    for brake in brakes {
+        let device = devices.iter_mut().find(|d| d.name == brake.axis);
         if let Some(axis) = device.and_then(|d| d.axis.as_mut()) {
-            axis.brake_output = Some(output);
+            axis.brake_output = Some(brake.output);
         }
     }
     connections.check(&devices, p);
@@ -90,6 +103,7 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         steps: program.steps,
         inputs: program.inputs,
         outputs: program.outputs,
+        copies,
         stop: program.stop,
         tables: program.tables,
         repeat,
@@ -97,27 +111,34 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
     })
 }
 
-/// Returns the outputs that release brakes, with the name of the axis's device. `set`: the outputs
-/// that steps set.
+/// The output that releases a brake.
+struct BrakeOutput {
+    /// The name of the axis's device.
+    axis: String,
+    output: Signal,
+    place: Span,
+}
+
+/// Returns the outputs that release brakes. `set`: the outputs that steps set.
 fn brake_outputs(
     brakes: &[(String, Spanned<String>)],
     known: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
     set: &[Signal],
     p: &mut Problems<'_>,
-) -> Vec<(String, Signal)> {
-    let mut found: Vec<(String, Signal)> = Vec::new();
+) -> Vec<BrakeOutput> {
+    let mut found: Vec<BrakeOutput> = Vec::new();
     for (axis, text) in brakes {
         let Some(output) = signal::output_of_text(text, known, p) else {
             continue;
         };
-        let taken = found.iter().find(|(_, other)| *other == output);
+        let taken = found.iter().find(|other| other.output == output);
         let problem = if output.field.bit_len != 1 {
             let bits = output.field.bit_len;
             Some((
                 format!("`{}` has {bits} bits", output.name),
                 "a brake is opened by an output of one bit",
             ))
-        } else if let Some((other, _)) = taken {
+        } else if let Some(BrakeOutput { axis: other, .. }) = taken {
             let message = format!("`{}` opens the brake of `{other}` already", output.name);
             Some((message, "each brake has an output of its own"))
         } else if set.contains(&output) {
@@ -134,7 +155,11 @@ fn brake_outputs(
         };
         match problem {
             Some((message, hint)) => p.add_hint(text.span(), message, hint),
-            None => found.push((axis.clone(), output)),
+            None => found.push(BrakeOutput {
+                axis: axis.clone(),
+                output,
+                place: text.span(),
+            }),
         }
     }
     found

@@ -7,6 +7,7 @@
 //! | `fields.rs` | `table!`: a table's keys, types, ranges and examples in one place |
 //! | `raw/` | the file as written: its tables |
 //! | `check.rs` | raw → [`Machine`]: bus, names, positions |
+//! | `copy.rs` | inputs that are copied to outputs |
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
 //! | `sdo.rs` | values of start-up SDOs as bytes |
 //! | `startup.rs` | which start-up SDOs are verified or skipped |
@@ -29,6 +30,7 @@ use std::time::Duration;
 
 mod axis;
 mod check;
+mod copy;
 mod device;
 #[cfg(test)]
 mod documented;
@@ -53,6 +55,7 @@ mod travel;
 mod units;
 
 pub(crate) use axis::is_maxon;
+pub use copy::{BitRange, CopySetup};
 pub(crate) use device::further_axis;
 pub use drive_limits::LimitConflict;
 pub use drive_units::{AdoptedUnits, UnitProblem};
@@ -90,6 +93,7 @@ pub struct Machine {
     /// The signals that the steps read; `outputs` are those they set.
     pub inputs: Vec<Signal>,
     pub outputs: Vec<Signal>,
+    pub copies: Vec<CopySetup>,
     pub stop: StopSetup,
     /// The set-point tables that the steps play.
     pub tables: Vec<TableFile>,
@@ -411,7 +415,7 @@ impl Machine {
             groups: std::iter::once(rest).chain(named).collect(),
             bus_lost: stop.bus_lost,
             emergency: stop.emergency.clone(),
-            copies: Vec::new(),
+            copies: self.copies.iter().map(CopySetup::rt).collect(),
             repeats: device::repeats(&self.devices),
         }
     }

@@ -6,6 +6,7 @@ use ecaxis_esi::layout::Field;
 
 use toml::Spanned;
 
+use super::copy::bits_of;
 use super::problem::{Problems, suggestion};
 use super::raw::RawSignal;
 use super::steps::ResolvedDevice;
@@ -58,7 +59,7 @@ pub(crate) enum SignalDirection {
 }
 
 impl SignalDirection {
-    fn noun(self) -> &'static str {
+    pub(super) fn noun(self) -> &'static str {
         match self {
             Self::In => "input",
             Self::Out => "output",
@@ -101,11 +102,20 @@ impl<'d> Candidates<'d> {
         let address = address(wanted);
         let same = |name: &String| name.trim().eq_ignore_ascii_case(wanted.trim());
         let all = self.fields.iter();
-        all.filter(|field| match address {
+        let mut found: Vec<&Field> = Vec::new();
+        for field in all.filter(|field| match address {
             Some(address) => address == (field.index, field.sub),
             None => self.names(field).iter().any(same),
-        })
-        .collect()
+        }) {
+            // An object that several PDOs map has the same value in all of them.
+            let repeats = |first: &&Field| {
+                (first.index, first.sub) == (field.index, field.sub) && first.pdo != field.pdo
+            };
+            if !found.iter().any(repeats) {
+                found.push(field);
+            }
+        }
+        found
     }
 
     /// Returns the shortest unique name of a field.
@@ -134,6 +144,24 @@ fn address(text: &str) -> Option<(u16, u8)> {
     ))
 }
 
+/// Splits a text such as `io.Output 3` behind the name of its device; returns the length of the
+/// name. Device names may contain dots.
+pub(super) fn split_device(
+    word: &str,
+    devices: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
+) -> Option<usize> {
+    let named = |d: &ResolvedDevice<'_>| {
+        word.strip_prefix(d.name)?
+            .strip_prefix('.')
+            .map(|_| d.name.len())
+    };
+    devices
+        .iter()
+        .filter_map(named)
+        .max()
+        .or_else(|| word.find('.'))
+}
+
 /// Returns an output that no axis writes, from a text such as `io.Output 3`.
 pub(crate) fn output_of_text(
     text: &Spanned<String>,
@@ -141,18 +169,7 @@ pub(crate) fn output_of_text(
     p: &mut Problems<'_>,
 ) -> Option<Signal> {
     let word = text.get_ref();
-    // Device names may contain dots.
-    let named = |d: &ResolvedDevice<'_>| {
-        word.strip_prefix(d.name)?
-            .strip_prefix('.')
-            .map(|_| d.name.len())
-    };
-    let split = devices
-        .iter()
-        .filter_map(named)
-        .max()
-        .or_else(|| word.find('.'));
-    let Some(split) = split else {
+    let Some(split) = split_device(word, devices) else {
         let message = format!("\"{word}\" names no output");
         p.add_hint(
             text.span(),
@@ -191,7 +208,7 @@ pub(crate) fn resolve(
     })
 }
 
-fn place<'n>(
+pub(super) fn place<'n>(
     name: &str,
     mut names: impl Iterator<Item = &'n str> + Clone,
 ) -> Result<usize, NameError> {
@@ -204,18 +221,23 @@ fn place<'n>(
     })
 }
 
-fn one(
+impl NameError {
+    pub(super) fn of_signal(message: String, hint: impl Into<String>) -> Self {
+        Self {
+            message,
+            hint: hint.into(),
+            device: false,
+        }
+    }
+}
+
+/// Returns a field of a device's process data with its shortest unique name.
+pub(super) fn field<'d>(
     wanted: &str,
     way: SignalDirection,
-    index: DeviceIndex,
-    device: &DeviceConfig,
-) -> Result<Signal, NameError> {
+    device: &'d DeviceConfig,
+) -> Result<(&'d Field, String), NameError> {
     let what = way.noun();
-    let wrong = |message: String, hint: String| NameError {
-        message,
-        hint,
-        device: false,
-    };
     let candidates = match way {
         SignalDirection::In => Candidates {
             fields: &device.selection.layout.tx,
@@ -231,8 +253,8 @@ fn one(
         let names = fields.iter().map(|field| candidates.name(field));
         names.collect()
     };
-    let field = match found.as_slice() {
-        [field] => *field,
+    match found.as_slice() {
+        [field] => Ok((field, candidates.name(field))),
         [] => {
             let message = format!(
                 "`{}` has no {what} \"{wanted}\" in its process data",
@@ -245,7 +267,7 @@ fn one(
                 let names = names.iter().map(String::as_str);
                 suggestion(wanted, names, &format!("its {what}s"))
             };
-            return Err(wrong(message, hint));
+            Err(NameError::of_signal(message, hint))
         }
         several => {
             let message = format!(
@@ -254,34 +276,55 @@ fn one(
             );
             let names = names(several).into_iter().map(|n| format!("\"{n}\""));
             let names = names.collect::<Vec<_>>().join(", ");
-            return Err(wrong(message, format!("write one of {names}")));
+            Err(NameError::of_signal(
+                message,
+                format!("write one of {names}"),
+            ))
         }
-    };
+    }
+}
+
+/// Returns why only the axis of a device may write an output.
+pub(super) fn reserved_for_axis(field: &Field, device: &DeviceConfig) -> Option<&'static str> {
+    device.axis.as_ref()?;
+    match further_axis(field) {
+        Some((_, same)) if AXIS_OUTPUTS.contains(&same) || same == POSITION_OFFSET => {
+            Some("belongs to an axis of the drive that is not used")
+        }
+        Some(_) => None,
+        None if field.index == POSITION_OFFSET => Some("adds to the axis' target, past its limits"),
+        None if AXIS_OUTPUTS.contains(&field.index) => Some("is written by the axis itself"),
+        None => None,
+    }
+}
+
+fn one(
+    wanted: &str,
+    way: SignalDirection,
+    index: DeviceIndex,
+    device: &DeviceConfig,
+) -> Result<Signal, NameError> {
+    let (field, name) = field(wanted, way, device)?;
     let signal = Signal {
         device: index,
-        name: format!("{}.{}", device.name, candidates.name(field)),
+        name: format!("{}.{name}", device.name),
         field: field.clone(),
     };
     if !(1..=64).contains(&field.bit_len) {
         let message = format!("`{}` has {} bits", signal.name, field.bit_len);
-        return Err(wrong(message, "numbers have 64 bits at most".to_owned()));
+        return Err(NameError::of_signal(
+            message,
+            "numbers have 64 bits at most",
+        ));
     }
-    if way == SignalDirection::Out && device.axis.is_some() {
-        let refused = match further_axis(field) {
-            Some((_, same)) if AXIS_OUTPUTS.contains(&same) || same == POSITION_OFFSET => {
-                Some("belongs to an axis of the drive that is not used")
-            }
-            Some(_) => None,
-            None if field.index == POSITION_OFFSET => {
-                Some("adds to the axis' target, past its limits")
-            }
-            None if AXIS_OUTPUTS.contains(&field.index) => Some("is written by the axis itself"),
-            None => None,
-        };
-        if let Some(why) = refused {
-            let message = format!("`{}` {why}", signal.name);
-            return Err(wrong(message, "give the axis a command instead".to_owned()));
-        }
+    if way == SignalDirection::Out
+        && let Some(why) = reserved_for_axis(field, device)
+    {
+        let message = format!("`{}` {why}", signal.name);
+        return Err(NameError::of_signal(
+            message,
+            "give the axis a command instead",
+        ));
     }
     Ok(signal)
 }
@@ -316,8 +359,8 @@ impl Machine {
     /// Returns an output that no axis writes. Names are as for inputs.
     ///
     /// # Errors
-    /// Fails if no output or several outputs have this name, if an axis writes it, or if it
-    /// releases a brake.
+    /// Fails if no output or several outputs have this name, if an axis or a copy writes it, or if
+    /// it releases a brake.
     pub fn output(&mut self, device: &str, name: &str) -> Result<OutputRef, NameError> {
         let signal = self.signal(device, name, SignalDirection::Out)?;
         let brakes = |axis: &&DeviceConfig| {
@@ -330,6 +373,17 @@ impl Machine {
                 hint: "the axis opens and closes its brake".to_owned(),
                 device: false,
             });
+        }
+        let bits = bits_of(&signal.field);
+        let mut copies = self.copies.iter();
+        if let Some(copy) = copies.find(|copy| copy.to.overlaps(signal.device, &bits)) {
+            return Err(NameError::of_signal(
+                format!(
+                    "`{}` is written by the copy in line {}",
+                    signal.name, copy.line
+                ),
+                "an output has one writer",
+            ));
         }
         Ok(OutputRef(known(&mut self.outputs, signal)))
     }

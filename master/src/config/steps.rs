@@ -60,6 +60,8 @@ pub(crate) struct Program {
     pub steps: Vec<Step>,
     pub inputs: Vec<Signal>,
     pub outputs: Vec<Signal>,
+    /// For each output, the first place that sets it.
+    pub output_places: Vec<Span>,
     pub tables: Vec<TableFile>,
 }
 
@@ -81,6 +83,7 @@ pub(crate) fn check(
         tables: Vec::new(),
         inputs: Vec::new(),
         outputs: Vec::new(),
+        output_places: Vec::new(),
         count: 0,
         switched: Vec::new(),
         number: String::new(),
@@ -97,6 +100,7 @@ pub(crate) fn check(
         steps,
         inputs: checker.inputs,
         outputs: checker.outputs,
+        output_places: checker.output_places,
         tables: checker.tables,
     }
 }
@@ -108,6 +112,7 @@ struct ProgramChecker<'c> {
     tables: Vec<TableFile>,
     inputs: Vec<Signal>,
     outputs: Vec<Signal>,
+    output_places: Vec<Span>,
     count: usize,
     /// The modes to which previous steps have switched.
     switched: Vec<(DeviceIndex, Mode)>,
@@ -348,8 +353,11 @@ impl ProgramChecker<'_> {
     ) -> Option<(OutputRef, f64)> {
         let output = signal::resolve(raw, self.devices, SignalDirection::Out, p)?;
         possible(&output, value, p)?;
-        let output = OutputRef(signal::known(&mut self.outputs, output));
-        Some((output, *value.get_ref()))
+        let index = signal::known(&mut self.outputs, output);
+        if self.output_places.len() < self.outputs.len() {
+            self.output_places.push(raw.name.span());
+        }
+        Some((OutputRef(index), *value.get_ref()))
     }
 }
 

@@ -18,6 +18,7 @@ pub mod mailbox;
 pub mod program;
 pub mod recordings;
 pub mod script;
+pub mod wire;
 
 pub use machines::*;
 

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use ecaxis_master::acyclic::StateTimeouts;
 use ecaxis_master::config::{
-    self, Action, Bus, DeviceConfig, ExchangeMode, Machine, Nic, Step, duration,
+    self, Action, BitRange, Bus, DeviceConfig, ExchangeMode, Machine, Nic, Step, duration,
 };
 use ecaxis_master::link::SocketKind;
 use ecaxis_master::rt::exchange::MAX_POLL_DATAGRAM;
@@ -49,6 +49,7 @@ fn explain(machine: &Machine) -> Document {
         self::device(device, &mut out);
     }
     wire(machine, &mut out);
+    copies(machine, &mut out);
     stop::stop(machine, &mut out);
     program(machine, &mut out);
     out
@@ -333,6 +334,39 @@ fn commands(plan: &ImagePlan) -> String {
         }
     }
     text
+}
+
+fn copies(machine: &Machine, out: &mut Document) {
+    if machine.copies.is_empty() {
+        return;
+    }
+    let mut table = Table::new("from|to|length|line|without frames");
+    for copy in &machine.copies {
+        let held = match has_watchdog(&machine.devices[copy.to.device], &copy.to) {
+            true => format!("{}, watchdog", duration::show(machine.bus.watchdog_ns)),
+            false => "keeps its value".to_owned(),
+        };
+        let length = copy.to.length();
+        table.row(cells![
+            copy.from.name,
+            copy.to.name,
+            length,
+            copy.line,
+            held
+        ]);
+    }
+    out.section("copies", table);
+}
+
+/// True if all these outputs end with the watchdog of their SyncManager (bit 6 of its ControlByte).
+fn has_watchdog(device: &DeviceConfig, outputs: &BitRange) -> bool {
+    let mut first = 0;
+    device.selection.layout.outputs.iter().all(|sm| {
+        let start = first;
+        first += u32::from(sm.len) * 8;
+        let apart = outputs.bits.end <= start || first <= outputs.bits.start;
+        apart || sm.control_byte & 0x40 != 0
+    })
 }
 
 fn program(machine: &Machine, out: &mut Document) {

@@ -27,6 +27,7 @@ table! { "the machine file",
         enable: Key<bool>,
         bus: RawBus = "[bus]\ncycle = \"1ms\"",
         devices: Vec<RawDevice> as "device" = "[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"",
+        copies: Vec<RawCopy> as "copy",
         stop: RawStop,
         steps: Vec<RawStep> as "step",
     }
@@ -213,6 +214,13 @@ table! { "[device.sim]",
         sync: Key<Ns>,
         node: Vec<RawNode>,
         track: Option<RawTrack>,
+    }
+}
+
+table! { "[[copy]]",
+    table RawCopy {
+        from: Key<String> = "\"io1.Input 1\"",
+        to: Key<String> = "\"io2.Output 1\"",
     }
 }
 
