@@ -86,6 +86,25 @@ fn abort_is_parsed_under_either_service() {
     }
 }
 
+/// ETG.1000.6 clause 5.6.2.7: bits 0 to 4 of the command are reserved in an abort.
+#[test]
+fn abort_with_reserved_bits_ends_uploads_and_downloads_with_its_code() {
+    for (service, command) in [(0x20, 0x90), (0x20, 0x9f), (0x30, 0x81), (0x30, 0x9f)] {
+        let abort = |index: u16| {
+            let [low, high] = index.to_le_bytes();
+            vec![
+                10, 0, 0, 0, 0, 0x13, 0, service, command, low, high, 0, 0x11, 0, 0x09, 0x06,
+            ]
+        };
+        for (n, index) in [(1, 0x6041), (1, 0x2000), (2, 0x2000)] {
+            let (error, _) = upload_error(index, &[Mischief::Replace(n, abort(index))]);
+            assert_eq!(error.abort_code(), Some(0x0609_0011), "{command:#x}");
+            let (error, _) = download_error(index, LONG, &[Mischief::Replace(n, abort(index))]);
+            assert_eq!(error.abort_code(), Some(0x0609_0011), "{command:#x}");
+        }
+    }
+}
+
 #[test]
 fn abort_among_segments_ends_the_transfer_at_any_address() {
     let abort = [

@@ -256,12 +256,17 @@ fn parse_coe(body: &[u8]) -> Result<Message<'_>, DecodeError> {
             .ok_or(short("an emergency", body)),
         SERVICE_SDO_RESPONSE => parse_sdo(content).map(Message::Sdo),
         // Devices send an abort with either service.
-        SERVICE_SDO_REQUEST if content.first() == Some(&ABORT) => {
+        SERVICE_SDO_REQUEST if content.first().is_some_and(|command| is_abort(*command)) => {
             parse_sdo(content).map(Message::Sdo)
         }
         SERVICE_SDO_INFORMATION => fragment(content).map(Message::Information),
         _ => Ok(Message::Other),
     }
+}
+
+/// True for an abort. Bits 0 to 4 are reserved (ETG.1000.6 clause 5.6.2.7); some devices set them.
+const fn is_abort(command: u8) -> bool {
+    command >> 5 == ABORT >> 5
 }
 
 fn fragment(content: &[u8]) -> Result<Fragment<'_>, DecodeError> {

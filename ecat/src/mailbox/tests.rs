@@ -109,6 +109,27 @@ fn answers_of_real_devices_are_parsed() {
     }
 }
 
+/// ETG.1000.6 clause 5.6.2.7: the command specifier is in bits 5 to 7; bits 0 to 4 of an abort are
+/// reserved.
+#[test]
+fn aborts_with_reserved_bits_are_aborts_with_their_code() {
+    for (service, reserved) in [0x20, 0x30]
+        .into_iter()
+        .flat_map(|service| (0..0x20).map(move |reserved| (service, reserved)))
+    {
+        let mut mailbox = bytes("0a0000000013 0000 80126008 11000906");
+        mailbox[7] = service;
+        mailbox[8] |= reserved;
+        let abort = Answer::Abort {
+            index: 0x6012,
+            sub: 8,
+            code: 0x0609_0011,
+        };
+        let parsed = Message::parse(&mailbox);
+        assert_eq!(parsed, Ok(Message::Sdo(abort)), "{reserved:#x}");
+    }
+}
+
 fn requests(data: &[u8], flags: (bool, bool), numbers: (u16, u8, u32)) -> Vec<Request<'_>> {
     let ((first, second), (index, sub, number)) = (flags, numbers);
     let short = data.get(..data.len().min(4)).unwrap_or_default();
