@@ -379,6 +379,7 @@ fn any_image() -> impl Strategy<Value = Sii> {
                 sync_units,
                 others,
                 ended: true,
+                damage: Vec::new(),
             },
         )
 }

@@ -78,12 +78,12 @@ const CASES: &[Case] = &[
     (
         "cut in the texts",
         |i| i.truncate(0x90),
-        "category 10 at byte 0x80 claims",
+        "byte 0x80, category 10: the category claims",
     ),
     (
         "cut in the PDOs",
         |i| i.truncate(data(i, RX_PDO) + 9),
-        "category 51 at byte",
+        "category 51: the category claims",
     ),
     (
         "cut before the end mark",
@@ -113,7 +113,7 @@ const CASES: &[Case] = &[
             let at = head(i, GENERAL);
             put(i, at + 2, 0xffff);
         },
-        "category 30 at byte",
+        "category 30: the category claims 131070 bytes",
     ),
     (
         "a category one word beyond the end",
@@ -122,7 +122,7 @@ const CASES: &[Case] = &[
             let left = (i.len() - at - 4) / 2;
             put(i, at + 2, u16::try_from(left + 1).unwrap());
         },
-        "category 60 at byte",
+        "category 60: the category claims",
     ),
     (
         "an empty category that never ends",
@@ -350,6 +350,108 @@ fn parse_needs_bounded_memory_for_any_counts() {
         put(&mut image, at, before);
     }
     assert!(crate::peak() < LIMIT, "{} bytes", crate::peak());
+}
+
+/// ETG.2010 lists each category once; of two, SOEM and ethercrab use the first as well. PDOs may be
+/// spread over several categories 50 and 51: IgH appends them.
+#[test]
+fn the_first_of_equal_categories_counts_and_pdo_categories_add_up() {
+    let good = sii::parse(&whole()).unwrap();
+    for kind in [STRINGS, GENERAL, FMMU, SYNC_MANAGER, DC] {
+        let mut image = whole();
+        let (at, end) = (head(&image, kind), head(&image, 0xffff));
+        let length = 4 + 2 * usize::from(word(&image, at + 2));
+        let mut again = image[at..at + length].to_vec();
+        again[4..].fill(0);
+        insert(&mut image, end, &again);
+        let (sii, warnings) = sii::inspect(&image).unwrap();
+        assert_eq!(sii, good, "category {kind}");
+        let text = warnings.iter().map(ToString::to_string);
+        assert_eq!(
+            text.filter(|w| w.contains("the first counts")).count(),
+            1,
+            "category {kind}"
+        );
+    }
+    let mut image = whole();
+    let (at, end) = (head(&image, TX_PDO), head(&image, 0xffff));
+    let length = 4 + 2 * usize::from(word(&image, at + 2));
+    let again = image[at..at + length].to_vec();
+    insert(&mut image, end, &again);
+    let (sii, warnings) = sii::inspect(&image).unwrap();
+    assert_eq!(sii.tx_pdos.len(), 2 * good.tx_pdos.len());
+    assert_eq!(warnings, []);
+}
+
+/// ETG.1000.6 and ETG.2010: the identity is in words 8 to 15, before all categories.
+#[test]
+fn a_damaged_category_keeps_the_identity_and_earlier_categories() {
+    let good = sii::parse(&whole()).unwrap();
+    let mut image = whole();
+    let at = head(&image, DC);
+    put(&mut image, at + 2, 0xffff);
+    let sii = sii::parse(&image).unwrap();
+    assert_eq!(
+        (sii.identity, sii.general, sii.sync_managers),
+        (
+            good.identity,
+            good.general.clone(),
+            good.sync_managers.clone()
+        )
+    );
+    assert_eq!((&sii.rx_pdos, sii.dc.len()), (&good.rx_pdos, 0));
+    assert_eq!(sii.damage.len(), 1);
+    assert!(!sii.ended);
+
+    // The last PDO of a category: the others and later categories remain.
+    let mut image = whole();
+    let mut last = data(&image, TX_PDO);
+    for pdo in good.tx_pdos.iter().take(good.tx_pdos.len() - 1) {
+        last += 8 + 8 * pdo.entries.len();
+    }
+    image[last + 2] = 0xff;
+    let sii = sii::parse(&image).unwrap();
+    assert_eq!(sii.tx_pdos, good.tx_pdos[..good.tx_pdos.len() - 1]);
+    assert_eq!((sii.rx_pdos, sii.dc), (good.rx_pdos, good.dc));
+    assert_eq!((sii.damage.len(), sii.ended), (1, true));
+}
+
+/// Word 0x3E is the size in KiBit minus one. A chip ignores upper address bits, so that a read
+/// beyond its end returns its beginning (Atmel AT24C16 data sheet, "Device addressing").
+#[test]
+fn categories_end_with_the_chip_and_a_wrong_size_word_is_reported() {
+    let mut image = whole();
+    let end = head(&image, 0xffff);
+    image.truncate(2048);
+    // Instead of the end mark, one category up to the end of the chip.
+    put(&mut image, end, 0x0900);
+    put(
+        &mut image,
+        end + 2,
+        u16::try_from((2048 - end - 4) / 2).unwrap(),
+    );
+    put(&mut image, 0x7c, 15);
+    let once = sii::parse(&image).unwrap();
+    let mut read = image.repeat(4);
+    assert_eq!(sii::chip_length(&read), 2048);
+    assert_eq!(sii::parse(&read).unwrap(), once);
+    assert!(!once.ended && once.damage.is_empty());
+    // The last category exceeds the chip.
+    put(&mut read, end + 2, u16::try_from((2048 - end) / 2).unwrap());
+    let damage = sii::parse(&read).unwrap().damage;
+    assert_eq!(damage.len(), 1, "{damage:?}");
+
+    let mut image = whole();
+    put(&mut image, 0x7c, 1);
+    let (sii, warnings) = sii::inspect(&image).unwrap();
+    assert_eq!(sii.rx_pdos, sii::parse(&whole()).unwrap().rx_pdos);
+    let text: Vec<String> = warnings.iter().map(ToString::to_string).collect();
+    assert_eq!(text.len(), 1, "{text:?}");
+    assert!(text[0].contains("the size in word 0x3E is 256 bytes"));
+    // Zeros beyond the size are not categories.
+    let end = head(&image, 0xffff);
+    image[end..].fill(0);
+    assert_eq!(sii::parse(&image).unwrap().others, sii.others);
 }
 
 #[test]

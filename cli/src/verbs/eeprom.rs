@@ -197,7 +197,7 @@ fn replace(args: &WriteArgs) -> Result<(), Failure> {
                 let new = with_category(&old, kind, &given);
                 let new = new.ok_or_else(|| no_category(kind, &old))?;
                 // Allow writing single categories to repair a broken image.
-                if sii::parse(&old).is_ok() {
+                if sii::parse(&old).is_ok_and(|sii| sii.damage.is_empty()) {
                     sound(&path, &new)?;
                 }
                 new
@@ -286,7 +286,9 @@ fn verify(args: &VerifyArgs) -> Result<(), Failure> {
             if !sii.checksum_ok {
                 problems.push("the checksum of its configuration area is wrong".to_owned());
             }
-            remarks.extend(warnings.iter().map(ToString::to_string));
+            problems.extend(sii.damage.iter().map(ToString::to_string));
+            let others = warnings.iter().filter(|w| !sii.damage.contains(w));
+            remarks.extend(others.map(ToString::to_string));
         }
         Err(error) => problems.push(error.to_string()),
     }
@@ -484,7 +486,10 @@ fn sound(path: &Path, image: &[u8]) -> Result<(), Failure> {
             "the checksum of its configuration area is wrong; a controller would ignore it"
                 .to_owned(),
         )),
-        Ok(_) => Ok(()),
+        Ok(sii) => match sii.damage.first() {
+            None => Ok(()),
+            Some(damage) => Err(wrong(damage.to_string())),
+        },
         Err(error) => Err(wrong(error.to_string())),
     }
 }

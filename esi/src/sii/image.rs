@@ -79,6 +79,7 @@ impl Sii {
                 .map(|category| (category.number, even(&category.data)))
                 .collect(),
             ended: true,
+            damage: Vec::new(),
         }
     }
 }

@@ -82,6 +82,8 @@ pub struct Sii {
     pub others: Vec<(u16, Vec<u8>)>,
     /// True if the image has an end mark.
     pub ended: bool,
+    /// Damaged categories and PDOs, which are ignored.
+    pub damage: Vec<SiiWarning>,
 }
 
 /// Mailbox areas from the SubDevice's view: MainDevice → SubDevice (`receive`) and SubDevice →
@@ -261,7 +263,14 @@ pub fn emit(device: &Device, modules: &[Module], options: &SiiOptions) -> Vec<u8
     Sii::from_device(device, modules, options).to_bytes()
 }
 
-/// Reads an EEPROM image.
+/// Returns the length of the chip if `bytes` were read from a device beyond its end, where its
+/// beginning repeats; else the number of bytes.
+#[must_use]
+pub fn chip_length(bytes: &[u8]) -> usize {
+    parse::chip_length(bytes)
+}
+
+/// Reads an EEPROM image. Damaged categories are ignored, see [`Sii::damage`].
 pub fn parse(bytes: &[u8]) -> Result<Sii, SiiError> {
     parse::image(bytes).map(|(sii, _)| sii)
 }

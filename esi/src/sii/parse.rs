@@ -1,7 +1,7 @@
 //! Bytes → image contents. All offsets come from outside and may point anywhere.
 
 use super::warning::{
-    SiiWarning, StringRefs, WarningKind, Warnings, repeated, strings_of, trailing_bytes,
+    SiiWarning, StringRefs, WarningKind, Warnings, occurs_once, strings_of, trailing_bytes,
 };
 use super::{
     General, HEADER_BYTES, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiFmmuDetail, SiiPdo,
@@ -19,38 +19,13 @@ pub enum SiiError {
         /// The length in bytes.
         len: usize,
     },
-    /// A category exceeds the image.
-    #[error("category {category} at byte 0x{offset:x} claims {claimed} bytes, {left} are left")]
-    Category {
-        /// The category type.
-        category: u16,
-        /// The byte offset of the category.
-        offset: usize,
-        /// The length in its header, in bytes.
-        claimed: usize,
-        /// The bytes up to the end of the image.
-        left: usize,
-    },
-    /// The entries of a PDO exceed its category.
-    #[error(
-        "category {category} at byte 0x{offset:x}: PDO 0x{pdo:04x} claims {entries} entries, more than the category holds"
-    )]
-    Pdo {
-        /// The category type.
-        category: u16,
-        /// The byte offset of the category.
-        offset: usize,
-        /// The index of the PDO.
-        pdo: u16,
-        /// The number of entries in its header.
-        entries: u8,
-    },
 }
 
 /// The offset of the checksum.
 const CHECKSUM: usize = 14;
 
 pub(super) fn image(bytes: &[u8]) -> Result<(Sii, Vec<SiiWarning>), SiiError> {
+    let bytes = bytes.get(..chip_length(bytes)).unwrap_or(bytes);
     let Some((header, body)) = bytes.split_at_checked(HEADER_BYTES) else {
         return Err(SiiError::TooShort { len: bytes.len() });
     };
@@ -61,21 +36,33 @@ pub(super) fn image(bytes: &[u8]) -> Result<(Sii, Vec<SiiWarning>), SiiError> {
     if right != found {
         notes.add(CHECKSUM, None, WarningKind::Checksum { found, right });
     }
-    let (found, ended) = categories(body)?;
-    sii.ended = ended;
-    if !ended {
-        notes.add(bytes.len(), None, WarningKind::NoEnd);
+    let size = usize::try_from(sii.byte_size).unwrap_or(usize::MAX);
+    let Categories { found, end, length } = categories(body, size, &mut notes);
+    sii.ended = matches!(end, End::Mark);
+    match end {
+        End::Mark if found.is_empty() => {
+            notes.add(HEADER_BYTES, None, WarningKind::NoCategories);
+        }
+        End::Missing => notes.add(bytes.len(), None, WarningKind::NoEnd),
+        End::Mark | End::Damage => {}
     }
-    if ended && found.is_empty() {
-        notes.add(HEADER_BYTES, None, WarningKind::NoCategories);
+    if length > size {
+        notes.add(size, None, WarningKind::BeyondSize { length, size });
     }
-    repeated(&found, &mut notes);
     let strings = found.iter().find(|c| c.kind == category::STRINGS);
     let strings = strings
         .map(|c| strings_of(c, &mut notes))
         .unwrap_or_default();
+    let mut unique = Vec::new();
     for here in &found {
         let (kind, data) = (here.kind, here.data);
+        if unique.contains(&kind) {
+            notes.add(here.offset, Some(kind), WarningKind::Repeated);
+            continue;
+        }
+        if occurs_once(kind) {
+            unique.push(kind);
+        }
         trailing_bytes(here, &mut notes);
         let mut strings = StringRefs {
             table: &strings,
@@ -89,8 +76,9 @@ pub(super) fn image(bytes: &[u8]) -> Result<(Sii, Vec<SiiWarning>), SiiError> {
             category::SYNC_MANAGER => {
                 sii.sync_managers = data.chunks_exact(8).map(sync_manager).collect()
             }
-            category::TX_PDO => sii.tx_pdos.extend(pdos(data, &mut strings)?),
-            category::RX_PDO => sii.rx_pdos.extend(pdos(data, &mut strings)?),
+            // PDOs may be spread over several categories.
+            category::TX_PDO => sii.tx_pdos.extend(pdos(data, &mut strings)),
+            category::RX_PDO => sii.rx_pdos.extend(pdos(data, &mut strings)),
             category::DC => {
                 sii.dc = data
                     .chunks_exact(24)
@@ -110,7 +98,32 @@ pub(super) fn image(bytes: &[u8]) -> Result<(Sii, Vec<SiiWarning>), SiiError> {
             _ => sii.others.push((kind, data.to_vec())),
         }
     }
-    Ok((sii, notes.0))
+    let Warnings { all, damage } = notes;
+    sii.damage = damage;
+    Ok((sii, all))
+}
+
+/// Returns the length of the chip that the bytes were read from: from there its beginning repeats,
+/// because a chip ignores the upper address bits. Returns the number of bytes if nothing repeats.
+pub(super) fn chip_length(bytes: &[u8]) -> usize {
+    /// Configuration, identity and serial number.
+    const COMPARED: usize = 0x20;
+    /// The smallest usual chip, 16 KiBit.
+    const SMALLEST: usize = 2048;
+    let Some(beginning) = bytes.get(..COMPARED) else {
+        return bytes.len();
+    };
+    if beginning.iter().all(|byte| Some(byte) == beginning.first()) {
+        return bytes.len();
+    }
+    let powers = (0..usize::BITS).filter_map(|n| SMALLEST.checked_shl(n));
+    let mut lengths = powers.take_while(|length| *length < bytes.len());
+    let repeats = |length: &usize| {
+        bytes
+            .get(*length..)
+            .is_some_and(|b| b.starts_with(beginning))
+    };
+    lengths.find(repeats).unwrap_or(bytes.len())
 }
 
 fn read_header(header: &[u8]) -> Sii {
@@ -150,35 +163,56 @@ pub(super) struct Category<'a> {
     pub data: &'a [u8],
 }
 
-/// Returns all categories up to the end mark, and whether the end mark exists.
-fn categories(body: &[u8]) -> Result<(Vec<Category<'_>>, bool), SiiError> {
+/// Why the list of categories ends.
+enum End {
+    Mark,
+    /// The image ends without an end mark.
+    Missing,
+    /// A category exceeds the image.
+    Damage,
+}
+
+struct Categories<'a> {
+    found: Vec<Category<'a>>,
+    end: End,
+    /// The length of the image up to the end of the list.
+    length: usize,
+}
+
+/// Returns all categories up to the end. `size`: the size of the EEPROM that the image states;
+/// zeros beyond it are not categories.
+fn categories<'a>(body: &'a [u8], size: usize, notes: &mut Warnings) -> Categories<'a> {
     let mut found = Vec::new();
     let mut rest = body;
-    loop {
+    let end = loop {
+        let offset = HEADER_BYTES + body.len() - rest.len();
         let Some((kind, after)) = rest.split_at_checked(2) else {
-            return Ok((found, false));
+            break End::Missing;
         };
         let kind = word(kind, 0);
         if kind == category::END {
-            return Ok((found, true));
+            rest = after;
+            break End::Mark;
         }
         let Some((length, after)) = after.split_at_checked(2) else {
-            return Ok((found, false));
+            break End::Missing;
         };
         let claimed = usize::from(word(length, 0)) * 2;
+        if kind == 0 && claimed == 0 && offset >= size {
+            break End::Missing;
+        }
         let Some((data, after)) = after.split_at_checked(claimed) else {
-            let offset = HEADER_BYTES + body.len() - rest.len();
-            return Err(SiiError::Category {
-                category: kind,
-                offset,
-                claimed,
-                left: after.len(),
-            });
+            let left = after.len();
+            let remark = WarningKind::Truncated { claimed, left };
+            notes.add(offset, Some(kind), remark);
+            break End::Damage;
         };
-        let offset = HEADER_BYTES + body.len() - after.len() - claimed;
+        let offset = offset + 4;
         found.push(Category { kind, offset, data });
         rest = after;
-    }
+    };
+    let length = HEADER_BYTES + body.len() - rest.len();
+    Categories { found, end, length }
 }
 
 fn general(data: &[u8], strings: &mut StringRefs<'_>) -> General {
@@ -225,7 +259,8 @@ fn sync_manager(data: &[u8]) -> SiiSyncManager {
     }
 }
 
-fn pdos(data: &[u8], strings: &mut StringRefs<'_>) -> Result<Vec<SiiPdo>, SiiError> {
+/// Returns the PDOs up to the first that exceeds the category.
+fn pdos(data: &[u8], strings: &mut StringRefs<'_>) -> Vec<SiiPdo> {
     let mut found = Vec::new();
     let mut at = 0;
     while let Some(head) = data.get(at..at + 8) {
@@ -233,12 +268,13 @@ fn pdos(data: &[u8], strings: &mut StringRefs<'_>) -> Result<Vec<SiiPdo>, SiiErr
         let first = at + 8;
         let end = first + usize::from(count) * 8;
         let Some(entries) = data.get(first..end) else {
-            return Err(SiiError::Pdo {
-                category: strings.here.kind,
-                offset: strings.here.offset + at,
+            let remark = WarningKind::Pdo {
                 pdo: index,
                 entries: count,
-            });
+            };
+            let offset = strings.here.offset + at;
+            strings.notes.add(offset, Some(strings.here.kind), remark);
+            break;
         };
         found.push(SiiPdo {
             index,
@@ -261,7 +297,7 @@ fn pdos(data: &[u8], strings: &mut StringRefs<'_>) -> Result<Vec<SiiPdo>, SiiErr
         });
         at = end;
     }
-    Ok(found)
+    found
 }
 
 /// Reads a DC mode. `at` is the offset of the mode in its category.

@@ -36,8 +36,30 @@ pub enum WarningKind {
     NoEnd,
     /// The end mark comes first: the image contains only the header.
     NoCategories,
-    /// A category that must be unique occurs again.
+    /// A category that must be unique occurs again; the first counts.
     Repeated,
+    /// The image ends within the category; this category and later ones are ignored.
+    Truncated {
+        /// The length in its header, in bytes.
+        claimed: usize,
+        /// The bytes up to the end of the image.
+        left: usize,
+    },
+    /// The entries of a PDO exceed its category; this PDO and later ones of the category are
+    /// ignored.
+    Pdo {
+        /// The index of the PDO.
+        pdo: u16,
+        /// The number of entries in its header.
+        entries: u8,
+    },
+    /// The categories end beyond the size of the EEPROM in word 0x3E.
+    BeyondSize {
+        /// The length of the image up to the end of its categories.
+        length: usize,
+        /// The size in word 0x3E, in bytes.
+        size: usize,
+    },
     /// The remaining bytes do not form a whole record.
     LeftOver {
         /// The bytes after the last record.
@@ -87,7 +109,24 @@ impl fmt::Display for SiiWarning {
             }
             WarningKind::NoEnd => f.write_str("the image stops without an end mark"),
             WarningKind::NoCategories => f.write_str("there are no categories, the header is all"),
-            WarningKind::Repeated => f.write_str("the category is there a second time"),
+            WarningKind::Repeated => {
+                f.write_str("the category is there a second time; the first counts")
+            }
+            WarningKind::Truncated { claimed, left } => {
+                write!(f, "the category claims {claimed} bytes, {left} are left")
+            }
+            WarningKind::Pdo { pdo, entries } => {
+                write!(
+                    f,
+                    "PDO 0x{pdo:04x} claims {entries} entries, more than the category holds"
+                )
+            }
+            WarningKind::BeyondSize { length, size } => {
+                write!(
+                    f,
+                    "the categories end at byte {length}, the size in word 0x3E is {size} bytes"
+                )
+            }
             WarningKind::LeftOver { bytes, record } => {
                 write!(f, "{bytes} bytes are left over, records have {record}")
             }
@@ -104,16 +143,28 @@ impl fmt::Display for SiiWarning {
 }
 
 #[derive(Default)]
-pub(super) struct Warnings(pub Vec<SiiWarning>);
+pub(super) struct Warnings {
+    pub all: Vec<SiiWarning>,
+    /// Those about contents that are ignored; also in `all` if there is room.
+    pub damage: Vec<SiiWarning>,
+}
 
 impl Warnings {
     pub fn add(&mut self, offset: usize, category: Option<u16>, remark: WarningKind) {
-        if self.0.len() < MOST {
-            self.0.push(SiiWarning {
-                offset,
-                category,
-                remark,
-            });
+        let damage = matches!(
+            remark,
+            WarningKind::Truncated { .. } | WarningKind::Pdo { .. }
+        );
+        let warning = SiiWarning {
+            offset,
+            category,
+            remark,
+        };
+        if damage && self.damage.len() < MOST {
+            self.damage.push(warning.clone());
+        }
+        if self.all.len() < MOST {
+            self.all.push(warning);
         }
     }
 }
@@ -152,21 +203,19 @@ pub(super) fn strings_of(here: &Category<'_>, notes: &mut Warnings) -> Table {
     table
 }
 
-pub(super) fn repeated(found: &[Category<'_>], notes: &mut Warnings) {
-    const ONCE: [u16; 7] = [
-        category::STRINGS,
-        category::GENERAL,
-        category::FMMU,
-        category::SYNC_MANAGER,
-        category::FMMU_DETAILS,
-        category::SYNC_UNIT,
-        category::DC,
-    ];
-    for kind in ONCE {
-        for again in found.iter().filter(|c| c.kind == kind).skip(1) {
-            notes.add(again.offset, Some(kind), WarningKind::Repeated);
-        }
-    }
+/// True for a category that an image contains at most once (ETG.2010). PDOs may be spread over
+/// several categories.
+pub(super) fn occurs_once(kind: u16) -> bool {
+    matches!(
+        kind,
+        category::STRINGS
+            | category::GENERAL
+            | category::FMMU
+            | category::SYNC_MANAGER
+            | category::FMMU_DETAILS
+            | category::SYNC_UNIT
+            | category::DC
+    )
 }
 
 /// Reports incomplete records and invalid codes.

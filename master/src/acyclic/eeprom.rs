@@ -8,6 +8,7 @@ use crate::cancel::CancelToken;
 use crate::mailbox::MailboxTransport;
 use crate::report::{Cause, Error};
 use ecaxis_ecat::registers;
+use ecaxis_esi::sii::chip_length;
 
 /// 0x0500: the PDI has access to the EEPROM; the MainDevice can take it by force.
 const LENT: u8 = 0x01;
@@ -31,6 +32,9 @@ const SIZE: u32 = 0x3e;
 const HEADER_BYTES: usize = 0x80;
 /// The maximum length of an image in bytes: 4 MiBit, more than the interface can address.
 const MAX_BYTES: usize = 512 * 1024;
+
+/// The bytes of a category that are read before the end of the chip is checked again.
+const PIECE: usize = 1024;
 
 const POLL: Duration = Duration::from_micros(200);
 /// The timeout for one word; a write takes at most 10 ms.
@@ -89,6 +93,13 @@ pub fn size_of(image: &[u8]) -> usize {
 fn declared_size(word: [u8; 2]) -> usize {
     let kibit = usize::from(u16::from_le_bytes(word)).saturating_add(1);
     kibit.saturating_mul(128).clamp(HEADER_BYTES, MAX_BYTES)
+}
+
+fn is_not_acknowledged(error: &Error) -> bool {
+    matches!(
+        *error.cause,
+        Cause::Eeprom(EepromError::NotAcknowledged { .. })
+    )
 }
 
 /// Runs `work` on a device's EEPROM. Afterwards the PDI has its access again, even after an error.
@@ -192,8 +203,8 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
     }
 
     /// Reads the image up to the end mark of its categories, independent of its size word. Without
-    /// an end mark, reads everything that can be addressed. `progress` receives the bytes read and
-    /// the expected maximum.
+    /// an end mark, reads up to the end of the chip, where its beginning repeats or where it no
+    /// longer acknowledges. `progress` receives the bytes read and the expected maximum.
     ///
     /// # Errors
     /// As [`Eeprom::read`].
@@ -201,12 +212,31 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
         let size = self.size().await?;
         let mut image = vec![0; HEADER_BYTES];
         self.read(0, &mut image).await?;
+        // The bytes of the present category that are not read yet.
+        let mut left = 0;
         loop {
             let at = image.len();
             progress(at, size.max(at));
-            let Some(head) = self.next(&mut image, MAX_BYTES, 4).await? else {
+            let bytes = if left > 0 { left.min(PIECE) } else { 4 };
+            let head = match self.next(&mut image, MAX_BYTES, bytes).await {
+                Err(error) if at >= size && is_not_acknowledged(&error) => {
+                    image.truncate(at);
+                    return Ok(image);
+                }
+                head => head?,
+            };
+            let Some(head) = head else {
                 return Ok(image);
             };
+            let chip = chip_length(&image);
+            if chip < image.len() {
+                image.truncate(chip);
+                return Ok(image);
+            }
+            if left > 0 {
+                left = left.saturating_sub(bytes);
+                continue;
+            }
             let [k0, k1, n0, n1] = head;
             // The end mark is one word, so the rest is cut off. Zeros beyond the declared size are
             // not categories.
@@ -214,10 +244,7 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
                 image.truncate(at + 2);
                 return Ok(image);
             }
-            let bytes = usize::from(u16::from_le_bytes([n0, n1])) * 2;
-            if self.next(&mut image, MAX_BYTES, bytes).await?.is_none() {
-                return Ok(image);
-            }
+            left = usize::from(u16::from_le_bytes([n0, n1])) * 2;
         }
     }
 
@@ -353,5 +380,104 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
 
     pub(super) fn failed(&self, source: EepromError) -> Error {
         self.registers.error(Cause::Eeprom(source))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+
+    use super::*;
+    use crate::mailbox::DatagramError;
+
+    /// A chip that ignores upper address bits, or acknowledges none beyond its end.
+    struct Chip {
+        bytes: Vec<u8>,
+        wraps: bool,
+        word: Cell<u32>,
+        reads: Cell<usize>,
+    }
+
+    impl Chip {
+        /// Has the given header and one category up to the end of the chip.
+        fn without_end_mark(size: usize, size_word: u16, wraps: bool) -> Self {
+            let mut bytes: Vec<u8> = (0..size)
+                .map(|n| (7 * n + n / 256).to_le_bytes()[0])
+                .collect();
+            bytes[0x7c..0x7e].copy_from_slice(&size_word.to_le_bytes());
+            let words = u16::try_from((size - HEADER_BYTES - 4) / 2).expect("small");
+            bytes[0x80..0x82].copy_from_slice(&0x0900_u16.to_le_bytes());
+            bytes[0x82..0x84].copy_from_slice(&words.to_le_bytes());
+            Self {
+                bytes,
+                wraps,
+                word: Cell::new(0),
+                reads: Cell::new(0),
+            }
+        }
+
+        fn image(&self) -> Vec<u8> {
+            let device = DeviceRef {
+                name: "x".to_owned(),
+                position: 0,
+                station: 0x1001,
+            };
+            let image = with_eeprom(self, &device, "reading", EepromAccess::IfFree, async |e| {
+                e.image(&mut |_, _| {}).await
+            });
+            let image: Result<Vec<u8>, Error> =
+                crate::sys::executor::block_on(image).expect("carried");
+            image.expect("an image")
+        }
+    }
+
+    impl MailboxTransport for Chip {
+        async fn read(&self, _: u16, register: u16, to: &mut [u8]) -> Result<u16, DatagramError> {
+            let at = usize::try_from(self.word.get()).expect("small") * 2;
+            let beyond = at >= self.bytes.len() && !self.wraps;
+            match register {
+                registers::EEPROM_CONTROL if beyond => to.copy_from_slice(&REFUSED.to_le_bytes()),
+                registers::EEPROM_DATA => {
+                    for (n, byte) in to.iter_mut().enumerate() {
+                        *byte = self.bytes[(at + n) % self.bytes.len()];
+                    }
+                }
+                _ => to.fill(0),
+            }
+            Ok(1)
+        }
+
+        async fn write(&self, _: u16, register: u16, data: &[u8]) -> Result<u16, DatagramError> {
+            if let (registers::EEPROM_CONTROL, [_, _, word @ ..]) = (register, data)
+                && let Some(word) = word.first_chunk()
+            {
+                self.word.set(u32::from_le_bytes(*word));
+                self.reads.set(self.reads.get() + 1);
+            }
+            Ok(1)
+        }
+
+        async fn delay(&self, _: Duration) {}
+
+        fn now(&self) -> u64 {
+            0
+        }
+    }
+
+    /// Word 0x3E is the size in KiBit minus one. A chip ignores upper address bits (Atmel AT24C16
+    /// data sheet, "Device addressing"), others do not acknowledge (ETG.1000.4, bit 13 of 0x0502).
+    #[test]
+    fn image_without_end_mark_ends_with_the_chip() {
+        for (size, size_word) in [(2048, 15), (2048, 1), (2048, 0xffff), (4096, 15)] {
+            for wraps in [true, false] {
+                if !wraps && size_word == 0xffff {
+                    continue;
+                }
+                let chip = Chip::without_end_mark(size, size_word, wraps);
+                assert_eq!(chip.image(), chip.bytes, "{size} {size_word} {wraps}");
+                let most = (size + 2 * PIECE) / 4;
+                assert!(chip.reads.get() <= most, "{} reads", chip.reads.get());
+            }
+        }
     }
 }

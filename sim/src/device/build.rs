@@ -1,7 +1,7 @@
 //! Builds devices from ESI files.
 
 use ecaxis_esi::model::{Access, Device, Dictionary, Module, ObjectCode, SmUse, SyncManager};
-use ecaxis_esi::sii::{self, SiiError, SiiOptions};
+use ecaxis_esi::sii::{self, SiiError, SiiOptions, SiiWarning};
 
 use super::application::{Application, Io};
 use super::esm::Al;
@@ -119,6 +119,9 @@ pub enum SimError {
     /// The EEPROM image is invalid.
     #[error("EEPROM image: {0}")]
     Image(#[from] SiiError),
+    /// A category of the EEPROM image is damaged.
+    #[error("EEPROM image: {0}")]
+    DamagedImage(SiiWarning),
 }
 
 /// The objects of a device, its PDOs and the SyncManagers that carry them.

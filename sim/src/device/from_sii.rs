@@ -22,10 +22,13 @@ impl SimDevice {
     ///
     /// # Errors
     ///
-    /// Fails if the image is shorter than its headers state, or a SyncManager lies outside the
-    /// address space.
+    /// Fails if a category or a PDO is longer than its image or category, or a SyncManager lies
+    /// outside the address space.
     pub fn from_sii(image: &[u8], options: DeviceOptions) -> Result<Self, SimError> {
         let sii = sii::parse(image)?;
+        if let Some(damage) = sii.damage.first() {
+            return Err(SimError::DamagedImage(damage.clone()));
+        }
         let options = DeviceOptions {
             serial: sii.serial,
             alias: sii.alias,

@@ -179,7 +179,9 @@ fn from_sii_names_the_missing_part_of_a_short_image() {
     let end = 0x80 + 4 + usize::from(u16::from_le_bytes([good[0x82], good[0x83]])) * 2;
     assert_eq!(
         error(&good[..end + 8]),
-        format!("EEPROM image: category 30 at byte 0x{end:x} claims 32 bytes, 4 are left")
+        format!(
+            "EEPROM image: byte 0x{end:x}, category 30: the category claims 32 bytes, 4 are left"
+        )
     );
     let mut sii = image();
     sii.sync_managers[3].start_address = 0xfff0;
