@@ -19,6 +19,7 @@ use ecaxis_tools::parameters::dump::Origin;
 use crate::access::bus::{self, Bus};
 use crate::args::numbers::number_16;
 use crate::hints::{self, Failure};
+use crate::render::note;
 
 /// Options that select one device
 #[derive(Debug, Clone, clap::Args)]
@@ -305,6 +306,9 @@ impl OpenDevice {
     }
 }
 
+/// The maximum number of unusable descriptions that are named.
+const MAX_NAMED: usize = 3;
+
 /// A device with open mailbox.
 #[derive(Debug)]
 pub(crate) struct Open<'a> {
@@ -381,7 +385,19 @@ impl Open<'_> {
         let mut progress = counter("asking for objects");
         let learned = dictionary::dictionary(coe, &at.wire, &at.device, &mut progress).await;
         bus::passed();
-        at.map_error(learned)
+        let read = at.map_error(learned)?;
+        for error in read.failed.iter().take(MAX_NAMED) {
+            note(&format!(
+                "warning: {}: {}",
+                at.device,
+                error.without_station()
+            ));
+        }
+        match read.failed.len().checked_sub(MAX_NAMED) {
+            None | Some(0) => {}
+            Some(more) => note(&format!("warning: {more} more descriptions are unusable")),
+        }
+        Ok(read.dictionary)
     }
 
     /// Returns the identity from the device's objects, completed from the EEPROM.

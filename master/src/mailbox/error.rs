@@ -91,6 +91,11 @@ impl<S> CoeError<S> {
         matches!(self.cause, CoeCause::Timeout { .. })
     }
 
+    /// True if the answer was received and is unusable.
+    pub fn is_malformed(&self) -> bool {
+        matches!(self.cause, CoeCause::Malformed(_))
+    }
+
     /// True if the device itself refused; it may still answer other requests.
     pub fn is_refusal(&self) -> bool {
         matches!(self.cause, CoeCause::Abort(_) | CoeCause::Refused(_))

@@ -8,6 +8,7 @@ use ecaxis_esi::{Dictionary, Object, ObjectItem, Writable};
 use proptest::prelude::*;
 
 use super::compare::compare;
+use super::dictionary::dictionary;
 use super::dump::{Dump, DumpError, Origin};
 use super::lookup::{FindError, ObjectQuery, find};
 use super::restore::{RestoreError, Restored, restore};
@@ -15,10 +16,11 @@ use super::restore_order::{Write, order};
 use super::{DataType, Kind, Parameter};
 use ecaxis_master::acyclic::DeviceRef;
 use ecaxis_master::cancel::CancelToken;
-use ecaxis_master::mailbox::{DatagramError, MailboxTransport, NamedObject};
+use ecaxis_master::mailbox::{CoeClient, DatagramError, MailboxTransport, NamedObject};
 use ecaxis_master::report::Cause;
+use ecaxis_test_support::mailbox::fault_injection::Mischief;
 use ecaxis_test_support::mailbox::server::Server;
-use ecaxis_test_support::mailbox::{STATION, block_on, client};
+use ecaxis_test_support::mailbox::{STATION, block_on, client, layout};
 
 fn parameter(index: u16, sub: u8, data_type: &str, value: &[u8]) -> Parameter {
     Parameter {
@@ -104,6 +106,68 @@ fn find_accepts_numbers_and_names() {
         Some("Axis configuration")
     );
     assert_eq!(near("-"), None);
+}
+
+fn device() -> DeviceRef {
+    DeviceRef {
+        name: "x".to_owned(),
+        position: 0,
+        station: STATION,
+    }
+}
+
+/// Returns the object indices of the dictionary and the texts of the failed descriptions.
+fn read_dictionary(mischief: &[Mischief]) -> Result<(Vec<u16>, Vec<String>), String> {
+    let objects: &[(u16, u8, &[u8])] = &[
+        (0x2000, 0, &[1, 2]),
+        (0x2001, 0, &[1, 2]),
+        (0x2002, 0, &[1, 2]),
+        (0x2003, 0, &[1, 2]),
+    ];
+    let server = Server::new(128, objects, mischief);
+    let mut coe = CoeClient::new(layout(128));
+    let (at, mut silent) = (device(), |_, _| {});
+    let read = dictionary(&mut coe, &server, &at, &mut silent);
+    let read = block_on(read).map_err(|error| error.to_string())?;
+    let indices = read.dictionary.objects.iter().map(|object| object.index);
+    let failed = read.failed.iter().map(|e| e.without_station().to_string());
+    Ok((indices.collect(), failed.collect()))
+}
+
+/// ETG.1000.6 clause 5.6.3: an object description has at least 6 bytes, an entry description 10.
+/// Answer 1 is the list; two answers per object follow.
+#[test]
+fn a_malformed_description_costs_one_object() {
+    let information = |opcode: u8, data: &[u8]| {
+        let length = u8::try_from(6 + data.len()).expect("short");
+        let mut message = vec![length, 0, 0, 0, 0, 0x13, 0, 0x80, opcode, 0, 0, 0];
+        message.extend(data);
+        message
+    };
+    assert_eq!(
+        read_dictionary(&[]),
+        Ok((vec![0x2000, 0x2001, 0x2002, 0x2003], vec![]))
+    );
+    let object = information(4, &[0x01, 0x20, 7, 0]);
+    let (indices, failed) = read_dictionary(&[Mischief::Replace(4, object)]).expect("a list");
+    assert_eq!(indices, [0x2000, 0x2002, 0x2003]);
+    assert_eq!(failed.len(), 1, "{failed:?}");
+    assert!(failed[0].starts_with("the description of object 0x2001"));
+
+    let entry = information(6, &[0x01, 0x20, 0, 7]);
+    let (indices, failed) = read_dictionary(&[Mischief::Replace(5, entry)]).expect("a list");
+    assert_eq!(indices, [0x2000, 0x2001, 0x2002, 0x2003]);
+    assert_eq!(failed.len(), 1, "{failed:?}");
+}
+
+#[test]
+fn an_unanswered_description_costs_one_object_and_a_silent_device_ends_the_list() {
+    let (indices, failed) = read_dictionary(&[Mischief::Skip(4)]).expect("a list");
+    assert_eq!(indices, [0x2000, 0x2002, 0x2003]);
+    assert_eq!(failed.len(), 1, "{failed:?}");
+    let silent = [3, 4, 5, 6, 7].map(Mischief::Skip);
+    let error = read_dictionary(&silent).expect_err("silent");
+    assert!(error.contains("no answer came"), "{error}");
 }
 
 /// Files without a format number have decimal subindices.
@@ -292,11 +356,7 @@ impl Failing {
                 object(0x6066, "y", &[""]),
             ],
         };
-        let device = DeviceRef {
-            name: "x".to_owned(),
-            position: 0,
-            station: STATION,
-        };
+        let device = device();
         let mut coe = client();
         block_on(restore(
             &mut coe,

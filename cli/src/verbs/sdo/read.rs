@@ -192,9 +192,12 @@ pub(super) async fn describe(
         let object = match (known, &dictionary) {
             (Some(object), _) => Some(object.clone()),
             // The device may have an object that its ESI does not describe.
-            (None, _) => dictionary::object(open.coe, &open.at.wire, found.index)
-                .await
-                .ok(),
+            (None, _) => {
+                let mut failed = Vec::new();
+                let own =
+                    dictionary::object(open.coe, &open.at.wire, found.index, &mut failed).await;
+                own.ok().flatten()
+            }
         };
         all.push((found, object.filter(|object| !object.items.is_empty())));
     }
