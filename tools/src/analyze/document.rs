@@ -69,6 +69,9 @@ fn head(name: &str, report: &Report) -> Document {
     out
 }
 
+/// The mailbox protocols whose contents the report shows.
+const DECODED: [&str; 3] = ["error", "CoE", "FoE"];
+
 fn devices(report: &Report, all: bool, out: &mut Document) {
     let answering = report.answering;
     let answering = answering.map_or(String::new(), |n| format!(" ({n} answer at most)"));
@@ -80,6 +83,7 @@ fn devices(report: &Report, all: bool, out: &mut Document) {
     };
     let mut configured = Table::new("#|name|out|in|FMMUs|SYNC0|SDO read|written|failed");
     let mut managers = Table::new("#|SyncManager|start|bytes|usage");
+    let mut mailboxes = Table::new("#|name|protocol|messages");
     for (place, device) in report.devices.iter().enumerate() {
         let mut row = Vec::from(cells![
             place,
@@ -95,6 +99,11 @@ fn devices(report: &Report, all: bool, out: &mut Document) {
             row.push(device.states.join(" → "));
         }
         table.line(row);
+        // CoE and FoE are decoded, and their transfers are listed.
+        let counted = device.mailbox_messages.iter();
+        for (protocol, count) in counted.filter(|(protocol, _)| !DECODED.contains(protocol)) {
+            mailboxes.row(cells![place, called(place, device), protocol, count]);
+        }
         if device.fmmus == 0 && device.sync_managers.is_empty() && device.sync0_ns.is_none() {
             continue;
         }
@@ -115,6 +124,7 @@ fn devices(report: &Report, all: bool, out: &mut Document) {
     }
     out.table(table);
     out.section("Configured", configured);
+    out.section("Mailbox messages, not decoded", mailboxes);
     if all {
         out.table(managers);
     }

@@ -45,6 +45,8 @@ pub enum EventKind {
         error: bool,
         code: Option<u16>,
     },
+    /// The AL status of all devices, combined, has the error bit.
+    ErrorBit,
     /// The AL status code of an earlier error event.
     Code(u16),
     Transfer(Box<Transfer>),
@@ -80,7 +82,7 @@ impl EventKind {
             Self::Transfer(transfer) => transfer.is_trouble(),
             Self::Emergency(emergency) => !emergency.is_reset(),
             Self::File(file) => file.error.is_some(),
-            Self::Refused(_) => true,
+            Self::Refused(_) | Self::ErrorBit => true,
             Self::Axis { state, .. } => {
                 matches!(state, State::Fault | State::FaultReactionActive)
             }
@@ -163,6 +165,7 @@ impl fmt::Display for EventKind {
                     _ => Ok(()),
                 }
             }
+            Self::ErrorBit => write!(f, "a device reports an error"),
             Self::Code(code) => write!(f, "AL status code {code:#06x}, {}", al_status_text(*code)),
             Self::Transfer(transfer) => transfer.fmt(f),
             Self::Emergency(emergency) => emergency.fmt(f),

@@ -39,6 +39,8 @@ pub struct Device {
     pub code: Option<u16>,
     /// The last requested state, and whether the request acknowledged errors.
     asked: Option<(AlState, bool)>,
+    /// The transmission time of the frame that last acknowledged errors.
+    acknowledged_at: Option<u64>,
     /// True if AL status has the error bit, including copied acknowledgements.
     flagged: bool,
     /// The states in order, without consecutive repetitions.
@@ -73,6 +75,10 @@ pub struct RecordedSegment {
     pub unfollowed: u64,
     /// The last state requested of all devices, and whether the request acknowledged errors.
     asked: Option<(AlState, bool)>,
+    /// True if the last broadcast read of AL status had the error bit.
+    flagged: bool,
+    /// The index of an error event whose device is not known yet.
+    unattributed: Option<usize>,
     /// Incremented when the mapping of process data changes.
     version: u64,
     located: Option<u64>,
@@ -216,10 +222,9 @@ impl RecordedSegment {
             if let Some(control) =
                 part_u16(register, data, registers::AL_CONTROL).or_else(|| low(register, data))
             {
-                let asked = asked(control);
-                self.asked = Some(asked);
+                self.asked = Some(asked(control));
                 for device in &mut self.devices {
-                    device.asked = Some(asked);
+                    device.request(asked(control), at);
                 }
                 self.event(at, EventScope::Bus, requested(control));
             }
@@ -235,7 +240,26 @@ impl RecordedSegment {
             && let (Some(data), Some(wkc)) = (passed.back, passed.wkc)
             && let Some([status]) = part(register, data, registers::AL_STATUS, 1)
         {
+            self.error_bit(at, *status);
             self.everybody(at, *status, wkc);
+        }
+    }
+
+    /// Reports an error bit in the AL status of all devices, combined by OR. The device becomes
+    /// known when its own AL status is read.
+    fn error_bit(&mut self, at: u64, status: u8) {
+        let flagged = status & 0x10 != 0;
+        let new = flagged && !self.flagged;
+        self.flagged = flagged;
+        // Devices without a processor copy the acknowledge bit.
+        let asked = self.devices.iter().map(|device| device.asked);
+        let mut asked = asked.chain([self.asked]).flatten();
+        if !new || asked.any(|(_, acknowledged)| acknowledged) {
+            return;
+        }
+        if !self.devices.iter().any(|device| device.error) {
+            self.unattributed = (self.events.len() < EVENTS).then_some(self.events.len());
+            self.event(at, EventScope::Bus, EventKind::ErrorBit);
         }
     }
 
@@ -274,7 +298,7 @@ impl RecordedSegment {
                 part_u16(register, data, registers::AL_CONTROL).or_else(|| low(register, data))
         {
             if let Some(device) = self.devices.get_mut(index) {
-                device.asked = Some(asked(control));
+                device.request(asked(control), at);
             }
             self.event(at, EventScope::Device(index), requested(control));
         }
@@ -323,13 +347,13 @@ impl RecordedSegment {
         }
         if let Some([status]) = part(register, data, registers::AL_STATUS, 1) {
             self.status(
-                at,
+                (passed.at, at),
                 index,
                 *status,
                 part_u16(register, data, registers::AL_STATUS_CODE),
             );
         } else if let Some(code) = part_u16(register, data, registers::AL_STATUS_CODE) {
-            self.code(at, index, code);
+            self.code((passed.at, at), index, code);
         }
         if let Some(time) = part(register, data, registers::DC_SYSTEM_TIME, 8)
             .or_else(|| part(register, data, registers::DC_SYSTEM_TIME, 4))
@@ -348,30 +372,44 @@ impl RecordedSegment {
         }
     }
 
-    fn status(&mut self, at: u64, index: usize, status: u8, code: Option<u16>) {
+    /// Processes the AL status of one device. `sent_at`: the transmission time of the frame.
+    fn status(&mut self, (sent_at, at): (u64, u64), index: usize, status: u8, code: Option<u16>) {
         let Some(device) = self.devices.get_mut(index) else {
             return;
         };
         let state = AlState::from_status(status);
         device.flagged = status & 0x10 != 0;
+        if !device.flagged && device.asked == Some((state, true)) {
+            // An error bit after this one is not copied.
+            device.asked = Some((state, false));
+        }
         // Devices without a processor copy AL control, including the acknowledge bit.
         let copied = device.asked == Some((state, true)) && code.is_none_or(|code| code == 0);
-        let error = device.flagged && !copied;
+        // The device has not yet processed an acknowledgement in the same frame.
+        let acknowledged = device.acknowledged_at == Some(sent_at);
+        // A known error lasts until the bit is cleared.
+        let lasts = device.error && device.state == Some(state);
+        let error = device.flagged && (lasts || !copied && !acknowledged);
         let code = code.filter(|_| error);
         if device.enters(state, error, code) {
-            self.event(
-                at,
-                EventScope::Device(index),
-                EventKind::State { state, error, code },
-            );
+            let what = EventKind::State { state, error, code };
+            let of = EventScope::Device(index);
+            let earlier = self.unattributed.take_if(|_| error);
+            match earlier.and_then(|earlier| self.events.get_mut(earlier)) {
+                Some(event) => (event.of, event.what) = (of, what),
+                None => self.event(at, of, what),
+            }
         }
     }
 
-    fn code(&mut self, at: u64, index: usize, code: u16) {
+    fn code(&mut self, (sent_at, at): (u64, u64), index: usize, code: u16) {
         let Some(device) = self.devices.get_mut(index) else {
             return;
         };
         if !device.flagged || code == 0 || device.code == Some(code) {
+            return;
+        }
+        if !device.error && device.acknowledged_at == Some(sent_at) {
             return;
         }
         let copied = !device.error;
@@ -461,6 +499,14 @@ impl RecordedSegment {
 }
 
 impl Device {
+    /// Stores the requested state, and when errors were acknowledged.
+    fn request(&mut self, asked: (AlState, bool), at: u64) {
+        self.asked = Some(asked);
+        if asked.1 {
+            self.acknowledged_at = Some(at);
+        }
+    }
+
     /// Updates the state. Returns true if it changed.
     fn enters(&mut self, state: AlState, error: bool, code: Option<u16>) -> bool {
         let fresh =

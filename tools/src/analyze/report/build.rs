@@ -1,5 +1,7 @@
 //! Devices, events and transfers of the report, from the segment.
 
+use std::collections::BTreeMap;
+
 use super::process_data::{axes, clocks, cycle};
 use super::{DeviceReport, FileReport, Line, Report, SyncManagerReport, TransferReport, problems};
 use crate::analyze::events::{Event, EventKind, EventScope};
@@ -202,6 +204,7 @@ fn device_report<'e>(
         writes: 0,
         failed_transfers: 0,
         emergencies: 0,
+        mailbox_messages: mailbox_messages(device),
         al_errors: Vec::new(),
         emergency_codes: Vec::new(),
     };
@@ -232,6 +235,25 @@ fn device_report<'e>(
         }
     }
     report
+}
+
+/// Mailbox types (ETG.1000.4, mailbox header).
+const PROTOCOLS: [(usize, &str); 7] = [
+    (0, "error"),
+    (1, "AoE"),
+    (2, "EoE"),
+    (3, "CoE"),
+    (4, "FoE"),
+    (5, "SoE"),
+    (15, "VoE"),
+];
+
+fn mailbox_messages(device: &Device) -> BTreeMap<&'static str, u64> {
+    let counted = PROTOCOLS.iter().filter_map(|(number, name)| {
+        let count = device.mailbox.messages.get(*number).copied()?;
+        (count > 0).then_some((*name, count))
+    });
+    counted.collect()
 }
 
 /// The maximum number of codes of one kind per device.

@@ -4,6 +4,8 @@
 //! - `process_data`: cycle, clocks and axes;
 //! - `problems`: the problems, worst first.
 
+use std::collections::BTreeMap;
+
 use serde::Serialize;
 
 use ecaxis_master::acyclic::AlState;
@@ -85,6 +87,8 @@ pub struct DeviceReport {
     pub writes: u64,
     pub failed_transfers: u64,
     pub emergencies: u64,
+    /// The number of mailbox messages in both directions, by protocol.
+    pub mailbox_messages: BTreeMap<&'static str, u64>,
     /// The AL status codes, each once in order of first occurrence.
     pub al_errors: Vec<u16>,
     pub emergency_codes: Vec<u16>,
