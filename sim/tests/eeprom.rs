@@ -2,7 +2,7 @@
 
 use crate::common::*;
 use ecaxis_sim::frame::{self, FrameBuilder};
-use ecaxis_sim::{DeviceOptions, FaultScript, SimDevice};
+use ecaxis_sim::{DeviceOptions, EscInfo, FaultScript, SimDevice};
 
 const S: u16 = 0x1001;
 
@@ -217,4 +217,34 @@ fn alias_is_loaded_from_the_eeprom_and_used_when_enabled() {
     assert_eq!(bus.read_u16(S, 0x12), 0x0abc);
     power_cycle(&mut bus);
     assert_eq!(bus.read_u16(S, 0x12), 0x0def);
+}
+
+/// Beckhoff ESC data sheet, section II, 0x0502 bit 7: EEPROMs above 16 KiBit need two address
+/// bytes. Sizes of EEPROM chips are powers of two (Atmel AT24C01 to AT24C512).
+#[test]
+fn image_fits_its_chip() {
+    let text = "x".repeat(60);
+    let mut device = coe_device();
+    device.eeprom.byte_size = 2048;
+    let small = sim(&device).sii().len();
+    assert_eq!(small, 2048);
+    device.eeprom.categories = vec![ecaxis_esi::model::EepromCategory {
+        number: 0x0801,
+        data: text.repeat(40).into_bytes(),
+        ..Default::default()
+    }];
+    for esc in [None, Some(EscInfo::ET1100), Some(EscInfo::ET1200)] {
+        let options = DeviceOptions {
+            esc,
+            ..DeviceOptions::default()
+        };
+        let sim = SimDevice::from_esi(&device, &[], options).unwrap();
+        let image = sim.sii().to_vec();
+        assert_eq!(image.len(), 4096);
+        assert_eq!(image[0x7c..0x7e], [31, 0], "the size in KiBit minus one");
+        let mut bus = one(sim);
+        let status = command(&mut bus, 1, 0x480);
+        assert_eq!(status & 0x0080, 0x0080, "two address bytes");
+        assert_eq!(bus.read(S, 0x508, 4), image[0x900..0x904]);
+    }
 }

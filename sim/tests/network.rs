@@ -423,6 +423,24 @@ fn broken_ring_reaches_every_device_from_one_side() {
 }
 
 #[test]
+fn a_fault_script_breaks_the_closing_cable_of_a_ring() {
+    let script = "[[fault]]\nat = '1ms'\nfor = '1ms'\nkind = 'link-break'\ndevice = 3\nport = 1";
+    let script = FaultScript::parse(script).unwrap();
+    let mut segment = ring(4, SecondPort::Listens);
+    assert_eq!(script.check(segment.topology()), Ok(()));
+    let line = Topology::by_order(&media(&vec![with_physics("YY"); 4])).unwrap();
+    assert!(script.check(&line).is_err());
+    segment.set_faults(script);
+    let mut reached = |now| {
+        let (first, all, _) = send(&mut segment, Nic::Primary, now);
+        (back_at(first), all)
+    };
+    assert_eq!(reached(0), (Some(Nic::Secondary), 4));
+    assert_eq!(reached(3 * MS / 2), (Some(Nic::Primary), 4));
+    assert_eq!(reached(3 * MS), (Some(Nic::Secondary), 4));
+}
+
+#[test]
 fn circulating_frame_is_destroyed() {
     let mut segment = ring(2, SecondPort::Listens);
     segment.plug(0, 0, false);

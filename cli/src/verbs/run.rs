@@ -8,7 +8,7 @@ use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{self, ConfigError, Machine, Nic, duration};
 use ecaxis_master::post_mortem::FaultReport;
 use ecaxis_master::session::{self, Options, Outcome, Summary};
-use ecaxis_sim::FaultScript;
+use ecaxis_sim::{FaultScript, SecondPort};
 use serde_json::{Value, json};
 
 use crate::access::signals;
@@ -254,7 +254,7 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
         return Err(Failure::new(hints::WRONG, message).hint("add `--for 10s` or a [[step]]"));
     }
     let script = args.faults.as_deref();
-    let faults = script.map(|path| faults(path, machine)).transpose()?;
+    let faults = script.map(|path| faults(path, machine, None)).transpose()?;
     let inputs = Inputs::from_machine(machine)
         .with("the fault script", script)
         .with("the recording to replay", &args.replay);
@@ -301,11 +301,15 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
 /// The maximum size of a fault script in bytes.
 const MAX_BYTES: u64 = 16 << 20;
 
-/// Loads a fault script and checks it against the machine's simulated bus.
-pub(crate) fn faults(path: &Path, machine: &Machine) -> Result<FaultScript, Failure> {
+/// Loads a fault script and checks it against the machine's simulated bus, which may be a ring.
+pub(crate) fn faults(
+    path: &Path,
+    machine: &Machine,
+    ring: Option<SecondPort>,
+) -> Result<FaultScript, Failure> {
     let text = ecaxis_master::file::read_text(path, MAX_BYTES)
         .map_err(|e| Failure::new(hints::WRONG, format!("cannot read {}: {e}", path.display())))?;
-    let bus = session::topology(machine).map_err(|e| hints::failure(&e, &machine.bus.nic))?;
+    let bus = session::topology(machine, ring).map_err(|e| hints::failure(&e, &machine.bus.nic))?;
     let script = FaultScript::parse(&text).and_then(|script| {
         script.check(&bus)?;
         Ok(script)
@@ -357,6 +361,19 @@ mod tests {
         let text = if machine == "demo" { &demo } else { head };
         let machine = config::parse(&configs.join("demo.toml"), text).unwrap();
         super::options(&args, &machine).unwrap_err()
+    }
+
+    #[test]
+    fn fault_script_may_break_the_closing_cable_of_a_ring() {
+        let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
+        let machine = config::load(&configs.join("demo.toml")).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("f.toml");
+        let last = machine.devices.len() - 1;
+        let script = format!("[[fault]]\nkind = 'link-break'\ndevice = {last}\nport = 1\n");
+        std::fs::write(&path, script).unwrap();
+        assert!(faults(&path, &machine, None).is_err());
+        assert!(faults(&path, &machine, Some(SecondPort::Listens)).is_ok());
     }
 
     #[test]

@@ -89,13 +89,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     let machine = config::load(&args.file).map_err(|e| hints::config(&args.file, &e))?;
     let devices = machine.devices.len();
+    let ring = args.nic2.as_ref().map(|_| SecondPort::Listens);
     let faults = args.faults.as_deref();
-    let faults = faults.map(|f| run::faults(f, &machine)).transpose()?;
+    let faults = faults.map(|f| run::faults(f, &machine, ring)).transpose()?;
     let seed = faults
         .as_ref()
         .and_then(|f| f.seed)
         .unwrap_or(session::Options::default().seed);
-    let ring = args.nic2.as_ref().map(|_| SecondPort::Listens);
     let (at_once, on_signal) = match args.faults_on_signal {
         true => (None, faults),
         false => (faults, None),

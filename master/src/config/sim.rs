@@ -128,7 +128,8 @@ pub fn topology(devices: &[DeviceConfig]) -> Result<Topology, Vec<TopologyError>
     Ok(topology)
 }
 
-fn media(order: &[&DeviceConfig]) -> Vec<Media> {
+/// Returns the ports of the devices by their ESI files.
+pub(crate) fn media(order: &[&DeviceConfig]) -> Vec<Media> {
     let physics = order.iter().map(|d| d.device.physics.as_str());
     physics.map(Medium::from_physics).collect()
 }

@@ -6,7 +6,6 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use ecaxis_esi::sii::{self, SiiOptions};
 use ecaxis_esi::{Device, Slots};
 
-use ecaxis_sim::network::topology::media;
 use ecaxis_sim::{
     DeviceOptions, FaultScript, FirmwareOptions, SecondPort, Segment, SegmentOptions, SimDevice,
     Topology,
@@ -96,14 +95,10 @@ pub fn simulated_bus(
     faults: Option<&FaultScript>,
     ring: Option<SecondPort>,
 ) -> Result<Segment, Error> {
-    let mut topology = topology(machine)?;
+    let topology = topology(machine, ring)?;
     let mut devices = Vec::with_capacity(machine.devices.len());
     for device in bus_order(&machine.devices) {
         devices.push(sim_device(device, devices.len(), seed)?);
-    }
-    if let Some(second) = ring {
-        let closed = topology.closed(&media(&devices), second);
-        topology = closed.map_err(|error| Cause::Sim(error.to_string()))?;
     }
     let options = SegmentOptions {
         seed,
@@ -116,17 +111,24 @@ pub fn simulated_bus(
     Ok(segment)
 }
 
-/// Returns the cabling of the simulated bus.
+/// Returns the cabling of the simulated bus. With `ring`, the last open port leads back to a second
+/// port of the MainDevice.
 ///
 /// # Errors
-/// [`Cause::Sim`] if a device finds no free port.
-pub fn topology(machine: &Machine) -> Result<Topology, Error> {
-    sim::topology(&machine.devices).map_err(|errors| {
+/// [`Cause::Sim`] if a device or the ring finds no free port.
+pub fn topology(machine: &Machine, ring: Option<SecondPort>) -> Result<Topology, Error> {
+    let line = sim::topology(&machine.devices).map_err(|errors| {
         let reported = errors
             .iter()
             .map(|error| sim::topology_message(error, &machine.devices).0);
-        Cause::Sim(reported.collect::<Vec<_>>().join("; ")).into()
-    })
+        Cause::Sim(reported.collect::<Vec<_>>().join("; "))
+    })?;
+    let Some(second) = ring else {
+        return Ok(line);
+    };
+    let media = sim::media(&bus_order(&machine.devices));
+    let closed = line.closed(&media, second);
+    closed.map_err(|error| Cause::Sim(error.to_string()).into())
 }
 
 /// The clock drifts of the simulated devices in ppm, as in real devices. Without drift a defective

@@ -1,7 +1,7 @@
 //! Builds devices from ESI files.
 
 use ecaxis_esi::model::{Access, Device, Dictionary, Module, ObjectCode, SmUse, SyncManager};
-use ecaxis_esi::sii::{self, SiiError, SiiOptions, SiiWarning};
+use ecaxis_esi::sii::{Sii, SiiError, SiiOptions, SiiWarning};
 
 use super::application::{Application, Io};
 use super::esm::Al;
@@ -186,7 +186,7 @@ impl SimDevice {
                     alias: options.alias,
                     serial: options.serial,
                 };
-                sii::emit(device, modules, &own)
+                factory_image(device, modules, &own)
             }
         };
         let mut gateway = Application::gateway(device, options.serial, options.gateway)?;
@@ -232,7 +232,8 @@ impl SimDevice {
         };
         let info = options
             .esc
-            .unwrap_or_else(|| EscInfo::fitting(&needs, image.len()));
+            .unwrap_or_else(|| EscInfo::fitting(&needs, image.len()))
+            .with_eeprom_of(image.len());
         let esc = Esc::new(
             EscConfig {
                 info: EscInfo {
@@ -309,6 +310,19 @@ impl SimDevice {
         sim.power_on(0);
         Ok(sim)
     }
+}
+
+/// Returns the image of the ESI. Contents that exceed the size in the ESI get the next larger chip;
+/// the sizes of chips are powers of two.
+fn factory_image(device: &Device, modules: &[Module], options: &SiiOptions) -> Vec<u8> {
+    let mut sii = Sii::from_device(device, modules, options);
+    let image = sii.to_bytes();
+    let size = u32::try_from(image.len()).unwrap_or(u32::MAX);
+    if size <= sii.byte_size.next_multiple_of(128) {
+        return image;
+    }
+    sii.byte_size = size.next_power_of_two();
+    sii.to_bytes()
 }
 
 /// True for a drive profile, or if a dictionary or PDO of device or modules has Controlword and

@@ -158,13 +158,19 @@ impl EscInfo {
         if needs.no_lrw {
             info.features |= feature::NO_LRW;
         }
-        if eeprom_bytes > 2048 {
-            info.eeprom |= eeprom::TWO_BYTE_ADDRESS;
-        }
         Self {
             eeprom_read_ns: QUICK_EEPROM_NS,
-            ..info
+            ..info.with_eeprom_of(eeprom_bytes)
         }
+    }
+
+    /// Returns the chip with an EEPROM that holds this many bytes.
+    #[must_use]
+    pub(crate) fn with_eeprom_of(mut self, bytes: usize) -> Self {
+        if bytes > 2048 {
+            self.eeprom |= eeprom::TWO_BYTE_ADDRESS;
+        }
+        self
     }
 
     #[must_use]

@@ -81,7 +81,7 @@ impl TargetArgs {
             ));
         }
         let faults = match (&self.faults, machine) {
-            (Some(file), Some(machine)) => Some(run::faults(file, machine)?),
+            (Some(file), Some(machine)) => Some(run::faults(file, machine, None)?),
             _ => None,
         };
         if let Some(path) = &self.record {

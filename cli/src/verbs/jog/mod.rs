@@ -157,7 +157,9 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
         return Err(Failure::new(hints::WRONG, message).hint("add --sim"));
     }
     let script = args.faults.as_deref();
-    let faults = script.map(|path| run::faults(path, machine)).transpose()?;
+    let faults = script
+        .map(|path| run::faults(path, machine, None))
+        .transpose()?;
     if let Some(path) = &args.record {
         let inputs = Inputs::from_machine(machine).with("the fault script", script);
         check_output("--record", path, args.force, &inputs)?;
