@@ -1,5 +1,10 @@
 //! `ecaxis compare` names every kind of difference, and `--apply` produces a valid file.
 
+use std::sync::Arc;
+
+use ecaxis_master::clock::Clock;
+use ecaxis_master::link::sim::SimLink;
+use ecaxis_master::session::{Observer, Options, Progress, run_on, simulated_bus};
 use serde_json::Value;
 
 use ecaxis_test_support::assert_snapshot;
@@ -269,6 +274,69 @@ fn compare_names_and_applies_every_difference() {
             "# left to right",
         ] {
             assert!(applied.contains(comment), "{name}: `{comment}` is gone");
+        }
+    }
+}
+
+struct Silent;
+
+impl Observer for Silent {
+    fn progress(&mut self, _: &Progress) {}
+}
+
+/// Returns the error of a run of `MACHINE` on the bus of another machine file.
+fn run_error(bench: &Bench, other: &str) -> String {
+    let bus = simulated_bus(&bench.machine(other), 1, None, None).expect("a bus");
+    let options = Options {
+        clock: Clock::Virtual,
+        limit: Some(100_000_000),
+        ..Options::default()
+    };
+    let machine = bench.machine(MACHINE);
+    let link = Box::new(SimLink::new(bus));
+    let outcome = run_on(link, machine, options, Arc::default(), &mut Silent);
+    outcome.result.expect_err("another bus").to_string()
+}
+
+#[test]
+fn run_names_a_device_missing_in_the_middle_as_compare() {
+    let bench = bench();
+    let at = |text: String, from: u16| {
+        text.replace(
+            &format!("position = {from}"),
+            &format!("position = {}", from - 1),
+        )
+    };
+    let without_doors = [2, 3, 4].into_iter().fold(without(MACHINE, "doors"), at);
+    for (other, expected) in [
+        (
+            at(without(MACHINE, "y"), 4),
+            "scanning: 5 of 6 SubDevices answer; missing: `y` (position 3)",
+        ),
+        (
+            without_doors,
+            "scanning: 5 of 6 SubDevices answer; missing: `doors` (position 1)",
+        ),
+        (
+            at(
+                without(&format!("{}[stop]\n", without(MACHINE, "doors")), "y"),
+                2,
+            )
+            .replace("position = 4", "position = 2"),
+            "scanning: 4 of 6 SubDevices answer; missing: `doors` (position 1), `y` (position 3)",
+        ),
+    ] {
+        assert_eq!(run_error(&bench, &other), format!("bring-up: {expected}"));
+        bench.write("other.toml", &other);
+        bench.write("machine.toml", MACHINE);
+        let ran = bench.ecaxis(&["compare", "machine.toml", "--sim", "other.toml"]);
+        let (_, missing) = expected.split_once("missing: ").expect("a list");
+        for device in missing.split(", ") {
+            assert!(
+                ran.out.contains(&format!("{device} is missing")),
+                "{}",
+                ran.out
+            );
         }
     }
 }

@@ -67,9 +67,41 @@ pub fn parents(dl_status: impl IntoIterator<Item = u16>) -> Vec<Option<ParentPor
     parents
 }
 
+/// Returns the position of a device whose IN and OUT are swapped, so that frames enter it at
+/// another port than port 0. Frames are then processed on their way back: the device comes after
+/// those behind it, where no port is left for it. `None` if the ports do not show it.
+#[must_use]
+pub fn reversed(dl_status: impl IntoIterator<Item = u16>) -> Option<usize> {
+    let parents = parents(dl_status);
+    let alone = parents.iter().skip(1).position(Option::is_none)?;
+    // More devices without a parent contradict one swapped device.
+    let after = parents.get(alone + 2..).unwrap_or_default();
+    after.is_empty().then_some(alone + 1)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Beckhoff ESC data sheet, section I, 3.1: the processing unit is between port 0 and port 3. A
+    /// frame that enters at port 1 passes port 0 and all devices behind it first.
+    #[test]
+    fn reversed_returns_the_device_that_comes_after_those_behind_it() {
+        let table: [(&[&[u8]], Option<usize>); 6] = [
+            (&[], None),
+            (&[&[0]], None),
+            (&[&[0, 1], &[0, 1], &[0]], None),
+            // The second of three is reversed.
+            (&[&[0, 1], &[0], &[0, 1]], Some(2)),
+            // The first of four.
+            (&[&[0, 1], &[0, 1], &[0], &[0, 1]], Some(3)),
+            (&[&[0], &[0], &[0]], None),
+        ];
+        for (devices, expected) in table {
+            let found = reversed(devices.iter().map(|ports| open(ports)));
+            assert_eq!(found, expected, "{devices:?}");
+        }
+    }
 
     /// Returns the DL status of a device with these ports open.
     fn open(ports: &[u8]) -> u16 {

@@ -6,9 +6,11 @@ use ecaxis_esi::model::{Identification, Identity};
 use ethercrab::error::{Error, TimeoutError};
 use ethercrab::{MainDevice, SubDeviceIdentity};
 
-use super::{Group, Step, scan_error};
+use super::{Group, Step, align, scan_error};
+use crate::acyclic::device::read_sii;
+use crate::acyclic::eeprom::EepromAccess;
 use crate::acyclic::enumerate::{EnumeratedDevice, FIRST_STATION, count, read_device};
-use crate::acyclic::{DeviceRef, al};
+use crate::acyclic::{DeviceRef, al, topology};
 use crate::config::{DeviceConfig, Locator, Machine};
 use crate::datagram::DatagramClient;
 use crate::report::{self, Cause};
@@ -31,6 +33,7 @@ pub(super) async fn explain_scan(
         return Cause::NoAnswer.into();
     };
     let (mut behind, mut unaddressed) = (None, None);
+    let mut all = Vec::new();
     for position in 0..count {
         let device = DeviceRef {
             name: name_at(machine, position),
@@ -46,6 +49,7 @@ pub(super) async fn explain_scan(
             }
             Err(_) => continue,
         };
+        all.push(found.clone());
         let EnumeratedDevice { state, code, .. } = found;
         // The device has lost the station address that ethercrab assigned.
         if found.station != device.station {
@@ -65,11 +69,15 @@ pub(super) async fn explain_scan(
         let wanted = al::AlState::PreOp;
         return al::StateError::Gone { wanted }.with_device(&device);
     }
-    let missing = positions(machine).filter(|(position, _)| *position >= count);
-    let missing: Vec<_> = missing.map(named).collect();
-    if !missing.is_empty() {
-        let found = usize::from(count);
-        return not_all(machine, found, missing);
+    if positions(machine).any(|(position, _)| position >= count) {
+        let there = present(wire, machine, &all).await;
+        let missing = missing_devices(machine, &there);
+        return not_all(machine, usize::from(count), missing);
+    }
+    if matches!(error, Error::Topology)
+        && let Some(at) = topology::reversed(all.iter().map(|found| found.dl_status))
+    {
+        return reversed(machine, at, &present(wire, machine, &all).await);
     }
     match (error, behind) {
         (Error::Timeout(TimeoutError::StateTransition), Some((device, actual))) => {
@@ -82,6 +90,54 @@ pub(super) async fn explain_scan(
         }
         (error, _) => scan_error("scanning the segment and going to PreOp", &error),
     }
+}
+
+/// A product: vendor and product code. `None` if it is unknown.
+type Product = Option<(u32, u32)>;
+
+fn product(identity: Identity) -> Product {
+    Some((identity.vendor, identity.product))
+}
+
+/// Reads the products of the SubDevices that the file does not locate by alias.
+async fn present(
+    wire: &DatagramClient,
+    machine: &Machine,
+    all: &[EnumeratedDevice],
+) -> Vec<Product> {
+    let by_alias = |alias| {
+        machine
+            .devices
+            .iter()
+            .any(|d| d.at == Locator::Alias(alias))
+    };
+    let mut products = Vec::new();
+    for found in all.iter().filter(|found| !by_alias(found.alias)) {
+        let device = found.named(name_at(machine, found.position));
+        let sii = read_sii(wire, &device, EepromAccess::of(found.state)).await;
+        products.push(sii.ok().and_then(|sii| product(sii.identity)));
+    }
+    products
+}
+
+/// Names the device whose IN and OUT are swapped. `at`: its index on the bus.
+fn reversed(machine: &Machine, at: usize, there: &[Product]) -> report::Error {
+    let expected: Vec<_> = positions(machine).collect();
+    let same = |wanted: usize, found: usize| is_product(expected.get(wanted), there.get(found));
+    let places = align::moved_from(expected.len(), there.len(), at, same);
+    let candidates = places.into_iter().filter_map(|index| expected.get(index));
+    let cause = Cause::Reversed {
+        position: u16::try_from(at).unwrap_or(u16::MAX),
+        candidates: candidates.copied().map(named).collect(),
+    };
+    cause.into()
+}
+
+fn is_product(wanted: Option<&(u16, &DeviceConfig)>, found: Option<&Product>) -> bool {
+    let Some((_, config)) = wanted else {
+        return false;
+    };
+    found.is_some_and(|found| *found == product(config.selection.identity))
 }
 
 /// Returns the name of the device that the machine file assigns to `position`, or a generic name.
@@ -113,6 +169,7 @@ pub(super) async fn assign(
     }
 
     let mut order = Vec::with_capacity(machine.devices.len());
+    let mut elsewhere = Vec::new();
     let mut missing = false;
     for config in &machine.devices {
         let position = match config.at {
@@ -129,7 +186,13 @@ pub(super) async fn assign(
             }
         };
         match position {
-            Some(position) => order.push(u16::try_from(position).unwrap_or(u16::MAX)),
+            Some(position) => {
+                let position = u16::try_from(position).unwrap_or(u16::MAX);
+                order.push(position);
+                if !matches!(config.at, Locator::Position(_)) {
+                    elsewhere.push(position);
+                }
+            }
             None => match config.at {
                 Locator::Position(_) => missing = true,
                 Locator::Alias(alias) => {
@@ -144,8 +207,14 @@ pub(super) async fn assign(
             },
         }
     }
+    // The products at the positions that the file does not locate otherwise.
+    let there: Vec<Product> = (0_u16..)
+        .zip(&found)
+        .filter(|(position, _)| !elsewhere.contains(position))
+        .map(|(_, found)| product(found.identity))
+        .collect();
     if missing {
-        let missing = missing_devices(machine, &found);
+        let missing = missing_devices(machine, &there);
         return Err(not_all(machine, found.len(), missing));
     }
 
@@ -162,14 +231,20 @@ pub(super) async fn assign(
             position,
             station,
         };
-        let product = (expected.vendor, expected.product) == (identity.vendor, identity.product);
+        let is_product = product(expected) == product(identity);
         let rule = config.identity;
-        if !product || !rule.accepts(expected.revision, identity.revision) {
+        if !is_product && belongs_elsewhere(machine, identity) {
+            let missing = missing_devices(machine, &there);
+            if !missing.is_empty() {
+                return Err(not_all(machine, found.len(), missing));
+            }
+        }
+        if !is_product || !rule.accepts(expected.revision, identity.revision) {
             return Err(Cause::Identity {
                 esi: config.esi_path.display().to_string(),
                 expected: format!("{} ({expected})", config.selection.device_name),
                 found: known(machine, identity),
-                revisions: product.then_some((expected.revision, identity.revision)),
+                revisions: is_product.then_some((expected.revision, identity.revision)),
             }
             .with_device(device()));
         }
@@ -213,20 +288,20 @@ fn identification_timeout(machine: &Machine, found: Identity) -> Duration {
     }
 }
 
-/// Returns the devices whose positions are missing on the bus. A device missing in the middle of a
-/// tree shifts those behind it. If the found models match the file in order, the gaps are the
-/// missing devices. Otherwise the last ones are missing.
-fn missing_devices(machine: &Machine, found: &[ScannedDevice]) -> Vec<String> {
+/// True if the file has a device of this product at a position.
+fn belongs_elsewhere(machine: &Machine, identity: Identity) -> bool {
+    positions(machine).any(|(_, config)| product(config.selection.identity) == product(identity))
+}
+
+/// Returns the devices of the file that are missing on the bus, as `compare` does. A device missing
+/// in the middle shifts those behind it. If no product is known, the last ones are missing.
+fn missing_devices(machine: &Machine, there: &[Product]) -> Vec<String> {
     let expected: Vec<_> = positions(machine).collect();
-    let models = |identity: &Identity| (identity.vendor, identity.product);
-    let wanted = expected
-        .iter()
-        .map(|(_, config)| models(&config.selection.identity));
-    let there: Vec<_> = found
-        .iter()
-        .map(|present| models(&present.identity))
-        .collect();
-    let missing = lacking(&wanted.collect::<Vec<_>>(), &there);
+    let same = |wanted: usize, found: usize| is_product(expected.get(wanted), there.get(found));
+    let missing = match there.iter().all(Option::is_none) {
+        true => (there.len()..expected.len()).collect(),
+        false => align::missing(expected.len(), there.len(), same),
+    };
     let missing = missing.into_iter().filter_map(|index| expected.get(index));
     missing.copied().map(named).collect()
 }
@@ -247,21 +322,6 @@ fn positions(machine: &Machine) -> impl Iterator<Item = (u16, &DeviceConfig)> {
 
 fn named((position, config): (u16, &DeviceConfig)) -> String {
     format!("`{}` (position {position})", config.name)
-}
-
-/// Returns the indices of `wanted` that are missing in `there`.
-fn lacking<T: PartialEq>(wanted: &[T], there: &[T]) -> Vec<usize> {
-    let mut rest = there.iter().peekable();
-    let mut lacking = Vec::new();
-    for (index, one) in wanted.iter().enumerate() {
-        if rest.next_if_eq(&one).is_none() {
-            lacking.push(index);
-        }
-    }
-    match rest.next() {
-        None => lacking,
-        Some(_) => (there.len()..wanted.len()).collect(),
-    }
 }
 
 fn not_located(name: &str, locator: String) -> report::Error {
@@ -297,26 +357,4 @@ fn known(machine: &Machine, identity: Identity) -> String {
             || identity.to_string(),
             |(.., name)| format!("{name} ({identity})"),
         )
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn lacking_returns_the_missing_devices() {
-        for (there, expected) in [
-            ("caab", &[][..]),
-            ("cab", &[2]),
-            ("ca", &[2, 3]),
-            ("cb", &[1, 2]),
-            ("aab", &[0]),
-            ("", &[0, 1, 2, 3]),
-            // The bus has an unexpected device: the last ones count as missing.
-            ("cx", &[2, 3]),
-        ] {
-            let there = there.as_bytes();
-            assert_eq!(lacking(b"caab", there), expected, "{there:?}");
-        }
-    }
 }

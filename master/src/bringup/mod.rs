@@ -29,6 +29,7 @@ use crate::rt::image::{self, ImagePlan};
 use crate::rt::phase::ClockPlan;
 use crate::text::pluralize;
 
+pub mod align;
 pub(crate) mod clocks;
 mod device;
 pub mod drive_units;

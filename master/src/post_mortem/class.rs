@@ -44,7 +44,8 @@ impl Class {
             | Cause::Datagram(_)
             | Cause::NotTaken { .. }
             | Cause::Scan(_)
-            | Cause::Missing { .. } => Self::Bus,
+            | Cause::Missing { .. }
+            | Cause::Reversed { .. } => Self::Bus,
             Cause::StartUp { source, .. } | Cause::Sdo(source) => match source.cause {
                 CoeCause::Gone | CoeCause::Wire(_) => Self::Bus,
                 // A device that another MainDevice sets to Init loses its mailbox.

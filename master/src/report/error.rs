@@ -132,7 +132,8 @@ pub enum Cause {
     #[error("{0}")]
     Scan(String),
     #[error(
-        "scanning: {found} of {expected} {}; missing: {}",
+        "scanning: {found}{} {}; missing: {}",
+        if found < expected { format!(" of {expected}") } else { String::new() },
         if *found == 1 { "SubDevice answers" } else { "SubDevices answer" }, few(missing)
     )]
     Missing {
@@ -140,6 +141,14 @@ pub enum Cause {
         found: usize,
         /// Names with positions, in the order of the segment.
         missing: Vec<String>,
+    },
+    /// Frames do not enter a SubDevice at port 0.
+    #[error("scanning: IN and OUT are swapped at {}", reversed(candidates, *position))]
+    Reversed {
+        /// Its position on the bus, after the devices behind it.
+        position: u16,
+        /// Devices of the file that may be the one, with positions.
+        candidates: Vec<String>,
     },
     #[error("the SubDevice at position {position} ({identity}) is not in the machine file")]
     Unexpected { position: u16, identity: String },
@@ -505,6 +514,14 @@ impl fmt::Display for DriveReport {
 }
 
 /// Returns the first names of a list, and how many follow.
+fn reversed(candidates: &[String], position: u16) -> String {
+    match candidates {
+        [] => format!("the SubDevice that frames reach at position {position}"),
+        [device] => device.clone(),
+        several => format!("one of {}", several.join(", ")),
+    }
+}
+
 fn few(names: &[String]) -> String {
     const FEW: usize = 3;
     let first = names.iter().take(FEW).map(String::as_str);

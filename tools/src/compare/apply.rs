@@ -275,6 +275,7 @@ fn change(
         | Difference::Added { .. }
         | Difference::Swapped { .. }
         | Difference::Moved { .. }
+        | Difference::Reversed { .. }
         | Difference::Parameter { .. } => {}
     }
     Ok(())

@@ -11,9 +11,10 @@ use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use ecaxis_esi::{Mode, address};
 
 use crate::scan::{Device, Scan};
+use ecaxis_master::acyclic::topology;
+use ecaxis_master::bringup::align;
 use ecaxis_master::config::{DeviceConfig, Locator, Machine};
 
-mod align;
 pub mod apply;
 mod parameters;
 
@@ -37,6 +38,12 @@ pub enum Difference {
         device: DeviceIndex,
         from: u16,
         to: u16,
+    },
+    /// Frames do not enter the device at port 0, so it comes after the devices behind it. Several
+    /// devices of one model may be the one.
+    Reversed {
+        devices: Vec<DeviceIndex>,
+        position: u16,
     },
     /// A revision that the device's `identity` does not accept.
     Revision {
@@ -109,7 +116,10 @@ pub fn compare(machine: &Machine, scan: &Scan) -> Comparison {
         let position = device.position();
         comparison.differences.push(Difference::Added { position });
     }
-    order(machine, &mut comparison);
+    match reversed(machine, scan) {
+        Some(reversed) => comparison.differences.push(reversed),
+        None => order(machine, &mut comparison),
+    }
     for (index, config) in machine.devices.enumerate() {
         let place = comparison.places.get(index).copied().flatten();
         if let Some(device) = place.and_then(|at| scan.devices.get(usize::from(at))) {
@@ -269,6 +279,32 @@ fn order(machine: &Machine, comparison: &mut Comparison) {
     }
 }
 
+/// Finds the device whose IN and OUT are swapped; it is not also reported as moved.
+fn reversed(machine: &Machine, scan: &Scan) -> Option<Difference> {
+    let status = scan.devices.iter().map(|device| device.found.dl_status);
+    let at = topology::reversed(status)?;
+    let mut expected: Vec<(u16, DeviceIndex)> = machine
+        .devices
+        .enumerate()
+        .filter_map(|(index, config)| match config.at {
+            Locator::Position(position) => Some((position, index)),
+            _ => None,
+        })
+        .collect();
+    expected.sort_unstable();
+    let same = |e: usize, t: usize| {
+        let config = expected.get(e).and_then(|(_, i)| machine.devices.get(*i));
+        let pair = config.zip(scan.devices.get(t));
+        pair.is_some_and(|(config, device)| is_product(config, device))
+    };
+    let places = align::moved_from(expected.len(), scan.devices.len(), at, same);
+    let devices = places.iter().filter_map(|e| expected.get(*e));
+    Some(Difference::Reversed {
+        devices: devices.map(|(_, index)| *index).collect(),
+        position: u16::try_from(at).unwrap_or(u16::MAX),
+    })
+}
+
 /// Compares a device that was found.
 fn compare_device(
     index: DeviceIndex,
@@ -370,6 +406,7 @@ impl Difference {
             Self::Added { .. } => "added",
             Self::Swapped { .. } => "swapped",
             Self::Moved { .. } => "moved",
+            Self::Reversed { .. } => "reversed",
             Self::Revision { .. } => "revision",
             Self::Alias { .. } => "alias",
             Self::Serial { .. } => "serial",
@@ -386,6 +423,7 @@ impl Difference {
             Self::Added { position } => (vec![], vec![*position]),
             Self::Swapped { devices, positions } => (devices.to_vec(), positions.to_vec()),
             Self::Moved { device, to, .. } => (vec![*device], vec![*to]),
+            Self::Reversed { devices, position } => (devices.clone(), vec![*position]),
             Self::Revision {
                 device, position, ..
             }
@@ -482,6 +520,21 @@ impl fmt::Display for DifferenceDisplay<'_> {
                 "`{}` is at position {to}, in the file at position {from}",
                 self.name(*device)
             ),
+            Difference::Reversed { devices, position } => {
+                let names: Vec<String> = devices
+                    .iter()
+                    .map(|device| format!("`{}`", self.name(*device)))
+                    .collect();
+                let device = match names.as_slice() {
+                    [] => format!("the device at position {position}"),
+                    [name] => name.clone(),
+                    names => format!("one of {}", names.join(", ")),
+                };
+                write!(
+                    f,
+                    "{device}: IN and OUT are swapped, frames reach it at position {position}"
+                )
+            }
             Difference::Revision {
                 device,
                 position,

@@ -1,11 +1,12 @@
-//! Longest common subsequence of two lists.
+//! Assigns the devices on the bus to those of the machine file, for bring-up and `compare`.
 
 /// The maximum length of a list; longer lists are not aligned (a quarter of a million comparisons).
 const MOST: usize = 512;
 
 /// Returns the pairs (left, right) of the longest common subsequence. Among equal lengths, it
 /// prefers early pairs.
-pub(super) fn longest(
+#[must_use]
+pub fn longest(
     left: usize,
     right: usize,
     same: impl Fn(usize, usize) -> bool,
@@ -44,11 +45,94 @@ pub(super) fn longest(
     found
 }
 
+/// Returns the indices of `wanted` without a partner in `there`. `same` compares an index of either
+/// list. A device in another place is not missing.
+#[must_use]
+pub fn missing(
+    wanted: usize,
+    there: usize,
+    same: impl Fn(usize, usize) -> bool + Copy,
+) -> Vec<usize> {
+    let pairs = longest(wanted, there, same);
+    let mut free: Vec<usize> = (0..there).collect();
+    free.retain(|t| pairs.iter().all(|(_, paired)| paired != t));
+    let mut missing: Vec<usize> = (0..wanted).collect();
+    missing.retain(|w| pairs.iter().all(|(paired, _)| paired != w));
+    missing.retain(|w| match free.iter().position(|t| same(*w, *t)) {
+        Some(moved) => {
+            free.remove(moved);
+            false
+        }
+        None => true,
+    });
+    missing
+}
+
+/// Returns the indices of `wanted` from which a device may have moved to index `at` of `there`, so
+/// that all others keep their order.
+#[must_use]
+pub fn moved_from(
+    wanted: usize,
+    there: usize,
+    at: usize,
+    same: impl Fn(usize, usize) -> bool,
+) -> Vec<usize> {
+    if wanted != there {
+        return Vec::new();
+    }
+    let others: Vec<usize> = (0..there).filter(|t| *t != at).collect();
+    let fits = |moved: &usize| {
+        let mut rest = (0..wanted).filter(|w| w != moved).zip(&others);
+        same(*moved, at) && rest.all(|(w, t)| same(w, *t))
+    };
+    (0..wanted).filter(fits).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
 
     use super::*;
+
+    #[test]
+    fn missing_returns_devices_without_a_partner() {
+        for (there, expected) in [
+            ("caab", &[][..]),
+            ("cab", &[2]),
+            ("ca", &[2, 3]),
+            ("cb", &[1, 2]),
+            ("aab", &[0]),
+            ("", &[0, 1, 2, 3]),
+            // Another device among them.
+            ("cx", &[1, 2, 3]),
+            ("caxb", &[2]),
+            // In another place.
+            ("acab", &[]),
+            ("baac", &[]),
+            ("cba", &[2]),
+        ] {
+            let (wanted, there) = (b"caab", there.as_bytes());
+            let same = |w: usize, t: usize| wanted.get(w) == there.get(t);
+            assert_eq!(missing(4, there.len(), same), expected, "{there:?}");
+        }
+    }
+
+    #[test]
+    fn moved_from_returns_all_places_that_fit() {
+        for (wanted, there, at, expected) in [
+            ("abc", "acb", 2, &[1][..]),
+            ("abc", "bca", 2, &[0]),
+            ("abb", "abb", 2, &[1, 2]),
+            ("aaa", "aaa", 2, &[0, 1, 2]),
+            ("abc", "acx", 2, &[]),
+            ("abc", "ac", 1, &[]),
+        ] {
+            let (w, t) = (wanted.as_bytes(), there.as_bytes());
+            let same = |a: usize, b: usize| w.get(a) == t.get(b);
+            let found = moved_from(w.len(), t.len(), at, same);
+            assert_eq!(found, expected, "{wanted} {there}");
+        }
+    }
 
     fn aligned(left: &str, right: &str) -> Vec<(usize, usize)> {
         let (l, r) = (left.as_bytes(), right.as_bytes());
