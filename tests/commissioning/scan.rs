@@ -239,3 +239,16 @@ position = 3
     assert_eq!(ran.code, 0, "{}", ran.err);
     assert!(ran.out.contains("4 SubDevices"), "{}", ran.out);
 }
+
+/// A truncated ESI file does not hide the others, and is named.
+#[test]
+fn scan_names_esi_files_that_it_cannot_read() {
+    let bench = Bench::new();
+    bench.write("esi/broken.xml", "<EtherCATInfo><Vendor>");
+    bench.copy("demo.toml", "bench.toml");
+    let ran = bench.ecaxis(&["scan", "--sim", "bench.toml", "--esi", "esi"]);
+    assert_eq!(ran.code, 0, "{}", ran.err);
+    assert!(ran.err.contains("ESI file not read: "), "{}", ran.err);
+    assert!(ran.err.contains("broken.xml"), "{}", ran.err);
+    assert!(ran.out.contains("EPOS4"), "{}", ran.out);
+}

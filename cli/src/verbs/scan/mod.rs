@@ -125,13 +125,18 @@ impl ScanResult {
             Some(library) => esi_match::describe(&scan, library),
             None => (scan.devices.iter().map(|_| None).collect(), Vec::new()),
         };
+        let unusable = library.map(Library::unusable).unwrap_or_default();
+        let unusable = unusable
+            .iter()
+            .map(|(file, problem)| format!("{}: {problem}", file.display()));
+        let unreadable = unreadable.iter().map(ToString::to_string).chain(unusable);
         Self {
             nic: match nic {
                 Nic::Sim => "sim".to_owned(),
                 Nic::Interface(nic) => nic.clone(),
             },
             described,
-            unreadable: unreadable.iter().map(ToString::to_string).collect(),
+            unreadable: unreadable.collect(),
             scan,
         }
     }
@@ -144,8 +149,13 @@ impl ScanResult {
 
     /// Prints warnings on stderr.
     pub fn warn(&self, intrude: bool) {
-        for problem in &self.unreadable {
-            bus::warn(problem);
+        /// The maximum number of ESI files that are named.
+        const NAMED: usize = 5;
+        for problem in self.unreadable.iter().take(NAMED) {
+            bus::warn(format_args!("ESI file not read: {problem}"));
+        }
+        if let Some(more @ 1..) = self.unreadable.len().checked_sub(NAMED) {
+            bus::warn(format_args!("{more} more ESI files were not read"));
         }
         let others = &self.scan.others;
         if !others.is_empty() {
@@ -163,8 +173,13 @@ impl ScanResult {
         }
         for device in &self.scan.devices {
             let position = device.position();
-            if let Err(problem) = &device.sii {
-                bus::warn(problem);
+            match &device.sii {
+                Err(problem) => bus::warn(problem),
+                Ok(sii) => {
+                    for damage in sii.damage.iter().take(1) {
+                        bus::warn(format_args!("position {position}: its EEPROM: {damage}"));
+                    }
+                }
             }
             if let Some(Err(problem)) = &device.answers {
                 bus::warn(problem);

@@ -1,5 +1,7 @@
 //! The axis section of a drive, from its answers.
 
+use std::ops::RangeInclusive;
+
 use ecaxis_axis::scale::{AccelerationUnit, Scale, VelocityUnit};
 use ecaxis_axis::units::{RawAcceleration, RawVelocity};
 use ecaxis_esi as esi;
@@ -13,6 +15,16 @@ const USUAL_ENCODER: f64 = 2000.0;
 /// Turns per second, and per second squared.
 const USUAL_VELOCITY: f64 = 1.0;
 const USUAL_ACCELERATION: f64 = 10.0;
+/// Values beyond these are no limits of a real drive: 120,000 rpm, and a thousandth of a turn per
+/// second.
+const VELOCITIES: RangeInclusive<f64> = 1e-3..=2000.0;
+const ACCELERATIONS: RangeInclusive<f64> = 1e-2..=1e7;
+/// The longest time in s to stop from the velocity limit.
+const LONGEST_STOP_S: f64 = 600.0;
+/// A range in turns that holds the first move, a tenth of a turn there and back.
+const SHORTEST_RANGE: f64 = 0.5;
+/// The part of the drive's 32 bits that a limit may use. Over-velocities must be distinguishable.
+const USABLE: f64 = 0.6;
 /// The maximum number of counts that a drive can distinguish.
 const MOST_COUNTS: f64 = 2_147_483_648.0;
 /// Percent of the rated torque, which every motor tolerates.
@@ -67,21 +79,47 @@ pub(super) fn section(device: &Device, described: &EsiMatch) -> String {
             "{MARK} the drive inverts by itself, 0x607E is 0x{polarity:02x}"
         ));
     }
-    if let Some(code) = drive.units.velocity_unit
-        && VelocityUnit::from_si_code(code).is_none()
-    {
+    let by_esi = default(described, 0x60a9);
+    let mut units = vec![VelocityUnit::default()];
+    units.extend(
+        [drive.units.velocity_unit, by_esi]
+            .into_iter()
+            .flatten()
+            .filter_map(VelocityUnit::from_si_code),
+    );
+    let unknown = |code: &u32| VelocityUnit::from_si_code(*code).is_none();
+    if let Some(code) = drive.units.velocity_unit.filter(unknown) {
         let comment =
             format!("{MARK} the drive's unit of velocity, 0x60A9, is 0x{code:08x}: not understood");
         lines.add("velocity_unit", "\"counts/s\"", &comment);
+        units.push(VelocityUnit::COUNTS_PER_SECOND);
+    } else if let Some(code) = by_esi.filter(unknown) {
+        let own = drive.units.velocity_unit.and_then(unit_name);
+        let (unit, name) = own.unwrap_or((VelocityUnit::COUNTS_PER_SECOND, "counts/s"));
+        let comment = format!("{MARK} 0x60A9 of the ESI is 0x{code:08x}: not understood");
+        lines.add("velocity_unit", &format!("\"{name}\""), &comment);
+        units.push(unit);
     }
     if let Ok(scale) = Scale::new(encoder, 1.0) {
-        limits(device, drive, scale_of(drive, scale, described), &mut lines);
+        let of_unit = |unit: &VelocityUnit| {
+            let scale = scale.with_velocity_unit(*unit);
+            scale.velocity_to_user(RawVelocity(i32::MAX)).0.abs()
+        };
+        let most = units.iter().map(of_unit).fold(f64::MAX, f64::min) * USABLE;
+        limits(
+            device,
+            drive,
+            scale_of(drive, scale, described),
+            most,
+            &mut lines,
+        );
     }
     lines.text()
 }
 
 fn encoder(device: &Device, drive: &DriveInfo, lines: &mut TomlWriter) -> f64 {
-    let sensor = drive.sensor_resolution.filter(|counts| *counts > 0);
+    let sensor = drive.sensor_resolution.map(f64::from);
+    let sensor = sensor.filter(|counts| (1.0..=MOST_COUNTS).contains(counts));
     let said = drive.units.counts_per_turn();
     let said = said.filter(|(_, counts)| (1.0..=MOST_COUNTS).contains(counts));
     let (counts, comment) = match (said, sensor) {
@@ -89,10 +127,7 @@ fn encoder(device: &Device, drive: &DriveInfo, lines: &mut TomlWriter) -> f64 {
             let comment = format!("counts a motor turn, by 0x{index:04X}");
             (counts, comment)
         }
-        (None, Some(counts)) => (
-            f64::from(counts),
-            "counts a motor turn, by 0x3000:05".to_owned(),
-        ),
+        (None, Some(counts)) => (counts, "counts a motor turn, by 0x3000:05".to_owned()),
         (None, None) => (
             USUAL_ENCODER,
             format!(
@@ -105,13 +140,28 @@ fn encoder(device: &Device, drive: &DriveInfo, lines: &mut TomlWriter) -> f64 {
     counts
 }
 
+/// Returns a unit that the machine file can name.
+fn unit_name(code: u32) -> Option<(VelocityUnit, &'static str)> {
+    let named = [
+        (VelocityUnit::RPM, "rpm"),
+        (VelocityUnit::MILLI_RPM, "mrpm"),
+        (VelocityUnit::COUNTS_PER_SECOND, "counts/s"),
+        (VelocityUnit::TURNS_PER_SECOND, "turns/s"),
+    ];
+    let unit = VelocityUnit::from_si_code(code)?;
+    named.into_iter().find(|(known, _)| *known == unit)
+}
+
+/// Returns the default of a 32-bit object in the ESI.
+fn default(described: &EsiMatch, index: u16) -> Option<u32> {
+    let item = described.device.dictionary.item(index, 0)?;
+    let bytes = <[u8; 4]>::try_from(item.default.as_slice()).ok()?;
+    item.has_default.then(|| u32::from_le_bytes(bytes))
+}
+
 /// Returns the drive's scale of velocities and accelerations.
 fn scale_of(drive: &DriveInfo, scale: Scale, described: &EsiMatch) -> Scale {
-    let default = |index: u16| {
-        let item = described.device.dictionary.item(index, 0)?;
-        let bytes = <[u8; 4]>::try_from(item.default.as_slice()).ok()?;
-        item.has_default.then(|| u32::from_le_bytes(bytes))
-    };
+    let default = |index: u16| default(described, index);
     let velocity = drive.units.velocity_unit.or_else(|| default(0x60a9));
     let velocity = velocity.and_then(VelocityUnit::from_si_code);
     let velocity = velocity.unwrap_or_default();
@@ -122,14 +172,24 @@ fn scale_of(drive: &DriveInfo, scale: Scale, described: &EsiMatch) -> Scale {
         .with_acceleration_unit(acceleration.unwrap_or(velocity.into()))
 }
 
-fn limits(device: &Device, drive: &DriveInfo, scale: Scale, lines: &mut TomlWriter) {
-    if let Some([low, high]) = range(drive) {
-        let [low, high] = [low, high].map(|n| number(scale.units_of_counts(f64::from(n))));
-        let comment = format!("{MARK} the drive's own, 0x607D");
-        lines.add("limits.position", &format!("[{low}, {high}]"), &comment);
-    } else {
-        let why = unsaid(device, "the drive knows no ends");
-        lines.comment(&format!("limits.position = [-10.0, 10.0]  {MARK} {why}"));
+/// Adds the limits. `most`: the highest velocity in turns/s that every unit can express.
+fn limits(device: &Device, drive: &DriveInfo, scale: Scale, most: f64, lines: &mut TomlWriter) {
+    let turns = |n: i32| scale.units_of_counts(f64::from(n));
+    match range(drive) {
+        Some([low, high]) if turns(high) - turns(low) >= SHORTEST_RANGE => {
+            let [low, high] = [low, high].map(|n| number(turns(n)));
+            let comment = format!("{MARK} the drive's own, 0x607D");
+            lines.add("limits.position", &format!("[{low}, {high}]"), &comment);
+        }
+        Some([low, high]) => {
+            let [low, high] = [low, high].map(|n| number(turns(n)));
+            let comment = format!("{MARK} 0x607D, less than half a turn");
+            lines.comment(&format!("limits.position = [{low}, {high}]  {comment}"));
+        }
+        None => {
+            let why = unsaid(device, "the drive knows no ends");
+            lines.comment(&format!("limits.position = [-10.0, 10.0]  {MARK} {why}"));
+        }
     }
 
     // The smaller of two equivalent limits.
@@ -140,16 +200,21 @@ fn limits(device: &Device, drive: &DriveInfo, scale: Scale, lines: &mut TomlWrit
     let motor = motor.map(|rpm| (f64::from(rpm) / 60.0, "0x6080"));
     let both = [profile, motor].into_iter().flatten();
     let slowest = both.min_by(|a, b| a.0.total_cmp(&b.0));
-    // A value beyond the range of the object is not a limit.
-    let most = scale.velocity_to_user(RawVelocity(i32::MAX)).0;
-    let velocity = slowest.filter(|(velocity, _)| *velocity <= most);
+    // A value beyond the range of the object, or of real motors, is not a limit.
+    let velocity = slowest.filter(|(n, _)| *n <= most && VELOCITIES.contains(n));
+    let absurd = |value: Option<(f64, &'static str)>| match value {
+        Some((_, object)) => format!("{object} is no limit of a real drive"),
+        None => unsaid(device, NOT_REPORTED).to_owned(),
+    };
+    let usual = USUAL_VELOCITY.min(most);
     said_or(
         "limits.velocity",
         velocity,
-        USUAL_VELOCITY.min(most),
-        ("turns/s", unsaid(device, NOT_REPORTED)),
+        usual,
+        ("turns/s", &absurd(slowest)),
         lines,
     );
+    let velocity = velocity.map_or(usual, |(velocity, _)| velocity);
 
     let raws = [
         (drive.max_acceleration, "0x60C5"),
@@ -159,12 +224,14 @@ fn limits(device: &Device, drive: &DriveInfo, scale: Scale, lines: &mut TomlWrit
         let raw = raw.filter(|n| *n > 0 && *n < u32::MAX)?;
         Some((scale.acceleration_to_user(RawAcceleration(raw)).0, object))
     });
-    let acceleration = each.min_by(|a, b| a.0.total_cmp(&b.0));
+    let lowest = each.min_by(|a, b| a.0.total_cmp(&b.0));
+    let acceleration =
+        lowest.filter(|(n, _)| ACCELERATIONS.contains(n) && velocity / n <= LONGEST_STOP_S);
     said_or(
         "limits.acceleration",
         acceleration,
         USUAL_ACCELERATION,
-        ("turns/s²", unsaid(device, NOT_REPORTED)),
+        ("turns/s²", &absurd(lowest)),
         lines,
     );
 
@@ -197,8 +264,9 @@ fn limits(device: &Device, drive: &DriveInfo, scale: Scale, lines: &mut TomlWrit
 fn range(drive: &DriveInfo) -> Option<[i32; 2]> {
     let [low, high] = drive.software_limits?;
     let wide = i64::from(high) - i64::from(low);
-    (low < high && low > i32::MIN && high < i32::MAX && wide < i64::from(i32::MAX))
-        .then_some([low, high])
+    // The ends are rounded in the file.
+    let most = i64::from(i32::MAX) / 10 * 9;
+    (low < high && low > i32::MIN && high < i32::MAX && wide < most).then_some([low, high])
 }
 
 /// Formats a value. `words`: the unit, and the reason for a guess.

@@ -15,6 +15,8 @@ use ecaxis_master::esi_library::RevisionMatch;
 
 mod axis;
 mod lines;
+#[cfg(test)]
+mod tests;
 
 use lines::TomlWriter;
 
