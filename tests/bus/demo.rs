@@ -293,3 +293,12 @@ fn bus_positions_may_differ_from_the_file_order() {
             .all(|a| a.final_error_counts.is_some_and(|e| e.abs() <= 1))
     );
 }
+
+/// ETG.1020, "Explicit Device ID": AL control bit 5 requests the identification, the AL status code
+/// contains it.
+#[test]
+fn a_device_is_found_by_its_explicit_identification() {
+    let text = axes(3).replace("position = 1", "id = 77");
+    let summary = run_well(machine(&text), virtual_time());
+    assert_eq!(summary.axes.len(), 3);
+}

@@ -2,6 +2,7 @@
 
 mod bench;
 mod complaints;
+mod conformance;
 mod doctor;
 mod esi;
 mod messages;
