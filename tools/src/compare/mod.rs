@@ -17,6 +17,8 @@ use ecaxis_master::config::{DeviceConfig, Locator, Machine};
 
 pub mod apply;
 mod parameters;
+#[cfg(test)]
+mod tests;
 
 pub use parameters::parameters;
 

@@ -32,7 +32,7 @@ pub mod esi_match;
 pub mod other_main_device;
 pub mod registers;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 pub mod write;
 
 pub use coe_info::{CoeInfo, DriveInfo};

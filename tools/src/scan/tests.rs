@@ -27,7 +27,7 @@ use ecaxis_master::session::{self, Prepared, RunBuilder, simulated_bus};
 const STACK: usize = 16 * 1024 * 1024;
 
 /// Runs `work` on the bus of a machine file.
-pub(super) fn on<T: Send + 'static>(
+pub(crate) fn on<T: Send + 'static>(
     file: &'static str,
     work: impl AsyncFnOnce(DatagramClient) -> T + Send + 'static,
 ) -> (T, SimLink) {
@@ -45,7 +45,7 @@ pub(super) fn on<T: Send + 'static>(
     done.expect("a thread").join().expect("no panic")
 }
 
-pub(super) async fn scanned(wire: &DatagramClient, options: Options) -> Scan {
+pub(crate) async fn scanned(wire: &DatagramClient, options: Options) -> Scan {
     scan(wire, options, &mut |_| {}).await.expect("a scan")
 }
 
