@@ -215,7 +215,8 @@ fn range(
         return None;
     };
     let names = devices.iter().map(|d| d.name);
-    let found = signal::place(&word[..split], names).and_then(|index: DeviceIndex| {
+    let found = signal::place(&word[..split], names).and_then(|index| {
+        let index = DeviceIndex(index);
         // An invalid device has already been reported.
         let Some(device) = devices[index].device else {
             return Ok(None);
