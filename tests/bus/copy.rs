@@ -12,7 +12,7 @@ use ecaxis_test_support::{Heard, faults, run_well, virtual_time};
 
 /// An I/O device with two input words and two output words, in two PDOs each.
 pub(crate) const WORDS: &str = r##"<?xml version="1.0" encoding="UTF-8"?>
-<EtherCATInfo><Vendor><Id>#x00000E0B</Id><Name>ecaxis demonstration devices, second maker</Name></Vendor>
+<EtherCATInfo><Vendor><Id>#x00000E0B</Id><Name>ecaxis demonstration devices, second vendor</Name></Vendor>
 <Descriptions><Groups><Group><Type>IO</Type><Name>I/O blocks</Name></Group></Groups><Devices>
 <Device Physics="YY"><Type ProductCode="#x57440002" RevisionNo="#x00010000">WD2</Type>
 <Name>2 words in, 2 words out</Name><GroupType>IO</GroupType>
