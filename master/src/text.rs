@@ -25,3 +25,12 @@ pub fn positive_zero(x: f64, decimals: i32) -> f64 {
         x
     }
 }
+
+/// Returns the message of a panic.
+pub(crate) fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
+    panic
+        .downcast_ref::<String>()
+        .cloned()
+        .or_else(|| panic.downcast_ref::<&str>().map(|text| (*text).to_owned()))
+        .unwrap_or_else(|| "unknown cause".to_owned())
+}

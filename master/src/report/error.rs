@@ -513,7 +513,6 @@ impl fmt::Display for DriveReport {
     }
 }
 
-/// Returns the first names of a list, and how many follow.
 fn reversed(candidates: &[String], position: u16) -> String {
     match candidates {
         [] => format!("the SubDevice that frames reach at position {position}"),
@@ -522,6 +521,7 @@ fn reversed(candidates: &[String], position: u16) -> String {
     }
 }
 
+/// Returns the first names of a list, and how many follow.
 fn few(names: &[String]) -> String {
     const FEW: usize = 3;
     let first = names.iter().take(FEW).map(String::as_str);
@@ -589,13 +589,4 @@ fn by(method: i8) -> String {
         Some(known) => format!("method {method} ({})", known.text),
         None => format!("method {method}"),
     }
-}
-
-/// Returns the message of a panic.
-pub(crate) fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
-    panic
-        .downcast_ref::<String>()
-        .cloned()
-        .or_else(|| panic.downcast_ref::<&str>().map(|text| (*text).to_owned()))
-        .unwrap_or_else(|| "unknown cause".to_owned())
 }

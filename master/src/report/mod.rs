@@ -15,7 +15,6 @@ pub(crate) mod summary;
 
 pub use diagnosis_message::{DiagnosisKind, DiagnosisMessage};
 pub use emergencies::{EmergencyLine, EmergencyLog, EmergencyReport};
-pub(crate) use error::panic_text;
 pub use error::{Cause, DriveReport, Error, FailedStep, Place};
 pub use events::EventLine;
 pub use progress::{AxisLine, Observer, ProbeCapture, Progress, Status, StepRef};

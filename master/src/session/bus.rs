@@ -11,7 +11,8 @@ use crate::clock::Clock;
 use crate::link::Link;
 use crate::link::pdu_loop::{drive_pdu_loop, main_device};
 use crate::mailbox::MailboxTransport;
-use crate::report::{Cause, Error, panic_text};
+use crate::report::{Cause, Error};
+use crate::text::panic_text;
 
 /// Runs `work` on a dedicated link and thread until it completes or is cancelled
 /// ([`crate::cancel::CancelToken`]). Blocks.

@@ -31,13 +31,14 @@ mod open;
 mod prepare;
 mod signals;
 
+use crate::report::events;
 use crate::report::summary::{self, SummaryInputs};
 pub use crate::report::{
     AxisLine, AxisSummary, Cause, DeviceErrors, DiagnosisKind, DiagnosisMessage, DriveReport,
     EmergencyLine, EmergencyLog, EmergencyReport, Error, EventLine, GroupStop, Observer,
     ProbeCapture, Progress, Status, StepRef, Summary, ThreadSummary,
 };
-use crate::report::{events, panic_text};
+use crate::text::panic_text;
 pub use bus::{run_on_link, with_bus};
 use cycle_thread::CycleRun;
 use fault_evidence::{BringUpEvidence, RunEvidence};
