@@ -156,11 +156,17 @@ def emitted(bench, d, machine, images, folder):
         which = ["--device", esi.type, "--product", str(esi.product), "--revision", str(esi.revision)]
         serial = str(int.from_bytes(image[0x1C:0x20], "little"))
         output = folder / f"{n}.emitted"
+        output.unlink(missing_ok=True)
         command = [bench.program, "esi", "sii", path, *which, "--serial", serial, "-o", output]
         done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
         d.compare("`ecaxis esi sii`", device, (done.returncode, done.returncode and done.stderr[-300:]), (0, 0))
         if done.returncode == 0:
-            d.compare("same bytes", device, output.read_bytes() == image, True)
+            # A simulated chip is as large as the next power of two; word 0x3E says so.
+            own, size = output.read_bytes(), slice(0x7C, 0x7E)
+            whole = bytearray(own.ljust(len(image), b"\xff"))
+            whole[size] = image[size]
+            larger = len(own) <= len(image) and len(image) & (len(image) - 1) == 0
+            d.compare("same bytes", device, own == image or (larger and bytes(whole) == image), True)
 
 
 def by_soem(d, machine, found, images):
@@ -285,7 +291,8 @@ def by_pysoem(bench, d, machine):
         master.config_dc()
         for device, slave in zip(machine.devices, master.slaves):
             _, esi = device
-            if esi.in_dictionary:
+            # What the modules of a device map is not in its own elements.
+            if esi.in_dictionary or esi.of_modules:
                 continue
             bits = [sum(p.bits for p in pdos if p.sm is not None) for pdos in (esi.rx, esi.tx)]
             sizes = tuple(-(-n // 8) for n in bits)
