@@ -37,7 +37,7 @@ pub use drive::{PlantParams, Track};
 pub use esc::al::AlState;
 pub use esc::chip::{self, EscInfo};
 pub use esc::ports::Medium;
-pub use faults::{FaultReport, FaultScript, ScriptError};
+pub use faults::{FaultProgress, FaultScript, ScriptError};
 pub use firmware::{FirmwareHeader, FirmwareOptions};
 pub use foe::{FileStore, FoeOptions};
 pub use network::topology::{PortRequest, SecondPort, Topology, TopologyError, Uplink};

@@ -8,7 +8,7 @@ use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::session::{self, Outcome, simulated_bus};
 use ecaxis_sim::Segment;
 use ecaxis_test_support::bench::Bench;
-use ecaxis_test_support::recordings::{Datagram, FPWR, LRW, datagrams};
+use ecaxis_test_support::recordings::{BWR, Datagram, FPWR, LRW, datagrams};
 use ecaxis_test_support::{Heard, faults, recorded, run, run_well, virtual_time};
 
 const MS: u64 = 1_000_000;
@@ -99,11 +99,13 @@ fn way_back_to_safe_op_has_its_own_time_out() {
     );
 }
 
-/// Returns what was written to a station: the register, and the byte at `byte` of its data.
+/// Returns what was written to a station, and the request of Op to all: the register, and the byte
+/// at `byte` of its data.
 fn written(datagrams: &[Datagram], station: u16, registers: &[(u16, usize)]) -> Vec<(u16, u8)> {
+    let op_of_all = |d: &Datagram| d.command == BWR && d.register() == 0x0120 && d.data == [8, 0];
     let sent = datagrams
         .iter()
-        .filter(|d| d.sent && d.command == FPWR && d.station() == station);
+        .filter(|d| d.sent && (d.command == FPWR && d.station() == station || op_of_all(d)));
     let found = sent.filter_map(|datagram| {
         let (register, byte) = registers.iter().find(|(r, _)| *r == datagram.register())?;
         Some((*register, *datagram.data.get(*byte)?))

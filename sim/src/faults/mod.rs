@@ -96,7 +96,7 @@ struct ActiveFault {
 /// The progress of a fault of the script.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
-pub struct FaultReport {
+pub struct FaultProgress {
     /// The line in the script.
     pub line: u32,
     /// The kind as written in the script.
@@ -218,8 +218,8 @@ impl Faults {
         self.concerns_frames = concerns_frames;
     }
 
-    pub(crate) fn reports(&self) -> impl Iterator<Item = FaultReport> + '_ {
-        self.running.iter().map(|running| FaultReport {
+    pub(crate) fn reports(&self) -> impl Iterator<Item = FaultProgress> + '_ {
+        self.running.iter().map(|running| FaultProgress {
             line: running.fault.line,
             name: running.fault.name,
             began: running.phase != Phase::Pending,

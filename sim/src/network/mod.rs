@@ -38,7 +38,7 @@ use crate::device::{Rest, SimDevice};
 use crate::esc::al::AlState;
 use crate::esc::ports::Medium;
 use crate::esc::registers as reg;
-use crate::faults::{FaultReport, FaultScript, Faults};
+use crate::faults::{FaultProgress, FaultScript, Faults};
 use crate::frame::{self, Datagram, FrameBuilder};
 use route::{Destination, Route};
 use topology::Topology;
@@ -165,7 +165,7 @@ impl Segment {
     }
 
     /// Returns the progress of every fault of the script.
-    pub fn fault_reports(&self) -> impl Iterator<Item = FaultReport> + '_ {
+    pub fn fault_progress(&self) -> impl Iterator<Item = FaultProgress> + '_ {
         self.faults.reports()
     }
 

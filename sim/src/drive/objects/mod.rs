@@ -27,6 +27,8 @@ mod velocity;
 
 use std::ops::RangeInclusive;
 
+use ecaxis_esi::model::Writable;
+
 use super::control::Tuning;
 use super::plant::PlantParams;
 use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
@@ -41,6 +43,21 @@ pub(super) use homing::HomingParameters;
 pub(super) use parameters::Parameters;
 pub(super) use probe::ProbeSlots;
 pub(super) use torque::CurrentLimits;
+
+/// Returns the mode at power-on. A dictionary with a Controlword and without a writable 0x6060 is
+/// that of a drive with one mode, which its target shows.
+fn power_on_mode(store: &ObjectStore) -> i64 {
+    const PROFILE_POSITION: i64 = 1;
+    let has = |index| store.has_object(index);
+    let mode = store.slot(0x6060, 0).and_then(|slot| store.item(slot));
+    let is_writable = mode.is_some_and(|item| item.access.write != Writable::Never);
+    if is_writable || !has(0x6040) {
+        return PROFILE_POSITION;
+    }
+    let targets = [(0x607a, 8), (0x60ff, 9), (0x6071, 10)];
+    let target = targets.into_iter().find(|(index, _)| has(*index));
+    target.map_or(PROFILE_POSITION, |(_, mode)| mode)
+}
 
 /// PP, PV, HM, CSP, CSV, CST.
 const SUPPORTED_MODES: i64 = 1 | 1 << 2 | 1 << 5 | 1 << 7 | 1 << 8 | 1 << 9;
@@ -129,6 +146,7 @@ impl Objects {
         b.with_default(0x6502, 0, "Supported drive modes", 32, SUPPORTED_MODES);
         b.with_default(0x60a8, 0, "SI unit position", 32, COUNTS);
         let parameters = ParameterSlots::bind(&mut b, plant);
+        let power_on_mode = power_on_mode(b.0);
         Self {
             is_maxon: b.is_maxon(),
             error_register: b.bind(0x1001, 0, "Error register", 8, RO),
@@ -136,7 +154,7 @@ impl Objects {
             history,
             controlword: b.bind(0x6040, 0, "Controlword", 16, RW),
             statusword: b.bind(0x6041, 0, "Statusword", 16, RO),
-            mode: b.with_default(0x6060, 0, "Modes of operation", 8, 1),
+            mode: b.with_default(0x6060, 0, "Modes of operation", 8, power_on_mode),
             mode_display: b.bind(0x6061, 0, "Modes of operation display", 8, RO),
             position_demand: b.bind(0x6062, 0, "Position demand value", 32, RO),
             position: b.bind(0x6064, 0, "Position actual value", 32, RO),

@@ -109,7 +109,14 @@ impl ParameterSlots {
         Self {
             options: OptionSlots::bind(b),
             velocity: VelocitySlots::find(b),
-            following_window: b.with_default(0x6065, 0, "Following error window", 32, 2000),
+            // maxon's factory value; 0xFFFFFFFF is off (CiA 402-2), as in the ESI of other vendors.
+            following_window: b.with_default(
+                0x6065,
+                0,
+                "Following error window",
+                32,
+                if b.is_maxon() { 2000 } else { 0xffff_ffff },
+            ),
             following_timeout: b.bind(0x6066, 0, "Following error time out", 16, RW),
             position_window: b.with_default(0x6067, 0, "Position window", 32, 0xffff_ffff),
             position_window_time: b.bind(0x6068, 0, "Position window time", 16, RW),

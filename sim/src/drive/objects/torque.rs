@@ -68,19 +68,27 @@ impl TorqueSlots {
         if let Some(rated_current) = b.0.slot(0x6075, 0) {
             b.motor_data(rated_current, whole(plant.nominal_current * 1e3));
         }
-        let limit = |index| {
-            b.0.slot(index, 0).map(|slot| Limit {
+        // Without a factory value in the ESI: the torque at the current limit, in thousandths of
+        // the rated torque. Zero would leave a drive without torque as soon as it is mapped.
+        let peak = whole(1000.0 * plant.current_limit / plant.nominal_current.max(1e-9));
+        let mut limit = |index| {
+            let slot = b.0.slot(index, 0)?;
+            b.fill(slot, peak);
+            Some(Limit {
                 slot,
                 mapped: false,
             })
         };
+        let max_torque = limit(0x6072);
+        let max_current = limit(0x6073);
+        let directions = [0x60e0, 0x60e1].map(limit);
         Self {
             rated_torque,
             counts_per_newton_metre,
             output_current_limit: b.own(0x3001, 2, "Output current limit"),
-            max_torque: limit(0x6072),
-            max_current: limit(0x6073),
-            directions: [0x60e0, 0x60e1].map(limit),
+            max_torque,
+            max_current,
+            directions,
         }
     }
 

@@ -110,6 +110,20 @@ fn drives_of_other_vendors_move() {
     }
 }
 
+/// An ESI without factory values: the limits are those of the power stage, three times the rated
+/// torque of the simulated motor.
+#[test]
+fn torque_limits_without_a_factory_value_are_the_peak() {
+    let Some(file) = esi("elmo/Elmo_ECAT_00010420_V11.xml") else {
+        return;
+    };
+    let described = |device: &&ecaxis_esi::Device| device.dictionary.object(0x6072).is_some();
+    let device = file.devices.iter().find(described).unwrap();
+    let rig = rig_of(&[&device.dictionary]);
+    let value = |index| rig.store.get(rig.slot(index, 0));
+    assert_eq!((value(0x6072), value(0x6073)), (3000, 3000));
+}
+
 /// The factory limits (0x607D, 7,129,736 to 9,713,015) exclude the position 0 of the axis.
 #[test]
 fn factory_limits_that_exclude_the_position_are_widened() {
