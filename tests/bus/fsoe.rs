@@ -1,20 +1,28 @@
 //! Two endpoints of Safety over EtherCAT (FSoE, ETG.5100) that `[[copy]]` connects. The endpoints
 //! follow the public description of the protocol with two bytes of safe data. They are test code
-//! without any claim of safety.
+//! without any claim of safety. The other FSoE master is the package `fsoe-master` of PyPI
+//! (`requirements.txt`); `ECAXIS_FSOE_PYTHON` names a Python that has it.
 
+use std::io::{Read, Write};
+use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex};
 
 use ecaxis_master::cancel::CancelToken;
+use ecaxis_master::config::Machine;
 use ecaxis_master::session::{Options, Outcome, run_on};
 use ecaxis_sim::Segment;
 use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::wire::{WatchedBus, Watcher};
-use ecaxis_test_support::{Heard, faults, virtual_time};
+use ecaxis_test_support::{Heard, faults, root, skip, virtual_time};
 
 /// The FSoE watchdog in bus cycles of 1 ms.
 const WATCHDOG: u32 = 100;
 const CONNECTION: u16 = 0x0207;
 const ADDRESS: u16 = 0x0031;
+/// The command of PDUs with fail-safe values in the state Data.
+const FAIL_SAFE: u8 = 0x08;
+/// The length of a PDU with two bytes of safe data.
+const PDU_LEN: usize = 7;
 
 /// The states of a connection, with their commands.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -109,6 +117,9 @@ struct Endpoint {
     step: usize,
     sent: Pdu,
     received: Pdu,
+    /// The CRC of the last PDU of each end in this session.
+    sent_crc: u16,
+    received_crc: u16,
     own: Sequence,
     others: Sequence,
     silent: u32,
@@ -129,16 +140,27 @@ const PHASES: [(State, &[u16]); 4] = [
 impl Endpoint {
     fn fail(&mut self, why: &'static str) {
         self.errors.push(why);
-        (self.state, self.step) = (State::Reset, 0);
+        self.enter(State::Reset);
+    }
+
+    /// Enters a state. Sequence numbers and CRCs begin again with each session.
+    fn enter(&mut self, state: State) {
+        (self.state, self.step) = (state, 0);
+        if state == State::Session {
+            (self.own, self.others) = Default::default();
+            (self.sent_crc, self.received_crc) = (0, 0);
+        }
     }
 
     fn send(&mut self, data: u16) {
         let connection = self.state.connection();
         let command = self.state as u8;
+        let crc = self.own.next(self.received_crc, command, data, connection);
+        self.sent_crc = crc;
         self.sent = Pdu {
             command,
             data,
-            crc: self.own.next(self.received.crc, command, data, connection),
+            crc,
             connection,
         };
     }
@@ -158,17 +180,21 @@ impl Endpoint {
             }
             return;
         }
+        let command = match pdu.command {
+            FAIL_SAFE => State::Data as u8,
+            command => command,
+        };
         // The slave follows the state of the master.
-        if !self.leads && pdu.command != self.state as u8 {
+        if !self.leads && command != self.state as u8 {
             let next = PHASES.iter().map(|phase| phase.0).chain([State::Data]);
             let next = next.skip_while(|state| *state != self.state).nth(1);
             match next {
-                Some(next) if next as u8 == pdu.command => (self.state, self.step) = (next, 0),
+                Some(next) if next as u8 == command => self.enter(next),
                 _ => return self.fail("command"),
             }
         }
         let connection = self.state.connection();
-        if pdu.command != self.state as u8 {
+        if command != self.state as u8 {
             return self.fail("command");
         }
         if pdu.connection != connection {
@@ -176,11 +202,12 @@ impl Endpoint {
         }
         let crc = self
             .others
-            .next(self.sent.crc, pdu.command, pdu.data, connection);
+            .next(self.sent_crc, pdu.command, pdu.data, connection);
         if crc != pdu.crc {
             return self.fail("CRC");
         }
         self.received = pdu;
+        self.received_crc = crc;
         self.silent = 0;
         if self.leads {
             self.answered(pdu.data)
@@ -225,11 +252,103 @@ impl Endpoint {
         }
         self.step += 1;
         if self.step == values.len() {
-            self.step = 0;
-            self.state = PHASES.get(phase + 1).map_or(State::Data, |next| next.0);
+            self.enter(PHASES.get(phase + 1).map_or(State::Data, |next| next.0));
         }
         let phase = PHASES.iter().find(|phase| phase.0 == self.state);
         self.send(phase.map_or(0, |(_, values)| values[self.step]));
+    }
+}
+
+/// The process of `fsoe.py`.
+struct OtherMaster {
+    process: Child,
+    request: [u8; PDU_LEN],
+    errors: u16,
+    /// Checked answers in the state Data.
+    checked: u32,
+    in_data: bool,
+}
+
+impl OtherMaster {
+    /// Starts the master, or skips the test.
+    fn start() -> Option<Self> {
+        let Some(python) = std::env::var_os("ECAXIS_FSOE_PYTHON") else {
+            skip("ECAXIS_FSOE_PYTHON names no Python with fsoe-master");
+            return None;
+        };
+        let process = Command::new(python)
+            .arg(root().join("tests/bus/fsoe.py"))
+            .args([CONNECTION, ADDRESS, WATCHDOG as u16].map(|n| n.to_string()))
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("Python starts");
+        Some(Self {
+            process,
+            request: [0; PDU_LEN],
+            errors: 0,
+            checked: 0,
+            in_data: false,
+        })
+    }
+
+    /// Runs once per bus cycle with the PDU in the outputs of the device.
+    fn cycle(&mut self, pdu: &[u8]) {
+        let input = self.process.stdin.as_mut().expect("a pipe");
+        input.write_all(pdu).expect("it runs");
+        let mut answer = [0; PDU_LEN + 7];
+        let output = self.process.stdout.as_mut().expect("a pipe");
+        output.read_exact(&mut answer).expect("it answers");
+        let (request, rest) = answer.split_at(PDU_LEN);
+        self.request.copy_from_slice(request);
+        self.errors = u16::from_le_bytes([rest[0], rest[1]]);
+        self.checked = u32::from_le_bytes([rest[2], rest[3], rest[4], rest[5]]);
+        self.in_data = rest[6] == 1;
+    }
+}
+
+impl Drop for OtherMaster {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+/// The other master at position 0 and the own slave at position 1, with lost answers.
+struct WithOtherMaster<F> {
+    ends: Arc<Mutex<(OtherMaster, Endpoint)>>,
+    cycle: usize,
+    lost: F,
+}
+
+impl<F: Fn(usize) -> bool + Send> Watcher for WithOtherMaster<F> {
+    fn before(&mut self, segment: &mut Segment) {
+        self.cycle += 1;
+        let mut ends = self.ends.lock().expect("no panic");
+        let (master, slave) = &mut *ends;
+        for position in 0..2 {
+            let device = segment.device_mut(position).expect("a device");
+            let outputs = device.outputs();
+            let whole = outputs.len() == PDU_LEN;
+            let sent = if position == 0 {
+                if whole {
+                    master.cycle(&outputs);
+                }
+                Pdu::parse(&master.request)
+            } else {
+                if whole {
+                    slave.cycle(Pdu::parse(&outputs));
+                }
+                slave.sent
+            };
+            for (sub, value) in (1..).zip(sent.objects()) {
+                assert!(device.set_input(0x6010, sub, value));
+            }
+        }
+    }
+
+    fn answer(&mut self, _: &mut [u8]) -> bool {
+        !(self.lost)(self.cycle)
     }
 }
 
@@ -293,11 +412,8 @@ fn esi() -> String {
     format!("{head}{pdos}<Eeprom>{tail}")
 }
 
-fn run(
-    exchange: &str,
-    options: Options,
-    lost: impl Fn(usize) -> bool + Send + 'static,
-) -> (Outcome, [Endpoint; 2]) {
+/// Returns the machine with both devices and the copies between them.
+fn safety_machine(exchange: &str, dwell: &str) -> Machine {
     let bench = Bench::new();
     bench.write("safety.xml", &esi());
     let text = format!(
@@ -322,10 +438,18 @@ to = "drive.pdo.0x1610"
 from = "drive.bytes.0..7"
 to = "logic.pdo.0x1610"
 [[step]]
-dwell = "2s"
+dwell = "{dwell}"
 "#
     );
-    let machine = bench.machine(&text);
+    bench.machine(&text)
+}
+
+fn run(
+    exchange: &str,
+    options: Options,
+    lost: impl Fn(usize) -> bool + Send + 'static,
+) -> (Outcome, [Endpoint; 2]) {
+    let machine = safety_machine(exchange, "2s");
     let mut endpoints = <[Endpoint; 2]>::default();
     endpoints[0].leads = true;
     let endpoints = Arc::new(Mutex::new(endpoints));
@@ -381,4 +505,54 @@ fn both_ends_detect_the_loss_of_a_device() {
         assert!(endpoint.exchanged > 50, "{endpoint:?}");
         assert_eq!(endpoint.errors, ["watchdog"]);
     }
+}
+
+/// Runs the other master and the own slave. Returns the outcome and both ends.
+fn run_with_other_master(
+    dwell: &str,
+    options: Options,
+    lost: impl Fn(usize) -> bool + Send + 'static,
+) -> Option<(Outcome, OtherMaster, Endpoint)> {
+    let master = OtherMaster::start()?;
+    let machine = safety_machine("same-cycle", dwell);
+    let ends = Arc::new(Mutex::new((master, Endpoint::default())));
+    let watcher = WithOtherMaster {
+        ends: Arc::clone(&ends),
+        cycle: 0,
+        lost,
+    };
+    let link = Box::new(WatchedBus::new(&machine, &options, watcher));
+    let mut heard = Heard::default();
+    let stop = Arc::<CancelToken>::default();
+    let outcome = run_on(link, machine, options, stop, &mut heard);
+    let ends = Arc::into_inner(ends).expect("the bus is gone");
+    let (master, slave) = ends.into_inner().expect("no panic");
+    Some((outcome, master, slave))
+}
+
+/// 10⁵ cycles with nine lost answers of 40; a PDU and its answer then take four to 13 cycles.
+#[test]
+fn another_safety_master_stays_connected_with_lost_frames() {
+    let lost = |n: usize| n > 300 && n % 40 < 9;
+    let Some((outcome, master, slave)) = run_with_other_master("100s", virtual_time(), lost) else {
+        return;
+    };
+    outcome.result.expect("runs");
+    println!("{} checked answers", master.checked);
+    assert_eq!((master.errors, master.in_data), (0, true));
+    assert_eq!((slave.state, &slave.errors[..]), (State::Data, &[][..]));
+    assert!(master.checked > 10_000, "{}", master.checked);
+}
+
+#[test]
+fn another_safety_master_detects_the_loss_of_a_device() {
+    let script = "[[fault]]\nkind = \"absent\"\ndevice = 1\nat = \"1s\"\n";
+    let Some((outcome, master, slave)) = run_with_other_master("2s", faults(script), |_| false)
+    else {
+        return;
+    };
+    outcome.result.expect_err("a device is missing");
+    assert!(master.checked > 50, "{}", master.checked);
+    assert_eq!((master.errors, master.in_data), (1, false));
+    assert_eq!(slave.errors, ["watchdog"]);
 }

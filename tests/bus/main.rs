@@ -4,6 +4,8 @@
 #![allow(clippy::print_stdout, reason = "what was measured")]
 
 mod axes;
+mod bring_up;
+mod clock_wrap;
 mod controller;
 mod copy;
 mod cycles;
@@ -19,3 +21,4 @@ mod repeats;
 mod samples;
 mod states;
 mod units;
+mod vendor_esi;

@@ -236,7 +236,7 @@ impl PdoSelector<'_> {
         if let Some(set) = self.with_objects(available, &default, &needed) {
             return Ok(match self.direction {
                 _ if !self.coe().is_some_and(|coe| coe.pdo_assign) => set,
-                Direction::Rx => without_repeats(set, &needed, notes),
+                Direction::Rx => drop_repeated_objects(set, &needed, notes),
                 Direction::Tx => self.with_position(available, &default, set, &needed),
             });
         }
@@ -435,7 +435,7 @@ pub(super) fn conflict(a: &Pdo, b: &Pdo) -> bool {
 
 /// Drops the PDOs whose objects another PDO of the set repeats, except mandatory ones. A drive
 /// would take the Controlword from any of them.
-fn without_repeats(mut set: Vec<Pdo>, needed: &[u16], notes: &mut Vec<String>) -> Vec<Pdo> {
+fn drop_repeated_objects(mut set: Vec<Pdo>, needed: &[u16], notes: &mut Vec<String>) -> Vec<Pdo> {
     // The PDO with the most objects of the mode stays.
     let main = set.iter().rev().max_by_key(|pdo| {
         let objects = needed.iter();

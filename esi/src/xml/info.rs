@@ -7,19 +7,19 @@ use crate::error::{EsiError, EsiProblem};
 use crate::model::{DeviceHeader, EsiFile, Group, Vendor};
 
 /// Decides which devices are built; `None`: all.
-pub(super) type Wanted<'w> = Option<&'w dyn Fn(&DeviceHeader) -> bool>;
+pub(super) type DeviceFilter<'w> = Option<&'w dyn Fn(&DeviceHeader) -> bool>;
 
 pub(super) fn read(
     c: &mut Cursor<'_>,
     file: &mut EsiFile,
-    wanted: Wanted<'_>,
+    filter: DeviceFilter<'_>,
 ) -> Result<(), EsiError> {
     let root = c.root()?;
     match root.name {
-        "EtherCATInfo" => info(c, &root, file, wanted),
-        "EtherCATModule" => modules_alone(c, &root, file, wanted),
+        "EtherCATInfo" => info(c, &root, file, filter),
+        "EtherCATModule" => modules_alone(c, &root, file, filter),
         "EtherCATInfoList" => c.children(&root, |c, el| match el.name {
-            "EtherCATInfo" => info(c, el, file, wanted),
+            "EtherCATInfo" => info(c, el, file, filter),
             _ => Ok(()),
         }),
         other => Err(c.error_at(&root, EsiProblem::NotEsi(other.chars().take(40).collect()))),
@@ -30,7 +30,7 @@ fn info<'a>(
     c: &mut Cursor<'a>,
     root: &Element<'a>,
     file: &mut EsiFile,
-    wanted: Wanted<'_>,
+    filter: DeviceFilter<'_>,
 ) -> Result<(), EsiError> {
     let first = (file.devices.len(), file.skipped.len());
     let mut vendor = None;
@@ -38,7 +38,7 @@ fn info<'a>(
         match el.name {
             "InfoReference" => file.references.push(c.text(el)?),
             "Vendor" => vendor = Some(read_vendor(c, el)?),
-            "Descriptions" => descriptions(c, el, file, wanted)?,
+            "Descriptions" => descriptions(c, el, file, filter)?,
             _ => {}
         }
         Ok(())
@@ -78,7 +78,7 @@ fn descriptions<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
     file: &mut EsiFile,
-    wanted: Wanted<'_>,
+    filter: DeviceFilter<'_>,
 ) -> Result<(), EsiError> {
     c.children(element, |c, el| match el.name {
         "Groups" => c.children(el, |c, el| {
@@ -91,11 +91,11 @@ fn descriptions<'a>(
             if el.name != "Device" {
                 return Ok(());
             }
-            if let Some(wanted) = wanted {
+            if let Some(filter) = filter {
                 let start = c.mark();
                 // An unreadable header is a problem that the reader of the device reports.
                 match device::header(c, el) {
-                    Ok(header) if !wanted(&header) => {
+                    Ok(header) if !filter(&header) => {
                         file.skipped.push(header);
                         return Ok(());
                     }
@@ -152,14 +152,14 @@ fn modules_alone<'a>(
     c: &mut Cursor<'a>,
     root: &Element<'a>,
     file: &mut EsiFile,
-    wanted: Wanted<'_>,
+    filter: DeviceFilter<'_>,
 ) -> Result<(), EsiError> {
     c.children(root, |c, el| {
         match el.name {
             "Vendor" => file.vendor = read_vendor(c, el)?,
             "Module" => one_module(c, el, file)?,
             "Modules" => modules(c, el, file)?,
-            "Descriptions" => descriptions(c, el, file, wanted)?,
+            "Descriptions" => descriptions(c, el, file, filter)?,
             _ => {}
         }
         Ok(())

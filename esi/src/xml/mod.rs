@@ -48,9 +48,9 @@ pub fn parse(bytes: &[u8]) -> Result<EsiFile, EsiError> {
     read(bytes, None)
 }
 
-/// Same as [`parse`], but builds only the devices that `wanted` accepts. The others are in
+/// Same as [`parse`], but builds only the devices that `filter` accepts. The others are in
 /// [`EsiFile::skipped`], and their content is not checked. The vendor of the header is not set
-/// when `wanted` sees it.
+/// when `filter` sees it.
 ///
 /// ```
 /// # let bytes = include_bytes!("../../../configs/esi/SV1.xml");
@@ -60,15 +60,15 @@ pub fn parse(bytes: &[u8]) -> Result<EsiFile, EsiError> {
 /// ```
 pub fn parse_where(
     bytes: &[u8],
-    wanted: &dyn Fn(&DeviceHeader) -> bool,
+    filter: &dyn Fn(&DeviceHeader) -> bool,
 ) -> Result<EsiFile, EsiError> {
-    read(bytes, Some(wanted))
+    read(bytes, Some(filter))
 }
 
 /// The longest chain of PDOs that refer to each other forwards.
 const MAX_REFERENCE_DEPTH: usize = 4;
 
-fn read(bytes: &[u8], wanted: info::Wanted<'_>) -> Result<EsiFile, EsiError> {
+fn read(bytes: &[u8], filter: info::DeviceFilter<'_>) -> Result<EsiFile, EsiError> {
     let decoded = decode::decode(bytes);
     let mut definitions = PdoDefinitions::default();
     // A `Ref` may stand before the `RefName` that it names, which may refer to another.
@@ -90,7 +90,7 @@ fn read(bytes: &[u8], wanted: info::Wanted<'_>) -> Result<EsiFile, EsiError> {
     let mut cursor = cursor::Cursor::new(&decoded.text);
     cursor.pdo_definitions = definitions;
     let mut file = EsiFile::default();
-    info::read(&mut cursor, &mut file, wanted)?;
+    info::read(&mut cursor, &mut file, filter)?;
     if let Some(error) = cursor.first_left_out.take()
         && file.devices.is_empty()
         && file.skipped.is_empty()

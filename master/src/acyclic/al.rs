@@ -6,6 +6,7 @@ use std::fmt;
 use std::time::Duration;
 
 use super::{DatagramClient, DeviceRef, Transition};
+use crate::concurrent::try_join_all;
 use crate::mailbox::{DatagramError, MailboxTransport};
 use crate::report::{Cause, Error};
 use ecaxis_ecat::al_status_code::al_status_text;
@@ -42,6 +43,11 @@ pub enum AlState {
 }
 
 impl AlState {
+    /// True if AL status shows an error.
+    pub(crate) const fn has_error(status: u8) -> bool {
+        status & ERROR != 0
+    }
+
     /// Decodes the low nibble of AL status.
     #[must_use]
     pub fn from_status(status: u8) -> Self {
@@ -162,9 +168,8 @@ pub async fn change_states(
     transitions: &[Transition<'_>],
     wanted: AlState,
 ) -> Result<(), Error> {
-    for transition in transitions {
-        request(wire, transition.device, wanted).await?;
-    }
+    let requests = transitions.iter().map(|t| request(wire, t.device, wanted));
+    try_join_all(requests).await?;
     wait_state(wire, transitions, wanted).await
 }
 
@@ -241,42 +246,56 @@ pub async fn wait_state(
     transitions: &[Transition<'_>],
     wanted: AlState,
 ) -> Result<(), Error> {
-    let begin = wire.now();
-    // The device whose time ends first is awaited first. No other time ends meanwhile.
-    let mut order: Vec<_> = transitions.iter().collect();
-    order.sort_by_key(|transition| transition.timeout);
-    for &&Transition { device, timeout } in &order {
-        let end = begin.saturating_add(u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX));
-        loop {
-            let failed = |source| StateError::Wire { wanted, source }.with_device(device);
-            let Some((status, code)) = read_status(wire, device.station).await.map_err(failed)?
-            else {
-                return Err(StateError::Gone { wanted }.with_device(device));
+    wait_state_since(wire, transitions, wanted, wire.now()).await
+}
+
+/// As [`wait_state`], for states requested at `begin`.
+pub(crate) async fn wait_state_since(
+    wire: &impl MailboxTransport,
+    transitions: &[Transition<'_>],
+    wanted: AlState,
+    begin: u64,
+) -> Result<(), Error> {
+    let each = transitions.iter().map(|t| wait_one(wire, t, wanted, begin));
+    try_join_all(each).await.map(|_| ())
+}
+
+/// Waits until one device is in `wanted`.
+async fn wait_one(
+    wire: &impl MailboxTransport,
+    &Transition { device, timeout }: &Transition<'_>,
+    wanted: AlState,
+    begin: u64,
+) -> Result<(), Error> {
+    let timeout_ns = u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX);
+    let end = begin.saturating_add(timeout_ns);
+    loop {
+        let failed = |source| StateError::Wire { wanted, source }.with_device(device);
+        let Some((status, code)) = read_status(wire, device.station).await.map_err(failed)? else {
+            return Err(StateError::Gone { wanted }.with_device(device));
+        };
+        let actual = AlState::from_status(status);
+        if status & ERROR != 0 {
+            let refused = StateError::Refused {
+                wanted,
+                actual,
+                code,
             };
-            let actual = AlState::from_status(status);
-            if status & ERROR != 0 {
-                let refused = StateError::Refused {
-                    wanted,
-                    actual,
-                    code,
-                };
-                return Err(refused.with_device(device));
-            }
-            if actual == wanted {
-                break;
-            }
-            if wire.now() >= end {
-                let late = StateError::Timeout {
-                    wanted,
-                    actual,
-                    timeout,
-                };
-                return Err(late.with_device(device));
-            }
-            wire.delay(POLL).await;
+            return Err(refused.with_device(device));
         }
+        if actual == wanted {
+            return Ok(());
+        }
+        if wire.now() >= end {
+            let late = StateError::Timeout {
+                wanted,
+                actual,
+                timeout,
+            };
+            return Err(late.with_device(device));
+        }
+        wire.delay(POLL).await;
     }
-    Ok(())
 }
 
 /// Acknowledges the errors of all devices, with another request of Init.

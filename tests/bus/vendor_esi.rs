@@ -1,0 +1,322 @@
+//! Every device of the vendors' ESI files, alone on the simulated bus, in each mode, module,
+//! assignment and OpMode that its file offers. It reaches Op, and an axis moves; or it is refused
+//! with a message that names the reason. [`REFUSED`] lists every refusal.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+
+use ecaxis_esi::{Device, EsiFile, Mode, offered_modes};
+use ecaxis_master::cancel::CancelToken;
+use ecaxis_master::config;
+use ecaxis_master::session::run_on;
+use ecaxis_sim::Segment;
+use ecaxis_test_support::wire::{WatchedBus, Watcher};
+use ecaxis_test_support::{Heard, fixture, virtual_time};
+
+/// The refusals: the start of the file's name, a part of the case, a part of the message, and their
+/// number among all cases.
+const REFUSED: &[(&str, &str, &str, usize)] = &[
+    ("Beckhoff AX5xxx", "", "speaks SoE and not CoE", 690),
+    // A PDO entry of several channels at once, which the dictionary does not list as mappable.
+    (
+        "Beckhoff EL1xxx",
+        " no clock",
+        "cannot be mapped to a PDO",
+        2,
+    ),
+    // The device's InitCmd writes the whole object by subindex 1.
+    ("Beckhoff EL6224", "", "0x8000:01", 4),
+    (
+        "Hilscher_NETX90_RE_ECS_V5.2.0_MDP",
+        " default",
+        "needs a module",
+        1,
+    ),
+    // The modules' PDOs have no `Sm`, and the device has no contents for them.
+    (
+        "Hilscher_NETX90_RE_ECS_V5.2.0_MDP",
+        " modules ",
+        "reading the PDO mapping back",
+        5,
+    ),
+    ("TI_AM243X", " default", "needs a module", 1),
+    // The device's InitCmd writes two bytes to an object of one byte.
+    ("kickcat_esi_test_sm_fmmu", "", "0x06070012", 4),
+];
+
+/// One device with one choice of each kind.
+#[derive(Debug)]
+struct Case {
+    file: PathBuf,
+    /// The device's identity and the choice, for messages.
+    name: String,
+    /// The keys of `[[device]]` that select the device and the choice.
+    keys: String,
+    drive: Option<(Mode, u64)>,
+}
+
+/// Returns a TOML string.
+fn quoted(text: &str) -> String {
+    let escaped = text.replace('\\', "\\\\").replace('"', "\\\"");
+    format!("\"{escaped}\"")
+}
+
+/// Returns the counts per motor turn: 0x608F of the dictionary, otherwise those of the simulated
+/// motor.
+fn encoder(device: &Device) -> u64 {
+    let value = |sub| {
+        let item = device.dictionary.item(0x608f, sub)?;
+        let mut bytes = [0; 8];
+        bytes
+            .get_mut(..item.default.len())?
+            .copy_from_slice(&item.default);
+        Some(u64::from_le_bytes(bytes)).filter(|value| *value > 0)
+    };
+    value(1).map_or(2000, |counts| counts / value(2).unwrap_or(1))
+}
+
+/// Returns the modules of each place: each alone, then all places with their first.
+fn module_choices(file: &EsiFile, device: &Device) -> Vec<Vec<String>> {
+    let Some(slots) = &device.slots else {
+        return Vec::new();
+    };
+    let mut places: Vec<(bool, Vec<String>)> = Vec::new();
+    for slot in &slots.slots {
+        let classed = file.modules.iter().filter(|module| {
+            let class = module.class.as_ref();
+            class.is_some_and(|class| slot.module_classes.contains(class))
+        });
+        let idents = slot.module_idents.iter().map(|(ident, _)| *ident);
+        let idents: Vec<String> = idents
+            .chain(classed.map(|module| module.ident))
+            .map(|ident| format!("0x{ident:08x}"))
+            .collect();
+        for instance in 0..slot.max_instances.max(slot.min_instances).clamp(1, 16) {
+            places.push((instance < slot.min_instances, idents.clone()));
+        }
+    }
+    let first = |place: &(bool, Vec<String>)| place.1.first().cloned().unwrap_or_default();
+    let mut choices = Vec::new();
+    for (number, (_, idents)) in places.iter().enumerate() {
+        for ident in idents {
+            let modules = places.iter().enumerate().map(|(other, place)| match place {
+                _ if other == number => ident.clone(),
+                (true, _) => first(place),
+                (false, _) => "-".to_owned(),
+            });
+            choices.push(modules.collect());
+        }
+    }
+    choices.push(places.iter().map(first).collect());
+    choices
+}
+
+/// Returns each choice of a device as (name, keys).
+fn choices(device: &Device) -> Vec<(String, String)> {
+    let mut choices = vec![("default".to_owned(), String::new())];
+    for (n, mode) in device.dc_modes.iter().enumerate() {
+        // Several OpModes may have one name; their descriptions differ.
+        let repeated = device
+            .dc_modes
+            .iter()
+            .take(n)
+            .any(|other| other.name == mode.name);
+        let name = if repeated {
+            &mode.description
+        } else {
+            &mode.name
+        };
+        choices.push((
+            format!("OpMode {}", n + 1),
+            format!("dc = {}\n", quoted(name)),
+        ));
+    }
+    if !device.dc_modes.is_empty() {
+        choices.push(("no clock".to_owned(), "dc = \"off\"\n".to_owned()));
+    }
+    for (n, mapping) in device.sm_mappings.iter().enumerate() {
+        let keys = format!("assignment = {}\n", quoted(&mapping.name));
+        choices.push((format!("assignment {}", n + 1), keys));
+    }
+    choices
+}
+
+fn cases_of(path: &Path) -> Vec<Case> {
+    let file = std::fs::read(path).expect("readable");
+    let file = ecaxis_esi::parse(&file).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+    let (mut drives, mut others) = (Vec::new(), Vec::new());
+    for device in &file.devices {
+        let id = &device.identity;
+        let who = format!(
+            "type = {}\nproduct = {}\nrevision = {}\n",
+            quoted(&device.type_name),
+            id.product,
+            id.revision
+        );
+        let case = |choice: &str, keys: &str, mode: Option<Mode>| {
+            let more = mode.map(|mode| format!("mode = \"{mode}\"\n"));
+            let mode_name = mode.map(|mode| format!("{mode} "));
+            Case {
+                file: path.to_owned(),
+                name: format!(
+                    "{:08x}:{:08x} {}{choice}",
+                    id.product,
+                    id.revision,
+                    mode_name.unwrap_or_default()
+                ),
+                keys: format!("{who}{}{keys}", more.unwrap_or_default()),
+                drive: mode.map(|mode| (mode, encoder(device))),
+            }
+        };
+        let modes = offered_modes(&file, device);
+        let modes: Vec<Mode> = modes.into_iter().filter(|mode| mode.is_cyclic()).collect();
+        for (choice, keys) in choices(device) {
+            for mode in &modes {
+                drives.push(case(&choice, &keys, Some(*mode)));
+            }
+            if modes.is_empty() {
+                others.push(case(&choice, &keys, None));
+            }
+        }
+        if modes.is_empty() {
+            for (n, modules) in module_choices(&file, device).iter().enumerate() {
+                let names: Vec<String> = modules.iter().map(|name| quoted(name)).collect();
+                let keys = format!("modules = [{}]\n", names.join(", "));
+                others.push(case(&format!("modules {}", n + 1), &keys, None));
+            }
+        }
+    }
+    drives.append(&mut others);
+    drives
+}
+
+/// Follows the shaft of the drive.
+struct Shaft(Arc<Mutex<Vec<i64>>>);
+
+impl Watcher for Shaft {
+    fn after(&mut self, segment: &mut Segment) {
+        let drive = segment.device(0).and_then(|device| device.drive());
+        if let Some(drive) = drive {
+            let mut positions = self.0.lock().expect("no panic");
+            positions.push(drive.position_counts());
+        }
+    }
+}
+
+/// Runs a case. Returns the refusal, or what went wrong in spite of a run that ended well.
+fn run(case: &Case) -> Result<Result<(), String>, String> {
+    let axis = case.drive.map(|(mode, encoder)| {
+        let step = match mode {
+            Mode::Csp => "move = { d = 1.0 }",
+            Mode::Csv => "velocity = { d = 5.0 }",
+            _ => "torque = { d = 8.0 }",
+        };
+        format!(
+            "[device.axis]\nunit = \"turn\"\nencoder = {encoder}\n\
+             limits = {{ velocity = 20.0, acceleration = 200.0, torque = 100.0, following_error = 1.0 }}\n\
+             [[step]]\n{step}\n"
+        )
+    });
+    let text = format!(
+        "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[[device]]\nname = \"d\"\nesi = {}\nposition = 0\n{}{}\
+         [[step]]\ndwell = \"300ms\"\n",
+        quoted(&case.file.display().to_string()),
+        case.keys,
+        axis.unwrap_or_default()
+    );
+    let machine = config::parse(Path::new("machine.toml"), &text).map_err(|e| e.to_string())?;
+    let options = virtual_time();
+    let positions = Arc::new(Mutex::new(Vec::new()));
+    let link = Box::new(WatchedBus::new(
+        &machine,
+        &options,
+        Shaft(Arc::clone(&positions)),
+    ));
+    let mut heard = Heard::default();
+    let stop = Arc::<CancelToken>::default();
+    let outcome = run_on(link, machine, options, stop, &mut heard);
+    outcome.result.map_err(|error| error.to_string())?;
+    let summary = outcome.summary.expect("a summary");
+    let errors = summary.counters.wkc_errors + summary.counters.lost_frames;
+    if errors > 0 {
+        return Ok(Err(format!(
+            "{errors} wrong working counters or lost frames"
+        )));
+    }
+    let Some((mode, encoder)) = case.drive else {
+        return Ok(Ok(()));
+    };
+    let positions = positions.lock().expect("no panic");
+    let turned = match (positions.first(), positions.last()) {
+        (Some(first), Some(last)) => (last - first) as f64 / encoder as f64,
+        _ => return Ok(Err("no drive".to_owned())),
+    };
+    let moved = match mode {
+        Mode::Csp => (turned - 1.0).abs() < 0.01,
+        // 5 turns/s for 300 ms.
+        Mode::Csv => (turned - 1.5).abs() < 0.3,
+        _ => turned > 0.2,
+    };
+    Ok(moved
+        .then_some(())
+        .ok_or(format!("moved {turned:.3} turns")))
+}
+
+#[test]
+fn every_vendor_device_reaches_op_or_is_refused_with_its_reason() {
+    let Some(folder) = fixture("esi") else {
+        return;
+    };
+    let mut files = Vec::new();
+    for vendor in std::fs::read_dir(folder).expect("a folder").flatten() {
+        let inside = std::fs::read_dir(vendor.path()).expect("a folder");
+        files.extend(inside.flatten().map(|entry| entry.path()));
+    }
+    files.sort();
+    let cases: Vec<Case> = files.iter().flat_map(|file| cases_of(file)).collect();
+    let next = AtomicUsize::new(0);
+    let results = Mutex::new(Vec::new());
+    let workers = std::thread::available_parallelism().map_or(2, usize::from);
+    std::thread::scope(|scope| {
+        for _ in 0..workers {
+            scope.spawn(|| {
+                while let Some(case) = cases.get(next.fetch_add(1, Ordering::Relaxed)) {
+                    let result = run(case);
+                    results.lock().expect("no panic").push((case, result));
+                }
+            });
+        }
+    });
+    let mut results = results.into_inner().expect("no panic");
+    results.sort_by_key(|(case, ..)| (&case.file, &case.name));
+    let (mut done, mut moved) = (0, 0);
+    let mut refused = vec![0; REFUSED.len()];
+    let mut wrong = Vec::new();
+    for (case, result) in &results {
+        let file = case.file.file_name().unwrap_or_default().to_string_lossy();
+        match result {
+            Ok(Ok(())) if case.drive.is_some() => moved += 1,
+            Ok(Ok(())) => done += 1,
+            Ok(Err(text)) => wrong.push(format!("{file} {}: {text}", case.name)),
+            Err(text) => {
+                let known = |(start, part, reason, _): &(&str, &str, &str, usize)| {
+                    file.starts_with(start) && case.name.contains(part) && text.contains(reason)
+                };
+                match REFUSED.iter().position(known) {
+                    Some(row) => refused[row] += 1,
+                    None => wrong.push(format!("{file} {}: {text}", case.name)),
+                }
+            }
+        }
+    }
+    println!(
+        "{} cases: {moved} axes moved, {done} devices in Op, {} refused",
+        results.len(),
+        refused.iter().sum::<usize>()
+    );
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    let expected: Vec<usize> = REFUSED.iter().map(|row| row.3).collect();
+    assert_eq!(refused, expected);
+    assert_eq!((moved, done), (110, 627));
+}
