@@ -11,13 +11,18 @@ use ethercrab::{Command, MainDevice, WrappedRead, WrappedWrite};
 
 use crate::cancel::CancelToken;
 use crate::clock::{self, Nanos};
+use crate::link::pdu_loop::MAX_DATAGRAMS;
 use crate::mailbox::{DatagramError, MailboxStatus, MailboxTransport};
 use crate::rt::exchange::BusStatus;
 use limiter::InFlightLimiter;
 
 mod limiter;
 
-/// Sends datagrams to configured station addresses, one per frame, in order of request.
+/// The datagrams in flight during operation. Each cycle sends one frame with one datagram, and an
+/// answer takes at most two cycles: more datagrams would only wait.
+const MAX_IN_OPERATION: u64 = 3;
+
+/// Sends datagrams to configured station addresses, in order of request.
 #[derive(Debug, Clone, Copy)]
 pub struct DatagramClient {
     device: &'static MainDevice<'static>,
@@ -26,13 +31,23 @@ pub struct DatagramClient {
 }
 
 impl DatagramClient {
-    /// Copies share one limiter and one cancel token. Both live as long as the MainDevice, that is,
-    /// as long as the process.
+    /// Returns a client for a bus in operation. Copies share one limiter and one cancel token. Both
+    /// live as long as the MainDevice, that is, as long as the process.
     #[must_use]
     pub fn new(device: &'static MainDevice<'static>) -> Self {
+        Self::with_limit(device, MAX_IN_OPERATION)
+    }
+
+    /// Returns a client for a bus without a cycle. Its datagrams share frames.
+    #[must_use]
+    pub fn without_cycle(device: &'static MainDevice<'static>) -> Self {
+        Self::with_limit(device, MAX_DATAGRAMS)
+    }
+
+    fn with_limit(device: &'static MainDevice<'static>, max: u64) -> Self {
         Self {
             device,
-            turns: Box::leak(Box::default()),
+            turns: Box::leak(Box::new(InFlightLimiter::new(max))),
             stop: Box::leak(Box::default()),
         }
     }

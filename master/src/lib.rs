@@ -15,6 +15,7 @@
 //! - [`link`]: transports for Ethernet frames;
 //! - [`recording`]: recording files, in this project's format and others;
 //! - [`cancel`]: cooperative cancellation;
+//! - `concurrent`: the same work on many devices at the same time;
 //! - [`clock`]: monotonic or virtual time;
 //! - [`text`]: formatting of counts with nouns;
 //! - [`mod@file`]: reads whole files of bounded length;
@@ -26,6 +27,7 @@ pub mod acyclic;
 pub mod bringup;
 pub mod cancel;
 pub mod clock;
+mod concurrent;
 pub mod config;
 mod datagram;
 pub mod esi_library;

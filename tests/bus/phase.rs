@@ -146,12 +146,11 @@ fn keep(cycle: &str, seed: u64, gains: Gains, seconds: u64) -> Kept {
         }
     }
     let cycle = plan.cycle_ns as i64;
-    let release = (plan.release % plan.cycle_ns) as i64;
     let arrivals = arrivals.lock().expect("one thread");
     let settled = arrivals.iter().filter(|a| a.at > start + 2 * SECOND);
     let mut deviations: Vec<i64> = settled
         .map(|a| {
-            let should = release + a.delay - a.sync0;
+            let should = i64::from(plan.release) + a.delay - a.sync0;
             let off = a.after_sync0 - should + cycle / 2;
             (off.rem_euclid(cycle) - cycle / 2).abs()
         })

@@ -40,7 +40,7 @@ fn machine() -> Machine {
 
 /// Returns the rows of a drive that is enabled, accelerates to `speed` counts per cycle, turns,
 /// stops and loses power. Its recording violates no rule.
-fn story(speed: i32) -> Vec<Row> {
+fn fault_report(speed: i32) -> Vec<Row> {
     let row = |controlword, position, statusword, actual| Row {
         controlword,
         mode: CSP,
@@ -101,7 +101,7 @@ impl Case {
     fn new(speed: i32) -> Self {
         Self {
             machine: machine(),
-            rows: story(speed),
+            rows: fault_report(speed),
             al_control: Vec::new(),
             report: Report::default(),
         }
@@ -464,7 +464,7 @@ fn judge_does_not_read_outputs_as_inputs_of_a_missing_device() {
 
 #[test]
 fn damaged_recordings_are_refused_and_never_panic() {
-    let file = recording(&story(10), &[]);
+    let file = recording(&fault_report(10), &[]);
     for end in 0..file.len().min(2000) {
         if let Ok(packets) = pcapng::packets(&file[..end]) {
             wire::read(&packets, &[]);

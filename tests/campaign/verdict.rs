@@ -29,7 +29,7 @@ fn text<'a>(value: &'a Value, path: &str) -> &'a str {
 /// Extracts the user-visible texts from the result.
 pub fn report(exit: i32, result: &Value, outcome: &mut Outcome) -> Report {
     outcome.error = text(result, "/error").to_string();
-    outcome.headline = text(result, "/story/headline").to_string();
+    outcome.headline = text(result, "/fault_report/headline").to_string();
     let none = Vec::new();
     let events = result
         .pointer("/summary/events")
@@ -114,8 +114,8 @@ pub fn check(plan: &Plan, wire: &Wire, report: &Report, result: &Value, outcome:
         return;
     }
     let cause = result
-        .pointer("/story/cause/cause")
-        .or_else(|| result.pointer("/story/cause"))
+        .pointer("/fault_report/cause/cause")
+        .or_else(|| result.pointer("/fault_report/cause"))
         .and_then(Value::as_str)
         .unwrap_or_default();
     let first = if outcome.headline.is_empty() {

@@ -422,7 +422,7 @@ fn reports_overwrite_only_with_force() {
         run([&["analyze", &ok, "--html", &page], force].concat()).exits(0);
         assert!(files.read("report.html").starts_with(b"<!DOCTYPE html>"));
     }
-    let story = [
+    let fault_report = [
         "run",
         "configs/demo.toml",
         "--sim",
@@ -430,7 +430,11 @@ fn reports_overwrite_only_with_force() {
         "--fault-report",
         &notes,
     ];
-    files.keeps("notes.txt", &story, &["--fault-report", "exists already"]);
+    files.keeps(
+        "notes.txt",
+        &fault_report,
+        &["--fault-report", "exists already"],
+    );
     // Figures and report of a bench are checked before the measurement.
     let both = [
         "bench",

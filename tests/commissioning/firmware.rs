@@ -23,8 +23,9 @@ use ecaxis_sim::{
 };
 use ecaxis_test_support::{load, root};
 use ecaxis_tools::firmware::{
-    self, BOOT_LOADER, Cause, DeviceIdentity, Expected, FinalDeviceState, FirmwareError, ReadBack,
-    RunningProgram, START_TIMEOUT, Step, UpdateMethod, UpdateProgress, UpdateReport, UpdateRequest,
+    self, BOOT_LOADER, DeviceIdentity, Expected, FinalDeviceState, FirmwareError, ReadBack,
+    RunningProgram, START_TIMEOUT, UpdateCause, UpdateMethod, UpdateProgress, UpdateReport,
+    UpdateRequest, UpdateStep,
 };
 
 /// The simulated bus with a power switch for one device.
@@ -242,7 +243,7 @@ fn a_mebibyte_is_updated_by_both_methods_with_progress() {
                         assert!(matches!(done.read_back, ReadBack::Refused(_)));
                     }
                 }
-                assert_eq!(steps.last(), Some(&Step::Check));
+                assert_eq!(steps.last(), Some(&UpdateStep::Check));
                 assert!(done.took.as_secs() >= 1 && done.took.as_secs() < 600);
 
                 // The new identity in EEPROM and objects.
@@ -294,18 +295,18 @@ fn an_update_succeeds_after_power_loss_at_forty_percent() {
             };
             match via {
                 UpdateMethod::Foe => {
-                    assert_eq!(*step, Step::Send);
+                    assert_eq!(*step, UpdateStep::Send);
                     let gone = match position {
                         0 => matches!(
                             **cause,
-                            Cause::Foe(FoeError {
+                            UpdateCause::Foe(FoeError {
                                 cause: FoeCause::Wire { .. },
                                 ..
                             })
                         ),
                         _ => matches!(
                             **cause,
-                            Cause::Foe(FoeError {
+                            UpdateCause::Foe(FoeError {
                                 cause: FoeCause::Gone { .. },
                                 ..
                             })
@@ -314,9 +315,9 @@ fn an_update_succeeds_after_power_loss_at_forty_percent() {
                     assert!(gone, "{error}");
                 }
                 UpdateMethod::Program => {
-                    assert_eq!(*step, Step::Download);
+                    assert_eq!(*step, UpdateStep::Download);
                     assert!(
-                        matches!(&**cause, Cause::Sdo(error) if matches!(error.cause, CoeCause::Wire(_))),
+                        matches!(&**cause, UpdateCause::Sdo(error) if matches!(error.cause, CoeCause::Wire(_))),
                         "{error}"
                     );
                 }
@@ -367,7 +368,7 @@ fn a_cancelled_update_leaves_no_device_in_bootstrap() {
                 let FirmwareError::Failed { cause, left, .. } = &error else {
                     panic!("{error}")
                 };
-                assert!(matches!(**cause, Cause::Interrupted), "{error}");
+                assert!(matches!(**cause, UpdateCause::Interrupted), "{error}");
                 let init = FinalDeviceState::In {
                     state: AlState::Init,
                     code: 0,
@@ -503,7 +504,7 @@ fn a_busy_device_is_awaited_for_a_limited_time() {
         let FirmwareError::Failed { cause, left, .. } = &error else {
             panic!("{error}")
         };
-        let Cause::Foe(FoeError { cause, .. }) = &**cause else {
+        let UpdateCause::Foe(FoeError { cause, .. }) = &**cause else {
             panic!("{error}")
         };
         let busy = matches!(cause, FoeCause::Busy { entire: 100, .. });
@@ -531,7 +532,7 @@ fn a_busy_device_is_awaited_for_a_limited_time() {
             matches!(
                 error,
                 FirmwareError::Failed {
-                    step: Step::Clear,
+                    step: UpdateStep::Clear,
                     ..
                 }
             ),

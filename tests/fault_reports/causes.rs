@@ -34,12 +34,12 @@ fn one_moves() -> String {
 
 #[track_caller]
 fn first_line(machine_file: &str, script: &str, expected: &str) {
-    let story = story(machine(machine_file), faults(script));
+    let fault_report = fault_report_of(machine(machine_file), faults(script));
     assert!(
-        story.headline.starts_with(expected),
+        fault_report.headline.starts_with(expected),
         "{}\n  expected {expected}\n  also {:?}\n  {script}",
-        story.headline,
-        story.also
+        fault_report.headline,
+        fault_report.also
     );
 }
 
@@ -98,20 +98,24 @@ fn a_stop_long_after_a_group_stop_has_its_own_cause() {
 #[test]
 fn a_missing_device_in_a_tree_is_named() {
     let script = fault("power-off", "1.5s", "device = 1");
-    let story = story(machine(&tree()), faults(&script));
+    let fault_report = fault_report_of(machine(&tree()), faults(&script));
     assert!(
-        story
+        fault_report
             .headline
             .starts_with("`di` (position 1) is out of reach: port ")
-            && story.headline.contains("of `coupler`"),
+            && fault_report.headline.contains("of `coupler`"),
         "{}",
-        story.headline
+        fault_report.headline
     );
-    let answers: Vec<bool> = story.devices.iter().map(|device| device.answers).collect();
+    let answers: Vec<bool> = fault_report
+        .devices
+        .iter()
+        .map(|device| device.answers)
+        .collect();
     assert_eq!(answers, [true, false, true]);
-    assert_eq!(story.devices[2].station, Some(0x1002));
+    assert_eq!(fault_report.devices[2].station, Some(0x1002));
     // The report does not attribute the drive's answers to the terminal.
-    assert!(story.devices[1].state.is_none() && story.devices[2].state.is_some());
+    assert!(fault_report.devices[1].state.is_none() && fault_report.devices[2].state.is_some());
 }
 
 #[test]
@@ -148,9 +152,13 @@ fn an_axis_of_a_line_stops_because_of_its_missing_partner() {
     let (outcome, _) = run(machine(&text), faults(POWER_OFF));
     let error = outcome.result.expect_err("the line is broken").to_string();
     assert!(error.contains("no longer answers"), "{error}");
-    let story = outcome.story.expect("a story");
+    let fault_report = outcome.fault_report.expect("a fault report");
     let expected = "`a1` (position 1) is out of reach: port 1 of `a0` has no link";
-    assert!(story.headline.starts_with(expected), "{}", story.headline);
+    assert!(
+        fault_report.headline.starts_with(expected),
+        "{}",
+        fault_report.headline
+    );
 }
 
 /// The run succeeds except for the group, so the report describes the stop of the group.
@@ -176,7 +184,9 @@ fn a_group_without_reset_is_reported() {
         let mut command = program::command();
         command.args(["run", "--virtual", "--sim", "--json", "--faults"]);
         let json = Ran::new(command.args([&script, &file])).exits(1).json();
-        let headline = json["story"]["headline"].as_str().unwrap_or_default();
+        let headline = json["fault_report"]["headline"]
+            .as_str()
+            .unwrap_or_default();
         assert!(headline.contains(expected), "{headline}; {faults}");
         let error = json["error"].as_str().unwrap_or_default();
         assert!(error.contains("was not reset"), "{error}");
@@ -195,8 +205,8 @@ fn a_device_missing_during_the_scan_is_named() {
             "`a1`",
         ),
     ] {
-        let story = story(machine(&axes(3)), faults(&script));
-        let headline = &story.headline;
+        let fault_report = fault_report_of(machine(&axes(3)), faults(&script));
+        let headline = &fault_report.headline;
         assert!(headline.contains(name), "{script}: {headline}");
     }
 }

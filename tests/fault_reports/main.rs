@@ -11,7 +11,7 @@ use std::sync::Arc;
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{self, Clock};
 use ecaxis_master::config::Machine;
-use ecaxis_master::post_mortem::{Cause, FaultReport};
+use ecaxis_master::post_mortem::{DiagnosedCause, FaultReport};
 use ecaxis_master::rt::controller::{Controller, CycleContext};
 use ecaxis_master::session::{Options, run_with};
 use ecaxis_test_support::program::{self, Ran};
@@ -22,14 +22,14 @@ use ecaxis_test_support::{
 
 /// Runs a machine that must fail and returns its fault report.
 #[track_caller]
-fn story(machine: Machine, options: Options) -> FaultReport {
+fn fault_report_of(machine: Machine, options: Options) -> FaultReport {
     let (outcome, heard) = run(machine, options);
     let Err(error) = outcome.result else {
         panic!("the run must fail; {:?}", heard.warnings());
     };
-    match outcome.story {
-        Some(story) => *story,
-        None => panic!("no story of {error}"),
+    match outcome.fault_report {
+        Some(fault_report) => *fault_report,
+        None => panic!("no fault report of {error}"),
     }
 }
 
@@ -162,7 +162,7 @@ fn overloaded(for_ns: u64) -> FaultReport {
         controller,
     );
     assert!(outcome.result.is_err());
-    *outcome.story.expect("a story")
+    *outcome.fault_report.expect("a fault report")
 }
 
 #[test]
@@ -171,7 +171,7 @@ fn another_main_device_during_bring_up_is_reported_as_cause() {
         let script = format!(
             "[[fault]]\nkind = \"other-main-device\"\nat = \"{at}ms\"\ncount = 1\nstate = \"init\"\n"
         );
-        let reported = story(machine(&axes(2)), faults(&script));
+        let reported = fault_report_of(machine(&axes(2)), faults(&script));
         let names = reported
             .headline
             .contains("another MainDevice is on this wire");
@@ -188,14 +188,14 @@ fn another_main_device_during_bring_up_is_reported_as_cause() {
 fn first_lines_match_the_snapshot() {
     let mut text = String::new();
     for (name, machine_file, script) in staged() {
-        let story = story(machine(&machine_file), faults(script));
-        let _ = write!(text, "{name}\n  {}\n", story.headline);
-        for also in &story.also {
+        let fault_report = fault_report_of(machine(&machine_file), faults(script));
+        let _ = write!(text, "{name}\n  {}\n", fault_report.headline);
+        for also in &fault_report.also {
             let _ = writeln!(text, "  also: {also}");
         }
     }
-    let story = overloaded(250_000_000);
-    let _ = write!(text, "overload of the host\n  {}\n", story.headline);
+    let fault_report = overloaded(250_000_000);
+    let _ = write!(text, "overload of the host\n  {}\n", fault_report.headline);
     assert_snapshot("fault_reports.txt", &text);
 }
 
@@ -212,9 +212,13 @@ fn a_drive_without_the_cycle_time_is_reported() {
         .replace("following_error = 1.0", "following_error = 0.44");
     run_well(machine(&text), virtual_time());
     let script = "[[fault]]\nkind = \"sdo-ignored\"\nindex = 0x60c2\nsub = 1\n";
-    let story = story(machine(&text), faults(script));
+    let fault_report = fault_report_of(machine(&text), faults(script));
     let first = "`a0` (position 0): the drive did not receive the cycle of 4 ms (0x60C2 is 0); then: `a0`: following error ";
-    assert!(story.headline.starts_with(first), "{}", story.headline);
+    assert!(
+        fault_report.headline.starts_with(first),
+        "{}",
+        fault_report.headline
+    );
 }
 
 /// The report contains cycles before the stop with its causes, and cycles after it with its
@@ -222,30 +226,38 @@ fn a_drive_without_the_cycle_time_is_reported() {
 #[test]
 fn the_cycles_around_the_stop_are_kept() {
     let script = "[[fault]]\nkind = \"drive-fault\"\nat = \"1.5s\"\ndevice = 1\ncode = 0x3220\n";
-    let story = story(machine(&axes(2)), faults(script));
-    let stop = story.stop.expect("it ran").cycle;
-    let numbers: Vec<u64> = story.cycles.iter().map(|page| page.cycle.number).collect();
+    let fault_report = fault_report_of(machine(&axes(2)), faults(script));
+    let stop = fault_report.stop.expect("it ran").cycle;
+    let numbers: Vec<u64> = fault_report
+        .cycles
+        .iter()
+        .map(|page| page.cycle.number)
+        .collect();
     assert_eq!(numbers.len(), 200);
     assert_eq!((numbers[0], numbers[199]), (stop - 150, stop + 49));
     let fault = |page: &ecaxis_master::post_mortem::report::CycleRecord| {
         page.axes[1].statusword & 0x08 != 0
     };
-    let first = story.cycles.iter().find(|page| fault(page));
+    let first = fault_report.cycles.iter().find(|page| fault(page));
     assert_eq!(first.map(|page| page.cycle.number), Some(stop));
     // The other axis is on its ramp, and its target changes within the limits.
-    for pair in story.cycles.windows(2) {
+    for pair in fault_report.cycles.windows(2) {
         let step = pair[1].axes[0].target_position - pair[0].axes[0].target_position;
         assert!(step.abs() <= 50.0 * 0.001 + 1e-9, "{step}");
     }
-    assert_eq!(story.axes.len(), 2);
-    assert!(matches!(story.cause, Cause::Unexplained { .. }));
-    assert_eq!(story.devices[1].error_code, Some(0x3220));
+    assert_eq!(fault_report.axes.len(), 2);
+    assert!(matches!(
+        fault_report.cause,
+        DiagnosedCause::Unexplained { .. }
+    ));
+    assert_eq!(fault_report.devices[1].error_code, Some(0x3220));
 }
 
 #[test]
 fn the_same_run_gives_the_same_report() {
     let (_, text, script) = staged().swap_remove(1);
-    let report = || serde_json::to_string(&story(machine(&text), faults(script))).expect("JSON");
+    let report =
+        || serde_json::to_string(&fault_report_of(machine(&text), faults(script))).expect("JSON");
     assert_eq!(report(), report());
 }
 
@@ -318,7 +330,7 @@ fn a_failed_run_writes_its_report() {
     let json = run(&["--json"]).json();
     assert_eq!(json["ok"], false);
     assert!(
-        json["story"]["headline"]
+        json["fault_report"]["headline"]
             .as_str()
             .is_some_and(|h| h.starts_with(cause))
     );
@@ -328,10 +340,10 @@ fn a_failed_run_writes_its_report() {
 #[test]
 fn a_successful_or_interrupted_run_has_no_report() {
     let (outcome, _) = run(machine(&axes(1)), virtual_time());
-    assert!(outcome.result.is_ok() && outcome.story.is_none());
+    assert!(outcome.result.is_ok() && outcome.fault_report.is_none());
     let stop = Arc::<CancelToken>::default();
     stop.cancel();
     let mut heard = Heard::default();
     let outcome = ecaxis_master::session::run(machine(&axes(1)), virtual_time(), stop, &mut heard);
-    assert!(outcome.result.is_err() && outcome.story.is_none());
+    assert!(outcome.result.is_err() && outcome.fault_report.is_none());
 }

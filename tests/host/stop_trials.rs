@@ -293,7 +293,7 @@ impl<'p> Bench<'p> {
         match trial.event {
             Event::Signal(signal) => run.signal(signal),
             Event::Fault => bus.process.signal(Signal::USR1),
-            Event::Frozen => frozen = Some(freeze::thread(run.id(), "ecaxis-mailbox")),
+            Event::Frozen => frozen = Some(freeze::thread(run.id(), "ecaxis-services")),
             Event::Ignored(_) | Event::Tolerated => {
                 match trial.event {
                     Event::Ignored(signal) => run.signal(signal),

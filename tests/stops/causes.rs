@@ -196,7 +196,7 @@ fn a_machine_with_a_long_ramp_completes_its_stop() {
 
 #[test]
 fn a_fault_from_before_the_run_is_reset_once() {
-    let script = "[[fault]]\nkind = \"drive-fault\"\ndevice = 0\nat = \"100ms\"\ncode = 0x3210\n";
+    let script = "[[fault]]\nkind = \"drive-fault\"\ndevice = 0\nat = \"60ms\"\ncode = 0x3210\n";
     let (outcome, heard) = run(machine(&axes(2)), faults(script));
     outcome.result.expect("the fault is gone after its reset");
     let warnings = heard.warnings().join("\n");

@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Instant;
 
 use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::cancel::CancelToken;
@@ -118,7 +119,8 @@ impl Bus {
                     true => link::open_exclusive(&nic, back_end)?,
                     false => link::open(&nic, back_end)?,
                 };
-                let frames = link::sniff_foreign_frames(link.as_mut()).map_err(Cause::Link)?;
+                let frames = link::sniff_foreign_frames(link.as_mut(), Instant::now())
+                    .map_err(Cause::Link)?;
                 heard.store(frames, Ordering::Relaxed);
                 // Another ecaxis may drive a machine on this interface.
                 Box::new(link::source_address::PrivateMacLink::new(

@@ -1,37 +1,37 @@
 //! Advice for the causes that a fault report can name.
 
 use ecaxis_ecat::al_status_code::al_status_hint;
-use ecaxis_master::post_mortem::Cause;
+use ecaxis_master::post_mortem::DiagnosedCause;
 
 /// Returns the advice, likeliest first. It is empty if the error brings its own.
-pub(crate) fn cause(cause: &Cause) -> Vec<String> {
+pub(crate) fn diagnosed(cause: &DiagnosedCause) -> Vec<String> {
     match cause {
-        Cause::Overload { .. } => vec![
+        DiagnosedCause::Overload { .. } => vec![
             "`ecaxis doctor` reports host settings that disturb the cycle, each with the command that fixes it".to_owned(),
             "reserve a CPU for the cycle (`cpu`), keep that CPU awake, and stop other heavy load on this computer".to_owned(),
             "or take a longer `cycle`; a longer `watchdog` tolerates single delays".to_owned(),
         ],
-        Cause::OtherMainDevice { .. } => vec![
+        DiagnosedCause::OtherMainDevice { .. } => vec![
             "end the other EtherCAT program: TwinCAT, SOEM or IgH's `ethercat`, or a second `ecaxis`, on this computer or another".to_owned(),
             "connect the segment to this computer's port alone, without a switch in between".to_owned(),
         ],
-        Cause::Interface { .. } => vec![
+        DiagnosedCause::Interface { .. } => vec![
             "check that the interface is up, its cable plugged (`ip link`), and that NetworkManager does not manage it".to_owned(),
         ],
-        Cause::NoResponse { .. } => vec![
+        DiagnosedCause::NoResponse { .. } => vec![
             "check the link light of the first device's IN port, its power and the cable".to_owned(),
             "`ip link` shows whether the interface still has a carrier".to_owned(),
         ],
-        Cause::LateFrames { .. } => vec![
+        DiagnosedCause::LateFrames { .. } => vec![
             "switch interrupt coalescing off: `ethtool -C IF rx-usecs 0 tx-usecs 0`; `ecaxis doctor IF` shows what else delays frames".to_owned(),
             "USB adapters and virtual interfaces add delays of a millisecond: use a dedicated network card".to_owned(),
             "or take a longer `cycle`, or `exchange = \"pipelined\"`, which allows frames one cycle to return".to_owned(),
         ],
-        Cause::TemporaryOutage { .. } => vec![
+        DiagnosedCause::TemporaryOutage { .. } => vec![
             "look for a loose plug at this computer or at the first device, and for an interface that resets (`dmesg`, `ethtool -S`)".to_owned(),
             "`lost_frames` in the machine file sets how many lost cycles in a row are tolerated".to_owned(),
         ],
-        Cause::OutOfReach { link, .. } => {
+        DiagnosedCause::OutOfReach { link, .. } => {
             let first = match link {
                 Some(true) => "the link is up, but the device does not answer: switch it off and on, then check its firmware and EEPROM",
                 _ => "look at the link lights at both ends of that cable and at the power of the device behind it",
@@ -42,30 +42,30 @@ pub(crate) fn cause(cause: &Cause) -> Vec<String> {
                 "where connectors move with the machine, use cables for drag chains and sockets that lock".to_owned(),
             ]
         }
-        Cause::Restarted { .. } => vec![
+        DiagnosedCause::Restarted { .. } => vec![
             "check its supply: a dip when all axes accelerate, a loose terminal, a tripped fuse, an emergency stop that also cuts the logic supply".to_owned(),
             "feed the logic of drives from a separate supply".to_owned(),
         ],
-        Cause::DamagedFrames { .. } => vec![
+        DiagnosedCause::DamagedFrames { .. } => vec![
             "replace that cable and check both sockets; then check whether the counters still grow".to_owned(),
             "keep it away from motor cables, and connect its shield at both ends".to_owned(),
             "if the errors stay with the device after the cable is replaced, its PHY or its supply is the cause".to_owned(),
         ],
-        Cause::LinkFlapping { .. } => vec![
+        DiagnosedCause::LinkFlapping { .. } => vec![
             "look for a loose plug, a worn cable in a drag chain, or a device at the other end that restarted".to_owned(),
         ],
-        Cause::Watchdog { silence_ns: 0, .. } => vec![
+        DiagnosedCause::Watchdog { silence_ns: 0, .. } => vec![
             "the watchdog may be too short for the cycle: omit `watchdog` to use the default".to_owned(),
             "frames arrived without outputs: look for a device in front of it that was not in Op".to_owned(),
         ],
-        Cause::Watchdog { .. } => vec![
+        DiagnosedCause::Watchdog { .. } => vec![
             "find out why no frame came back: the cable, a device in front that restarted, or this computer (`ecaxis doctor`)".to_owned(),
             "`lost_frames` in the machine file stops the machine before the watchdogs do".to_owned(),
         ],
-        Cause::OutputsNotTaken { .. } => vec![
+        DiagnosedCause::OutputsNotTaken { .. } => vec![
             "switch the device off and on; check its outputs' SyncManager and FMMU against `ecaxis explain`".to_owned(),
         ],
-        Cause::Sync { code, .. } => {
+        DiagnosedCause::Sync { code, .. } => {
             let own = al_status_hint(*code).map(ToOwned::to_owned);
             own.into_iter()
                 .chain([
@@ -74,25 +74,25 @@ pub(crate) fn cause(cause: &Cause) -> Vec<String> {
                 ])
                 .collect()
         }
-        Cause::LeftOp { code: 0, .. } => vec![
+        DiagnosedCause::LeftOp { code: 0, .. } => vec![
             "check whether another program drives the bus, then the device's supply".to_owned(),
         ],
-        Cause::LeftOp { code, .. } => {
+        DiagnosedCause::LeftOp { code, .. } => {
             vec![al_status_hint(*code).unwrap_or("look the code up in the device's manual").to_owned()]
         }
-        Cause::Interpolation { .. } => vec![
+        DiagnosedCause::Interpolation { .. } => vec![
             "0x60C2 must be the cycle: it is written from `cycle` unless `sdo` in the machine file says otherwise".to_owned(),
             "a drive that confirms the write but keeps the old value needs another state or firmware; read it back with `ecaxis sdo`".to_owned(),
         ],
-        Cause::Mailbox { .. } => vec![
+        DiagnosedCause::Mailbox { .. } => vec![
             "switch the device off and on; check that its firmware runs (RUN light, its own display)".to_owned(),
             "another program that uses the same mailbox takes the answers away".to_owned(),
         ],
-        Cause::Revision { .. } => vec![
+        DiagnosedCause::Revision { .. } => vec![
             "get the ESI file of that revision from the manufacturer, or pick the revision with `revision`".to_owned(),
             "`identity` in the machine file sets which other revisions are accepted for that of the ESI file".to_owned(),
         ],
-        Cause::Unexplained { .. } => Vec::new(),
+        DiagnosedCause::Unexplained { .. } => Vec::new(),
     }
 }
 

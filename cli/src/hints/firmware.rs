@@ -3,7 +3,7 @@
 use ecaxis_master::config::Nic;
 use ecaxis_master::mailbox::{FoeCause, FoeError};
 use ecaxis_master::report;
-use ecaxis_tools::firmware::{Cause, FinalDeviceState, FirmwareError, UpdateMethod};
+use ecaxis_tools::firmware::{FinalDeviceState, FirmwareError, UpdateCause, UpdateMethod};
 
 use super::{FAILED, Failure, INTERRUPTED, WRONG, state};
 
@@ -15,7 +15,9 @@ pub(crate) fn shared_bus() -> Failure {
 
 pub(crate) fn firmware(error: &FirmwareError, nic: &Nic) -> Failure {
     let code = match error {
-        FirmwareError::Failed { cause, .. } if matches!(**cause, Cause::Interrupted) => INTERRUPTED,
+        FirmwareError::Failed { cause, .. } if matches!(**cause, UpdateCause::Interrupted) => {
+            INTERRUPTED
+        }
         _ => FAILED,
     };
     let failure = Failure::new(code, error.to_string());
@@ -56,25 +58,29 @@ fn wrong(failure: Failure) -> Failure {
     }
 }
 
-fn cause(cause: &Cause) -> Option<String> {
+fn cause(cause: &UpdateCause) -> Option<String> {
     let hint = match cause {
-        Cause::Foe(error) => foe(error)?,
-        Cause::Sdo(_) => {
+        UpdateCause::Foe(error) => foe(error)?,
+        UpdateCause::Sdo(_) => {
             "the device refuses this file or this order: use the file that its vendor specifies"
         }
-        Cause::Service(error) => match &*error.cause {
+        UpdateCause::Service(error) => match &*error.cause {
             report::Cause::State(error) => return Some(state(error)),
             _ => return None,
         },
-        Cause::Control { .. } => "the device ignores 0x1F51: check whether it supports `--via foe`",
-        Cause::Differs { .. } => {
+        UpdateCause::Control { .. } => {
+            "the device ignores 0x1F51: check whether it supports `--via foe`"
+        }
+        UpdateCause::Differs { .. } => {
             "the device did not store the sent data; its program memory may be worn"
         }
-        Cause::NotRunning { .. } => {
+        UpdateCause::NotRunning { .. } => {
             "the device took the file but does not run it: switch it off and on, then run `ecaxis firmware info`"
         }
-        Cause::NotBack { .. } => "switch the device off and on, then run `ecaxis firmware info`",
-        Cause::Interrupted => return None,
+        UpdateCause::NotBack { .. } => {
+            "switch the device off and on, then run `ecaxis firmware info`"
+        }
+        UpdateCause::Interrupted => return None,
     };
     Some(hint.to_owned())
 }

@@ -21,7 +21,7 @@ mod firmware;
 mod host;
 mod service;
 
-pub(crate) use fault_report::cause;
+pub(crate) use fault_report::diagnosed;
 pub(crate) use firmware::{firmware, shared_bus};
 use host::interfaces;
 pub(crate) use host::{capabilities, concern, denied, interface, overload};
@@ -118,6 +118,9 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         }
         Cause::NoStart => {
             "frames are lost or the computer is overloaded: check cables, and stop other programs".to_owned()
+        }
+        Cause::ClockDoesNotFollow => {
+            "connect it in front of all other devices with a clock, or write `dc = \"off\"`".into()
         }
         Cause::NoClock => {
             "run the device without distributed clock: `dc = \"off\"`".to_owned()

@@ -320,15 +320,15 @@ fn hints_keep_drives_on_with_another_main_device() {
 
 #[test]
 fn firmware_error_names_its_device_once() {
-    use ecaxis_tools::firmware::{Cause, FinalDeviceState, FirmwareError, Step};
+    use ecaxis_tools::firmware::{FinalDeviceState, FirmwareError, UpdateCause, UpdateStep};
     let abort = sdo_error(0x1f51, 1, CoeCause::Abort(0x0601_0002));
     let state = StateError::Gone {
         wanted: AlState::PreOp,
     };
-    let state = super::Cause::State(state).with_device(device());
+    let state = Cause::State(state).with_device(device());
     for (step, cause) in [
-        (Step::Clear, Cause::Sdo(abort)),
-        (Step::PreOp, Cause::Service(state)),
+        (UpdateStep::Clear, UpdateCause::Sdo(abort)),
+        (UpdateStep::PreOp, UpdateCause::Service(state)),
     ] {
         let error = FirmwareError::from_step(&device(), step, cause, FinalDeviceState::Silent);
         let text = firmware(&error, &Nic::Sim).message;

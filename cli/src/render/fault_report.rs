@@ -7,7 +7,7 @@ use ecaxis_axis::cia402::{State, Statusword};
 use ecaxis_master::config::duration;
 use ecaxis_master::post_mortem::cause::about;
 use ecaxis_master::post_mortem::report::{CycleRecord, DeviceSection};
-use ecaxis_master::post_mortem::{Cause, FaultReport};
+use ecaxis_master::post_mortem::{DiagnosedCause, FaultReport};
 use ecaxis_master::rt::flight_recorder::AxisCycle;
 use ecaxis_tools::cells;
 use ecaxis_tools::document::format::{civil, hex16, times, utc};
@@ -28,20 +28,22 @@ const KEPT: usize = 19;
 const PREFIX: &str = "ecaxis-stop-";
 
 /// Formats the fault report for the terminal in at most 20 lines.
-pub(crate) fn short(story: &FaultReport) -> String {
+pub(crate) fn short(fault_report: &FaultReport) -> String {
     // The error itself is printed elsewhere.
-    let mut out = Document::new(match &story.cause {
-        Cause::Unexplained { .. } if story.events.is_empty() => return String::new(),
-        Cause::Unexplained { .. } => "events in the cycle:".to_owned(),
+    let mut out = Document::new(match &fault_report.cause {
+        DiagnosedCause::Unexplained { .. } if fault_report.events.is_empty() => {
+            return String::new();
+        }
+        DiagnosedCause::Unexplained { .. } => "events in the cycle:".to_owned(),
         cause => format!("cause: {cause}"),
     });
     // The events that led to the stop, and the stop itself.
-    if let Some(stop) = story.events.iter().position(|event| event.failure) {
-        for event in &story.events[(stop + 1).saturating_sub(SHOWN)..=stop] {
+    if let Some(stop) = fault_report.events.iter().position(|event| event.failure) {
+        for event in &fault_report.events[(stop + 1).saturating_sub(SHOWN)..=stop] {
             out.item(format!("{:.3} s  ", event.at_s), &event.what);
         }
     }
-    for cause in story.also.iter().take(2) {
+    for cause in fault_report.also.iter().take(2) {
         out.item("also: ", cause.to_string());
     }
     let text = out.text(Some(WIDTH));
@@ -49,48 +51,48 @@ pub(crate) fn short(story: &FaultReport) -> String {
 }
 
 /// Returns the full page. The first line names the device and the cause.
-pub(crate) fn page(story: &FaultReport, hints: &[String]) -> Document {
-    let mut out = Document::new(&story.headline);
-    out.heading(format!("The run ended with: {}", story.error));
-    let stop = story.stop.map(|stop| {
+pub(crate) fn page(fault_report: &FaultReport, hints: &[String]) -> Document {
+    let mut out = Document::new(&fault_report.headline);
+    out.heading(format!("The run ended with: {}", fault_report.error));
+    let stop = fault_report.stop.map(|stop| {
         let (at, cycle) = (stop.at_s, stop.cycle);
         format!(", stopped {at:.3} s after the first cycle, in cycle {cycle}")
     });
     out.line(format!(
         "{}, cycle {}{}, {}",
-        story.machine,
-        duration::show(story.cycle_ns),
+        fault_report.machine,
+        duration::show(fault_report.cycle_ns),
         stop.unwrap_or_default(),
-        match story.unix_time {
+        match fault_report.unix_time {
             Some(seconds) => format!("at {} UTC", utc(seconds)),
             None => "in virtual time".to_owned(),
         }
     ));
-    let also: Vec<String> = story.also.iter().map(ToString::to_string).collect();
+    let also: Vec<String> = fault_report.also.iter().map(ToString::to_string).collect();
     for (title, items) in [("What to do", hints), ("Also seen", &also)] {
         if !items.is_empty() {
             out.heading(title);
         }
         items.iter().for_each(|item| out.item("- ", item));
     }
-    let stop = story.events.iter().position(|event| event.failure);
+    let stop = fault_report.events.iter().position(|event| event.failure);
     let until = stop
         .map_or(usize::MAX, |stop| stop + 10)
-        .min(story.events.len());
-    let events = report::events(&story.events[until.saturating_sub(40)..until]);
+        .min(fault_report.events.len());
+    let events = report::events(&fault_report.events[until.saturating_sub(40)..until]);
     out.section("What happened, in order", events);
-    devices(story, &mut out);
-    axes(story, &mut out);
-    out.section("This computer", host(story));
-    bus_cycles(story, &mut out);
-    axis_cycles(story, &mut out);
+    devices(fault_report, &mut out);
+    axes(fault_report, &mut out);
+    out.section("This computer", host(fault_report));
+    bus_cycles(fault_report, &mut out);
+    axis_cycles(fault_report, &mut out);
     out
 }
 
-fn devices(story: &FaultReport, out: &mut Document) {
+fn devices(fault_report: &FaultReport, out: &mut Document) {
     let mut table = Table::new("SubDevice|at|connected to|state|AL status code");
     let mut ports = Table::new("SubDevice|port|CRC|PHY|forwarded|lost links");
-    for device in &story.devices {
+    for device in &fault_report.devices {
         let state = match (&device.state, device.came_back) {
             (Some(state), true) => format!("{state}, after it had been away"),
             (Some(state), false) => state.clone(),
@@ -113,7 +115,7 @@ fn devices(story: &FaultReport, out: &mut Document) {
         report::port_rows(&mut ports, &device.name, errors);
     }
     out.section("SubDevices", table);
-    for device in &story.devices {
+    for device in &fault_report.devices {
         for line in details(device) {
             out.line(format!("{}: {line}", device.name));
         }
@@ -177,9 +179,9 @@ fn counted(count: u8) -> String {
     }
 }
 
-fn axes(story: &FaultReport, out: &mut Document) {
+fn axes(fault_report: &FaultReport, out: &mut Document) {
     let mut table = Table::new("axis|state at the end|fault or trip");
-    for axis in &story.axes {
+    for axis in &fault_report.axes {
         let why = [&axis.fault, &axis.trip].into_iter().flatten();
         let why: Vec<&str> = why.map(String::as_str).collect();
         table.row(cells![axis.name, axis.state, why.join("; ")]);
@@ -187,8 +189,8 @@ fn axes(story: &FaultReport, out: &mut Document) {
     out.section("Axes", table);
 }
 
-fn host(story: &FaultReport) -> Table {
-    let (counters, link) = (&story.counters, &story.link);
+fn host(fault_report: &FaultReport) -> Table {
+    let (counters, link) = (&fault_report.counters, &fault_report.link);
     let protocols = link.foreign.saturating_sub(link.main_devices);
     let rows = [
         ("cycles", counters.cycles),
@@ -218,11 +220,11 @@ fn same(a: &CycleRecord, b: &CycleRecord, cycle_ns: u64) -> bool {
 
 /// Returns the cycles with a change; if there are too many, those nearest to the stop.
 fn notable(
-    story: &FaultReport,
+    fault_report: &FaultReport,
     changed: impl Fn(&CycleRecord, &CycleRecord) -> bool,
 ) -> Vec<&CycleRecord> {
-    let cycles = &story.cycles;
-    let stop = story.stop.map(|stop| stop.cycle);
+    let cycles = &fault_report.cycles;
+    let stop = fault_report.stop.map(|stop| stop.cycle);
     let mut found: Vec<&CycleRecord> = Vec::new();
     for (n, page) in cycles.iter().enumerate() {
         let ends = n == 0 || n + 1 == cycles.len();
@@ -242,9 +244,9 @@ fn notable(
     found
 }
 
-fn bus_cycles(story: &FaultReport, out: &mut Document) {
+fn bus_cycles(fault_report: &FaultReport, out: &mut Document) {
     let mut table = Table::new("cycle|time|frames|wkc|AL status|woke late");
-    for page in notable(story, |a, b| !same(a, b, story.cycle_ns)) {
+    for page in notable(fault_report, |a, b| !same(a, b, fault_report.cycle_ns)) {
         let cycle = &page.cycle;
         let wkc = match cycle.wkc {
             (seen, expected) if seen == expected => seen.to_string(),
@@ -261,25 +263,25 @@ fn bus_cycles(story: &FaultReport, out: &mut Document) {
             about(cycle.late),
         ]);
     }
-    let count = story.cycles.len();
+    let count = fault_report.cycles.len();
     let title = format!("The last {count} cycles: those in which something on the bus changed");
     out.section(title, table);
 }
 
-fn axis_cycles(story: &FaultReport, out: &mut Document) {
+fn axis_cycles(fault_report: &FaultReport, out: &mut Document) {
     let words = |axis: &AxisCycle| (axis.statusword, axis.controlword, axis.mode, axis.fresh);
     let differs =
         |a: &CycleRecord, b: &CycleRecord| !a.axes.iter().map(words).eq(b.axes.iter().map(words));
     let ends = [
-        story.stop.map(|stop| stop.cycle),
-        story.cycles.last().map(|c| c.cycle.number),
+        fault_report.stop.map(|stop| stop.cycle),
+        fault_report.cycles.last().map(|c| c.cycle.number),
     ];
     let mut table = Table::new("cycle|axis|Statusword|state|target|actual|error|% torque");
-    let mut last = vec![None; story.axes.len()];
+    let mut last = vec![None; fault_report.axes.len()];
     let mut rows = 0;
-    for page in notable(story, differs) {
+    for page in notable(fault_report, differs) {
         let number = page.cycle.number;
-        for ((of, axis), last) in story.axes.iter().zip(&page.axes).zip(&mut last) {
+        for ((of, axis), last) in fault_report.axes.iter().zip(&page.axes).zip(&mut last) {
             let now = words(axis);
             if last.replace(now) == Some(now) && !ends.contains(&Some(number)) {
                 continue;
@@ -324,7 +326,7 @@ pub(crate) enum ReportDestination {
 
 /// Writes the page, and the fault report as JSON next to it.
 pub(crate) fn keep(
-    story: &FaultReport,
+    fault_report: &FaultReport,
     hints: &[String],
     keep: &ReportDestination,
 ) -> Result<Option<PathBuf>, Failure> {
@@ -333,7 +335,8 @@ pub(crate) fn keep(
         ReportDestination::File(path) => path.clone(),
         ReportDestination::Folder(folder) => {
             make_room(folder);
-            let [year, month, day, hour, minute, second] = civil(story.unix_time.unwrap_or(0));
+            let [year, month, day, hour, minute, second] =
+                civil(fault_report.unix_time.unwrap_or(0));
             let name =
                 format!("{PREFIX}{year:04}{month:02}{day:02}-{hour:02}{minute:02}{second:02}.txt");
             folder.join(name)
@@ -348,9 +351,10 @@ pub(crate) fn keep(
             ),
         )
     };
-    std::fs::write(&path, page(story, hints).text(Some(WIDTH))).map_err(|e| failed(&path, &e))?;
+    std::fs::write(&path, page(fault_report, hints).text(Some(WIDTH)))
+        .map_err(|e| failed(&path, &e))?;
     let json = path.with_extension("json");
-    let text = serde_json::to_string(story).unwrap_or_default();
+    let text = serde_json::to_string(fault_report).unwrap_or_default();
     std::fs::write(&json, text + "\n").map_err(|e| failed(&json, &e))?;
     Ok(Some(path))
 }
@@ -370,12 +374,12 @@ fn make_room(folder: &Path) {
     // File names contain the time, so this sorts by time.
     reports.sort();
     let surplus = reports.len().saturating_sub(KEPT);
-    for story in reports.iter().take(surplus) {
-        let _ = std::fs::remove_file(story);
-        let _ = std::fs::remove_file(story.with_extension("json"));
+    for fault_report in reports.iter().take(surplus) {
+        let _ = std::fs::remove_file(fault_report);
+        let _ = std::fs::remove_file(fault_report.with_extension("json"));
         note(&format!(
             "{}: the oldest fault report is removed",
-            story.display()
+            fault_report.display()
         ));
     }
 }

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use ecaxis_axis::Mode;
-use ecaxis_master::bringup::Step;
+use ecaxis_master::bringup::{Step, StepTime};
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{Bus, Nic, TorqueUnit};
 use ecaxis_master::session::{AxisLine, Observer, Progress, Status};
@@ -18,6 +18,8 @@ const STATUS_PERIOD: Duration = Duration::from_secs(1);
 pub(crate) struct ProgressPrinter {
     /// `None` prints separate lines.
     bar: Option<ProgressBar>,
+    /// Print where the time of the bring-up went.
+    times: bool,
     clock: Clock,
     cycle_ns: u64,
     /// The interface; hints depend on it.
@@ -38,6 +40,7 @@ impl ProgressPrinter {
         });
         Self {
             bar,
+            times: plain,
             clock,
             cycle_ns: bus.cycle_ns,
             nic: bus.nic.clone(),
@@ -112,6 +115,10 @@ impl Observer for ProgressPrinter {
                     "the group `{group}` has been reset and can be enabled again"
                 ));
             }
+            Progress::BringUpTimes(steps) if self.times => {
+                note(bring_up_times(steps).trim_end());
+            }
+            Progress::BringUpTimes(_) => {}
             Progress::PhaseLocked => note("frames leave in phase with SYNC0"),
             Progress::Enabled { axes: 1 } => note("1 axis in Operation enabled"),
             Progress::Enabled { axes } => note(&format!("{axes} axes in Operation enabled")),
@@ -140,6 +147,24 @@ impl Drop for ProgressPrinter {
     fn drop(&mut self) {
         output::detach_bar();
     }
+}
+
+/// Returns a table of the steps of a bring-up.
+fn bring_up_times(steps: &[StepTime]) -> String {
+    let ms = |ns: u64| format!("{:.1}", ns as f64 / 1e6);
+    let mut text = format!(
+        "{:<26}{:>9}{:>9}  slowest device\n",
+        "bring-up", "from ms", "took ms"
+    );
+    for step in steps {
+        let (began, took) = (ms(step.began_ns), ms(step.took_ns));
+        text += &format!("  {:<24}{began:>9}{took:>9}", step.name);
+        if let Some((device, took)) = &step.slowest {
+            text += &format!("  `{device}`, {} ms", ms(*took));
+        }
+        text.push('\n');
+    }
+    text
 }
 
 fn status_line(status: &Status, cycle_ns: u64) -> String {

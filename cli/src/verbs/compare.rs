@@ -151,7 +151,7 @@ fn look(bus: Bus, machine: &Machine, args: &Args) -> Result<(Scan, Comparison), 
             intrude,
             heard,
         };
-        let mut report = |step: scan::Step| {
+        let mut report = |step: scan::ScanStep| {
             let (what, position, of) = (step.what, step.position, step.of);
             bus::passing(&format!("{what} position {position}, {of} in all"));
         };

@@ -124,7 +124,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let Outcome {
         summary,
         result: ended,
-        story,
+        fault_report,
         ..
     } = session::run(machine, options, stop, &mut teller);
     drop(teller);
@@ -139,8 +139,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         failure
     });
     failure = failure.or_else(|| summary.as_ref().and_then(unfinished));
-    if let (Some(story), Some(failure)) = (&story, &mut failure) {
-        print_fault_report(args, story, failure, &nic);
+    if let (Some(fault_report), Some(failure)) = (&fault_report, &mut failure) {
+        print_fault_report(args, fault_report, failure, &nic);
     }
     let written = if args.json {
         print_json(&json!({
@@ -149,7 +149,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             "hints": failure.as_ref().map_or(&[][..], |f| &f.hints),
             "problems": [],
             "summary": summary,
-            "story": story,
+            "fault_report": fault_report,
         }))
     } else {
         summary
@@ -185,13 +185,13 @@ fn stopped_since(summary: &Summary) -> Option<Failure> {
 
 /// Prints the fault report in short on stderr and writes it to a file. If the cause is known, its
 /// advice replaces the advice for the error.
-fn print_fault_report(args: &Args, story: &FaultReport, failure: &mut Failure, nic: &Nic) {
-    let advice = hints::cause(&story.cause);
+fn print_fault_report(args: &Args, fault_report: &FaultReport, failure: &mut Failure, nic: &Nic) {
+    let advice = hints::diagnosed(&fault_report.cause);
     // The recorded bus cannot be fixed during a replay.
     if !advice.is_empty() && args.replay.is_none() {
         failure.hints = advice;
     }
-    let short = fault_report::short(story);
+    let short = fault_report::short(fault_report);
     if !short.is_empty() {
         note(short.trim_end());
     }
@@ -202,7 +202,7 @@ fn print_fault_report(args: &Args, story: &FaultReport, failure: &mut Failure, n
         // A simulated run is repeatable, so its fault report is not kept.
         (None, Nic::Sim) => ReportDestination::No,
     };
-    match fault_report::keep(story, &failure.hints, &keep) {
+    match fault_report::keep(fault_report, &failure.hints, &keep) {
         Ok(Some(path)) => {
             failure.after = Some(format!(
                 "  full fault report: {}, and as JSON next to it",

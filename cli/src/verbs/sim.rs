@@ -212,7 +212,7 @@ fn report(stats: &ServeStats, segment: &Segment) -> Value {
         })
         .collect();
     let faults: Vec<Value> = segment
-        .fault_reports()
+        .fault_progress()
         .map(|fault| {
             json!({
                 "line": fault.line,

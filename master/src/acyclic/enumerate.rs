@@ -177,12 +177,12 @@ pub async fn at<const N: usize>(
     let mut bytes = [0; N];
     match wire.read_at(position, register, &mut bytes).await {
         Ok(1) => Ok(bytes),
-        answer => Err(silent(position, step, answer)),
+        answer => Err(no_answer(position, step, answer)),
     }
 }
 
 /// Returns the error of a device that should have answered.
-fn silent(position: u16, action: &'static str, answer: Result<u16, DatagramError>) -> Error {
+fn no_answer(position: u16, action: &'static str, answer: Result<u16, DatagramError>) -> Error {
     match answer {
         Ok(_) | Err(DatagramError::Timeout { .. }) => Cause::Silent { position, action }.into(),
         Err(error) => Error::from(Cause::Datagram(error)).with_action(action),
@@ -219,7 +219,7 @@ pub async fn address(wire: &DatagramClient, found: &mut [EnumeratedDevice]) -> R
             .await
         {
             Ok(1) => {}
-            answer => return Err(silent(position, STEP, answer)),
+            answer => return Err(no_answer(position, STEP, answer)),
         }
         device.station = next;
         taken.push(next);

@@ -1,63 +1,84 @@
-//! SYNC0 on every device whose ESI OpMode uses it.
+//! The clocks, and SYNC0 on every device whose ESI OpMode uses it.
 //!
-//! ethercrab has measured the propagation delays, set offsets and run the static drift
-//! compensation. It would start SYNC0 at a whole multiple of the cycle regardless of the ESI.
-//! Therefore start, shift, cycle and AssignActivate are written here (ETG.1000.4, 6.4.2; ETG.2000,
-//! Dc).
+//! ethercrab has measured the propagation delays. It would start SYNC0 at a whole multiple of the
+//! cycle regardless of the ESI. Therefore offsets, start, shift, cycle and AssignActivate are
+//! written here (ETG.1000.4, 6.4.2; ETG.2000, Dc).
+
+use std::cell::Cell;
+use std::future::Future;
+use std::time::Duration;
 
 use super::device::{read, write};
 use super::{BusDevice, Step};
 use crate::acyclic::DeviceRef;
-use crate::clock::Nanos;
+use crate::clock::{self, Nanos};
+use crate::concurrent::try_join_all;
 use crate::config::Machine;
 use crate::datagram::DatagramClient;
 use crate::mailbox::MailboxTransport;
 use crate::report::{Cause, Error};
+use crate::rt::image::ImagePlan;
 use crate::rt::phase::ClockPlan;
 use ecaxis_ecat::registers;
 
 const STEP: &str = "starting SYNC0";
 
+/// The pause between two distributions of the time before the cycle.
+const DISTRIBUTION_PERIOD: Duration = Duration::from_micros(100);
+/// The time in ns that bring-up spends on settling alone.
+const SETTLING_TIMEOUT: Nanos = 100_000_000;
+
 /// The first pulse must still be in the future when the last device receives its start time.
-const START_DELAY: Nanos = 100_000_000;
-const START_DELAY_PER_DEVICE: Nanos = 5_000_000;
+const START_DELAY: Nanos = 20_000_000;
+const START_DELAY_PER_DEVICE: Nanos = 500_000;
+/// A clock of 32 bits takes a time that is half a wrap ahead, 2.1 s, for the past.
+const MAX_START_DELAY: Nanos = 2_000_000_000;
 /// The minimum of that delay left after the last device was configured.
 const START_MARGIN: Nanos = 10_000_000;
+/// SYNC0 cycles without relation to the bus cycle have no finer pattern than this.
+const SHORTEST_PATTERN: i64 = 1_000;
 /// Lost datagrams can use up the delay; then the start is repeated with a longer one.
-const MAX_ATTEMPTS: u32 = 3;
+const MAX_ATTEMPTS: u32 = 4;
 
 /// Returns `None` if no device uses distributed clocks.
 pub(super) async fn configure(
-    wire: &impl MailboxTransport,
+    wire: &DatagramClient,
     machine: &Machine,
-    devices: &[BusDevice],
-    progress: &mut dyn FnMut(Step),
+    devices: &mut [BusDevice],
+    image: &ImagePlan,
+    progress: &dyn Fn(Step),
 ) -> Result<Option<ClockPlan>, Error> {
+    let reference = reference(devices);
+    if let Some(reference) = &reference {
+        find_followers(wire, devices, reference).await?;
+    }
     let wanting: Vec<_> = machine
         .devices
         .iter()
-        .zip(devices)
+        .zip(&*devices)
         .filter_map(|(config, device)| Some((config.selection.dc.as_ref()?, device)))
         .collect();
     if let Some((_, device)) = wanting.iter().find(|(_, device)| !device.dc) {
         return Err(Cause::NoClock.with_device(&device.at));
     }
-    let reference = devices
-        .iter()
-        .filter(|d| d.dc)
-        .min_by_key(|d| d.at.position);
     let (false, Some(reference)) = (wanting.is_empty(), reference) else {
         return Ok(None);
     };
+    if let Some((_, device)) = wanting.iter().find(|(_, device)| !device.follows) {
+        return Err(Cause::ClockDoesNotFollow.with_device(&device.at));
+    }
 
     let cycle = machine.bus.cycle_ns;
     let mut ahead = START_DELAY
         + START_DELAY_PER_DEVICE * u64::try_from(wanting.len()).unwrap_or(u64::MAX / 1_000_000_000);
     for _ in 0..MAX_ATTEMPTS {
-        let now = system_time(wire, reference).await?;
-        let start = (now.wrapping_add(ahead) / cycle + 1).wrapping_mul(cycle);
-        for (dc, device) in &wanting {
-            let first = start.wrapping_add_signed(i64::from(dc.sync0_shift_ns));
+        let now = system_time(wire, &reference).await?;
+        let release_at = clock::now();
+        ahead = ahead.min(MAX_START_DELAY);
+        let start = now.wrapping_add(ahead);
+        let starts = wanting.iter().map(async |(dc, device)| {
+            let own = system_time(wire, &device.at).await?;
+            let first = extend(start.wrapping_add_signed(i64::from(dc.sync0_shift_ns)), own);
             for (register, data) in [
                 (registers::DC_CYCLIC_CONTROL, &[0, 0][..]),
                 (registers::DC_START_TIME, &first.to_le_bytes()),
@@ -70,26 +91,38 @@ pub(super) async fn configure(
             ] {
                 write(wire, &device.at, STEP, register, data).await?;
             }
-        }
+            Ok::<(), Error>(())
+        });
+        try_join_all(starts).await?;
         // A device with a start time in the past never generates a pulse.
-        let shifts = || wanting.iter().map(|(dc, _)| i64::from(dc.sync0_shift_ns));
-        let first = start.wrapping_add_signed(shifts().min().unwrap_or(0));
-        let reported = system_time(wire, reference).await?;
+        let shifts = wanting.iter().map(|(dc, _)| i64::from(dc.sync0_shift_ns));
+        let first = start.wrapping_add_signed(shifts.min().unwrap_or(0));
+        let reported = system_time(wire, &reference).await?;
         tracing::debug!(start, reported, "SYNC0 started");
-        if reported.wrapping_add(START_MARGIN) < first {
+        if extend(first, reported) > reported.wrapping_add(START_MARGIN) {
             progress(Step::Clocks {
-                reference: reference.at.name.clone(),
+                reference: reference.name.clone(),
                 devices: wanting.len(),
             });
+            let behind = |device: &BusDevice| i64::from(device.propagation_delay);
+            let first_delay = devices.iter().find(|device| device.at == reference);
+            let first_delay = first_delay.map_or(0, behind);
+            let pulses = wanting.iter().map(|(dc, device)| Pulses {
+                shift: i64::from(dc.sync0_shift_ns),
+                cycle: u64::from(dc.sync0_cycle_ns),
+                delay: behind(device) - first_delay,
+            });
+            let after = release_time(cycle, image.wire_ns(), pulses);
             return Ok(Some(ClockPlan {
-                reference: reference.at.station,
+                reference: reference.station,
                 cycle_ns: cycle,
-                release: start.wrapping_add(between_pulses(cycle, shifts())),
+                release: start.wrapping_add(after) as u32,
+                release_at: release_at + ahead + after,
             }));
         }
         ahead *= 2;
     }
-    Err(Cause::NoStart.with_device(&reference.at))
+    Err(Cause::NoStart.with_device(&reference))
 }
 
 /// Stops SYNC0 and SYNC1 of devices that are back in PreOp or Init. Active pulses would indicate a
@@ -107,16 +140,14 @@ pub(crate) async fn stop(wire: &impl MailboxTransport, stations: impl Iterator<I
     }
 }
 
-/// Sets the clocks again, with the first device that has a system time as reference. ethercrab uses
-/// the first device with receive times. If that device has no system time, ethercrab has given all
-/// other devices a time of zero.
-pub(super) async fn set_again(wire: &DatagramClient, devices: &[BusDevice]) -> Result<(), Error> {
+/// Sets the clocks, with the first device that has a system time as reference. ethercrab uses the
+/// first device with receive times, even if it has no system time. Its offsets are old by the time
+/// of the changes to PreOp, in which the clocks drift apart.
+pub(super) async fn set_offsets(wire: &DatagramClient, devices: &[BusDevice]) -> Result<(), Error> {
     const STEP: &str = "setting the clocks";
     /// The value after reset; writing it restarts the control loop at the frequency of the
     /// oscillator.
     const DEFAULT_SPEED_START: u16 = 0x1000;
-    /// The number that ethercrab sends.
-    const STATIC_SYNC_CYCLES: u32 = 1_000;
 
     let clocks = || devices.iter().filter(|device| device.dc);
     let Some(reference) = clocks().min_by_key(|device| device.at.position) else {
@@ -126,44 +157,107 @@ pub(super) async fn set_again(wire: &DatagramClient, devices: &[BusDevice]) -> R
         let behind = device.propagation_delay;
         behind.saturating_sub(reference.propagation_delay)
     };
-    for device in clocks() {
+    let restarts = clocks().map(async |device| {
         let start = DEFAULT_SPEED_START.to_le_bytes();
         let delay = delay(device).to_le_bytes();
         let at = &device.at;
         write(wire, at, STEP, registers::DC_SPEED_COUNTER_START, &start).await?;
-        write(wire, at, STEP, registers::DC_SYSTEM_TIME_DELAY, &delay).await?;
-    }
-    let failed = |error| {
+        write(wire, at, STEP, registers::DC_SYSTEM_TIME_DELAY, &delay).await
+    });
+    try_join_all(restarts).await?;
+    let latched = wire.write_all(registers::DC_RECEIVE_TIME, &[0; 4]).await;
+    latched.map_err(|error| {
         Cause::Datagram(error)
             .with_device(&reference.at)
             .with_action(STEP)
-    };
-    wire.write_all(registers::DC_RECEIVE_TIME, &[0; 4])
-        .await
-        .map_err(failed)?;
+    })?;
     let offset = read(wire, &reference.at, STEP, registers::DC_SYSTEM_TIME_OFFSET).await?;
     let local = read(wire, &reference.at, STEP, registers::DC_RECEIVE_TIME_UNIT).await?;
     // The system time at which the frame was at the reference clock.
     let then = u64::from_le_bytes(local).wrapping_add(u64::from_le_bytes(offset));
-    for device in clocks().filter(|device| device.at != reference.at) {
-        let local = read(wire, &device.at, STEP, registers::DC_RECEIVE_TIME_UNIT).await?;
+    let others = clocks().filter(|device| device.at != reference.at);
+    let offsets = others.map(async |device| {
+        let at = &device.at;
+        let local = read(wire, at, STEP, registers::DC_RECEIVE_TIME_UNIT).await?;
         let there = then.wrapping_add(u64::from(delay(device)));
         let offset = there.wrapping_sub(u64::from_le_bytes(local)).to_le_bytes();
-        write(
-            wire,
-            &device.at,
-            STEP,
-            registers::DC_SYSTEM_TIME_OFFSET,
-            &offset,
-        )
-        .await?;
+        write(wire, at, STEP, registers::DC_SYSTEM_TIME_OFFSET, &offset).await
+    });
+    try_join_all(offsets).await.map(|_| ())
+}
+
+/// Returns the reference clock: the first device with a system time.
+pub(super) fn reference(devices: &[BusDevice]) -> Option<DeviceRef> {
+    let clocks = devices.iter().filter(|device| device.dc);
+    let first = clocks.min_by_key(|device| device.at.position);
+    first.map(|device| device.at.clone())
+}
+
+/// Distributes the time of the reference clock while `work` runs, so that the clocks compensate
+/// their drift meanwhile.
+pub(super) async fn distribute_during<T>(
+    wire: &DatagramClient,
+    reference: Option<&DeviceRef>,
+    work: impl Future<Output = T>,
+) -> T {
+    let Some(reference) = reference else {
+        return work.await;
+    };
+    let over = Cell::new(false);
+    let work = async {
+        let done = work.await;
+        over.set(true);
+        done
+    };
+    let distribution = async {
+        while !over.get() {
+            // A device that no longer answers fails in `work`.
+            let _ = wire.distribute_time(reference.station).await;
+            wire.delay(DISTRIBUTION_PERIOD).await;
+        }
+    };
+    tokio::join!(work, distribution).0
+}
+
+/// Distributes the time until all clocks with SYNC0 have settled, within [`SETTLING_TIMEOUT`].
+/// Returns false if one has not: then the cycle continues, and Op waits for it.
+pub(super) async fn settle(
+    wire: &DatagramClient,
+    machine: &Machine,
+    devices: &[BusDevice],
+) -> Result<bool, Error> {
+    let Some(reference) = reference(devices) else {
+        return Ok(true);
+    };
+    let window = machine.bus.sync_window_ns;
+    let uses_sync = machine.devices.iter().zip(devices);
+    let others: Vec<_> = uses_sync
+        .filter(|(config, _)| config.selection.dc.is_some())
+        .map(|(_, device)| device)
+        .filter(|device| device.dc && device.at != reference)
+        .collect();
+    let end = wire.now().saturating_add(SETTLING_TIMEOUT);
+    loop {
+        let each = others
+            .iter()
+            .map(|device| read(wire, &device.at, STEP, registers::DC_SYSTEM_TIME_DIFFERENCE));
+        let differences = try_join_all(each).await?;
+        // Bit 31 is the sign.
+        let amount = |difference: &[u8; 4]| u32::from_le_bytes(*difference) & 0x7fff_ffff;
+        if differences.iter().all(|d| u64::from(amount(d)) <= window) {
+            return Ok(true);
+        }
+        if wire.now() >= end {
+            return Ok(false);
+        }
+        let distributed = wire.distribute_time(reference.station).await;
+        distributed.map_err(|error| {
+            Cause::Datagram(error)
+                .with_device(&reference)
+                .with_action(STEP)
+        })?;
+        wire.delay(DISTRIBUTION_PERIOD).await;
     }
-    for _ in 0..STATIC_SYNC_CYCLES {
-        wire.distribute_time(reference.at.station)
-            .await
-            .map_err(failed)?;
-    }
-    Ok(())
 }
 
 /// True if the device has a system time. Some devices only latch receive times for the delay
@@ -181,16 +275,79 @@ pub(super) async fn has_system_time(
     Ok(counter > 0)
 }
 
-async fn system_time(wire: &impl MailboxTransport, reference: &BusDevice) -> Result<u64, Error> {
-    let time = read(wire, &reference.at, STEP, registers::DC_SYSTEM_TIME).await?;
+/// Finds the devices that follow the reference clock. If the working counter of the distributed time
+/// (FRMW) shows that some do not, each device receives almost its own time.
+async fn find_followers(
+    wire: &DatagramClient,
+    devices: &mut [BusDevice],
+    reference: &DeviceRef,
+) -> Result<(), Error> {
+    let failed = |at: &DeviceRef, error| Cause::Datagram(error).with_device(at).with_action(STEP);
+    let counted = wire.distribute_time(reference.station).await;
+    let counted = counted.map_err(|error| failed(reference, error))?;
+    let all = devices.iter().filter(|device| device.dc).count() <= usize::from(counted);
+    for device in devices {
+        device.follows = device.dc && (all || device.at == *reference);
+        if device.dc && !device.follows {
+            let time = system_time(wire, &device.at).await?.to_le_bytes();
+            let at = &device.at;
+            let written = wire
+                .write(at.station, registers::DC_SYSTEM_TIME, &time)
+                .await;
+            device.follows = written.map_err(|error| failed(at, error))? > 0;
+            tracing::debug!(device = %at, follows = device.follows, "system time written");
+        }
+    }
+    Ok(())
+}
+
+async fn system_time(wire: &impl MailboxTransport, at: &DeviceRef) -> Result<u64, Error> {
+    let time = read(wire, at, STEP, registers::DC_SYSTEM_TIME).await?;
     Ok(u64::from_le_bytes(time))
 }
 
-/// Returns the middle of the longest pause between the SYNC0 pulses of a cycle, in ns after the
-/// pulse without shift. A frame there has the largest distance from every pulse.
-fn between_pulses(cycle: u64, shifts: impl Iterator<Item = i64>) -> u64 {
+/// Returns the time next to `near` with the low 32 bits of `time`. All clocks have these bits in
+/// common. Some clocks have no others, so the higher ones of two clocks may differ.
+fn extend(time: u64, near: u64) -> u64 {
+    let ahead = (time as u32).wrapping_sub(near as u32).cast_signed();
+    near.wrapping_add_signed(i64::from(ahead))
+}
+
+/// The SYNC0 pulses of a device.
+#[derive(Debug, Clone, Copy)]
+struct Pulses {
+    /// The first pulse after the common start.
+    shift: i64,
+    cycle: u64,
+    /// The propagation delay from the reference clock.
+    delay: i64,
+}
+
+/// Returns when a cycle's frames should begin to pass the reference clock, in ns after the common
+/// start of SYNC0 and less than a cycle.
+///
+/// Every device has the same distance from a pulse to the first bit of the frames as from their last
+/// bit to the next pulse, or a larger one. `frames` is the time from the first bit to the last one.
+fn release_time(cycle: u64, frames: u64, devices: impl Iterator<Item = Pulses>) -> u64 {
     let period = i64::try_from(cycle).unwrap_or(i64::MAX).max(1);
-    let mut pulses: Vec<i64> = shifts.map(|shift| shift.rem_euclid(period)).collect();
+    let frames = i64::try_from(frames).unwrap_or(i64::MAX);
+    // Pulses of other cycles than the bus cycle repeat in this pattern.
+    let step = |device: &Pulses| {
+        let step = greatest_common_divisor(device.cycle, cycle);
+        i64::try_from(step).unwrap_or(period).max(SHORTEST_PATTERN)
+    };
+    let devices: Vec<_> = devices.map(|device| (step(&device), device)).collect();
+    let longest = devices.iter().map(|(step, _)| *step).max();
+    let mut pulses = Vec::new();
+    for (step, device) in devices {
+        // No frame fits between the pulses of this device: it must not move those of the others.
+        if step <= frames && Some(step) != longest {
+            continue;
+        }
+        let first = device.shift - device.delay;
+        let repeated = (0..).map(|n| n * step).take_while(|&after| after < period);
+        pulses.extend(repeated.map(|after| (first + after).rem_euclid(period)));
+    }
     pulses.sort_unstable();
     let following = pulses.iter().skip(1).copied();
     let wrapped = pulses.first().map(|first| first + period);
@@ -200,15 +357,33 @@ fn between_pulses(cycle: u64, shifts: impl Iterator<Item = i64>) -> u64 {
         .map(|(&pulse, next)| (next - pulse, pulse))
         .max_by_key(|&(gap, start)| (gap, -start))
         .unwrap_or((period, 0));
-    (start + gap / 2).rem_euclid(period).unsigned_abs()
+    (start + gap / 2 - frames / 2)
+        .rem_euclid(period)
+        .unsigned_abs()
+}
+
+fn greatest_common_divisor(a: u64, b: u64) -> u64 {
+    match a {
+        0 => b,
+        _ => greatest_common_divisor(b % a, a),
+    }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::between_pulses;
+    use super::*;
+
+    fn release(cycle: u64, frames: u64, devices: &[(i64, u64, i64)]) -> u64 {
+        let pulses = devices.iter().map(|&(shift, cycle, delay)| Pulses {
+            shift,
+            cycle,
+            delay,
+        });
+        release_time(cycle, frames, pulses)
+    }
 
     #[test]
-    fn between_pulses_returns_the_longest_pause() {
+    fn release_time_is_in_the_middle_of_the_longest_pause() {
         for (shifts, expected) in [
             (&[0][..], 500_000),
             (&[500_000], 0),
@@ -217,11 +392,69 @@ mod tests {
             (&[0, 500_000], 250_000),
             (&[], 500_000),
         ] {
-            assert_eq!(
-                between_pulses(1_000_000, shifts.iter().copied()),
-                expected,
-                "{shifts:?}"
-            );
+            let devices: Vec<_> = shifts.iter().map(|&at| (at, 1_000_000, 0)).collect();
+            assert_eq!(release(1_000_000, 0, &devices), expected, "{shifts:?}");
+        }
+    }
+
+    /// ETG.2000, `CycleTimeSync0`: a factor of -2 or -4, or a fixed time, makes SYNC0 faster than
+    /// the bus; a positive factor makes it slower.
+    #[test]
+    fn release_time_avoids_the_pulses_of_faster_and_slower_sync0() {
+        for (devices, expected) in [
+            (&[(0, 500_000, 0)][..], 250_000),
+            (&[(0, 250_000, 0)], 125_000),
+            (&[(62_500, 125_000, 0)], 125_000),
+            (&[(0, 4_000_000, 0)], 500_000),
+            // Between the third and the fourth pulse of the first device.
+            (
+                &[
+                    (0, 250_000, 0),
+                    (600_000, 1_000_000, 0),
+                    (100_000, 1_000_000, 0),
+                    (400_000, 1_000_000, 0),
+                ],
+                875_000,
+            ),
+        ] {
+            assert_eq!(release(1_000_000, 0, devices), expected, "{devices:?}");
+        }
+    }
+
+    /// A device whose pulses are closer than the frames are long does not move the frames towards the
+    /// pulse of a drive: 60 µs of frames, and SYNC0 cycles of 10 µs and of no common divisor.
+    #[test]
+    fn release_time_ignores_pulses_that_no_frame_fits_between() {
+        for fast in [10_000, 300_007] {
+            let devices = [(0, 1_000_000, 0), (0, fast, 500)];
+            assert_eq!(release(1_000_000, 60_000, &devices), 470_000, "{fast} ns");
+        }
+    }
+
+    /// The pause before the first bit at the first device is as long as that after the last bit at
+    /// the last device: each frame arrives later by the propagation delay (ETG.1000.4, distributed
+    /// clocks).
+    #[test]
+    fn release_time_leaves_room_for_the_frames_and_their_propagation() {
+        let cycle = 1_000_000;
+        let frames = 120_000;
+        let devices: Vec<_> = (0..100).map(|n| (0, cycle, n * 1_000)).collect();
+        let start = release(cycle, frames, &devices) as i64;
+        let before = start;
+        let after = cycle as i64 - (start + 99_000 + frames as i64);
+        assert_eq!(before - after, 0, "{before} {after}");
+    }
+
+    #[test]
+    fn extend_finds_the_nearest_time_across_a_wrap() {
+        const WRAP: u64 = 1 << 32;
+        for (time, near, expected) in [
+            (5, WRAP - 5, WRAP + 5),
+            (WRAP - 5, 5 * WRAP + 5, 5 * WRAP - 5),
+            (7 * WRAP + 9, 3, 9),
+            (1 << 30, 9 * WRAP, 9 * WRAP + (1 << 30)),
+        ] {
+            assert_eq!(extend(time, near), expected, "{time} {near}");
         }
     }
 }

@@ -33,7 +33,7 @@ pub(super) async fn start_up(
     config: &DeviceConfig,
     device: &mut BusDevice,
     moment: StartupPhase,
-    progress: &mut dyn FnMut(Step),
+    progress: &dyn Fn(Step),
 ) -> Result<(), Error> {
     let due = |transition: &str| (transition == "SO") == (moment == StartupPhase::InSafeOp);
     let list: Vec<_> = config

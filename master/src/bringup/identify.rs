@@ -72,7 +72,7 @@ pub(super) async fn explain_scan(
     if positions(machine).any(|(position, _)| position >= count) {
         let there = present(wire, machine, &all).await;
         let missing = missing_devices(machine, &there);
-        return not_all(machine, usize::from(count), missing);
+        return devices_missing(machine, usize::from(count), missing);
     }
     if matches!(error, Error::Topology)
         && let Some(at) = topology::reversed(all.iter().map(|found| found.dl_status))
@@ -156,7 +156,7 @@ pub(super) async fn assign(
     main_device: &MainDevice<'static>,
     group: &Group,
     machine: &Machine,
-    progress: &mut dyn FnMut(Step),
+    progress: &dyn Fn(Step),
 ) -> Result<Vec<u16>, report::Error> {
     let mut found = Vec::with_capacity(group.len());
     for sub_device in group.iter(main_device) {
@@ -215,7 +215,7 @@ pub(super) async fn assign(
         .collect();
     if missing {
         let missing = missing_devices(machine, &there);
-        return Err(not_all(machine, found.len(), missing));
+        return Err(devices_missing(machine, found.len(), missing));
     }
 
     for (config, &position) in machine.devices.iter().zip(&order) {
@@ -236,7 +236,7 @@ pub(super) async fn assign(
         if !is_product && belongs_elsewhere(machine, identity) {
             let missing = missing_devices(machine, &there);
             if !missing.is_empty() {
-                return Err(not_all(machine, found.len(), missing));
+                return Err(devices_missing(machine, found.len(), missing));
             }
         }
         if !is_product || !rule.accepts(expected.revision, identity.revision) {
@@ -328,7 +328,7 @@ fn not_located(name: &str, locator: String) -> report::Error {
     Cause::NotLocated { locator }.with_name(name)
 }
 
-fn not_all(machine: &Machine, found: usize, missing: Vec<String>) -> report::Error {
+fn devices_missing(machine: &Machine, found: usize, missing: Vec<String>) -> report::Error {
     let expected = machine.devices.len();
     let cause = Cause::Missing {
         expected,

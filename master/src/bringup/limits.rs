@@ -13,7 +13,7 @@ pub(super) async fn compare(
     wire: &impl MailboxTransport,
     config: &DeviceConfig,
     device: &mut BusDevice,
-    progress: &mut dyn FnMut(Step),
+    progress: &dyn Fn(Step),
 ) -> Result<(), Error> {
     let (Some(axis), Some(coe)) = (&config.axis, device.coe.as_mut()) else {
         return Ok(());

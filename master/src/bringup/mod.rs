@@ -20,12 +20,13 @@ use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 use crate::acyclic::state_timeouts::mailbox_timeouts;
 use crate::acyclic::{AlState, DeviceRef, StateTimeouts, Transition, al, enumerate};
 use crate::clock;
-use crate::config::{AdoptedUnits, LimitConflict, MAX_SUBDEVICES, Machine};
+use crate::concurrent::try_join_all;
+use crate::config::{AdoptedUnits, DeviceConfig, LimitConflict, MAX_SUBDEVICES, Machine};
 use crate::datagram::DatagramClient;
 use crate::mailbox::CoeClient;
 use crate::mailbox::worker::EmergencySink;
 use crate::report::{Cause, Error};
-use crate::rt::image::{self, ImagePlan};
+use crate::rt::image::{self, DeviceRegion, ImagePlan};
 use crate::rt::phase::ClockPlan;
 use crate::text::pluralize;
 
@@ -38,12 +39,14 @@ mod limits;
 mod mailbox;
 mod mapping;
 mod output_defaults;
+mod times;
 pub(crate) use identify::name_at;
 mod watchdog;
 
 use device::StartupPhase;
 pub(crate) use device::enable_op_only;
 pub use device::{SdoOutcome, write_startup_sdo};
+pub use times::{StepTime, StepTimes};
 
 /// The size of ethercrab's own process image, which is not used.
 const MAX_PDI: usize = 1;
@@ -61,6 +64,8 @@ pub struct BusDevice {
     /// True if the device has a system time: not every device that reports one in 0x0008 has it
     /// enabled.
     pub dc: bool,
+    /// True if its clock follows the reference clock, or is the reference clock.
+    pub follows: bool,
     /// Outputs that no axis drives and that must not be zero: index, subindex, value.
     pub held: Vec<(u16, u8, i64)>,
     /// For a drive: its axis in the drive's own units.
@@ -82,6 +87,10 @@ pub struct Bus {
     pub devices: IndexVec<DeviceIndex, BusDevice>,
     pub image: ImagePlan,
     pub dc: Option<ClockPlan>,
+    /// True if all clocks had settled before SafeOp.
+    pub clocks_settled: bool,
+    /// The durations of the steps so far.
+    pub times: StepTimes,
 }
 
 /// A step of the bring-up, for display.
@@ -168,135 +177,203 @@ pub async fn bring_up(
     main_device: &'static MainDevice<'static>,
     machine: &Machine,
     image: ImagePlan,
-    progress: &mut dyn FnMut(Step),
+    progress: &dyn Fn(Step),
     listener: &dyn EmergencySink,
 ) -> Result<Bus, Error> {
-    let wire = DatagramClient::new(main_device);
+    let wire = DatagramClient::without_cycle(main_device);
     progress(Step::Scan);
-    enumerate::count(&wire)
-        .await
-        .map_err(|error| match *error.cause {
-            Cause::Datagram(_) => error.with_action("scanning"),
-            _ => error,
-        })?;
-
-    let scan = main_device.init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now);
-    let group = match mailbox::enable_during(&wire, machine, scan).await {
-        Ok(group) => group,
-        Err(error) => return Err(identify::explain_scan(&wire, machine, error).await),
+    let times = StepTimes::default();
+    let scan = async {
+        enumerate::count(&wire)
+            .await
+            .map_err(|error| match *error.cause {
+                Cause::Datagram(_) => error.with_action("scanning"),
+                _ => error,
+            })?;
+        // ethercrab's tables are large, and futures hold them by value.
+        let scan = Box::pin(main_device.init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now));
+        match mailbox::enable_during(&wire, machine, scan).await {
+            Ok(group) => Ok(group),
+            Err(error) => Err(identify::explain_scan(&wire, machine, error).await),
+        }
     };
-    let order = identify::assign(&wire, main_device, &group, machine, progress).await?;
+    let scan = times.measure("scan, EEPROM, PreOp", None, Box::pin(scan));
+    let group = scan.await?;
+    let assign = identify::assign(&wire, main_device, &group, machine, progress);
+    let order = times.measure("identification", None, assign).await?;
     progress(Step::Found {
         devices: order.len(),
     });
 
-    let mut devices = Vec::with_capacity(order.len());
-    // All devices with receive times, and whether they have a system time.
-    let mut timed = Vec::new();
-    for (config, &position) in machine.devices.iter().zip(&order) {
-        let sub_device = group
-            .subdevice(main_device, usize::from(position))
-            .map_err(|e| scan_error("reading the scan's result", &e))?;
-        let at = DeviceRef {
-            name: config.name.clone(),
-            position,
-            station: sub_device.configured_address(),
-        };
-        tracing::debug!(
-            device = %at,
-            "found {}, {:?}, {} ns behind the first clock",
-            config.selection.device_name,
-            sub_device.dc_support(),
-            sub_device.propagation_delay()
-        );
-        let receive_times = !matches!(sub_device.dc_support(), DcSupport::None);
-        let dc = receive_times && clocks::has_system_time(&wire, &at).await?;
-        if receive_times {
-            timed.push((position, dc));
-        }
-        let info = &config.device.info;
-        let coe = mailbox::open(&wire, config, &at).await?;
-        devices.push(BusDevice {
-            coe: coe.map(|layout| CoeClient::new(layout).with_timeouts(mailbox_timeouts(info))),
-            timeouts: StateTimeouts::new(info),
-            at,
-            held: Vec::new(),
-            adopted: None,
-            limits: Vec::new(),
-            dc,
-            propagation_delay: sub_device.propagation_delay(),
-            // Used only for a later comparison; 0 if unreadable.
-            dl_status: enumerate::at(&wire, position, "reading its ports", registers::DL_STATUS)
-                .await
-                .map_or(0, u16::from_le_bytes),
-            op_only: Vec::new(),
+    let found = machine
+        .devices
+        .iter()
+        .zip(&order)
+        .map(|(config, &position)| {
+            let device = describe(&wire, main_device, &group, config, position);
+            times.measure("mailbox", Some(&config.name), device)
         });
-    }
-
-    if timed.iter().min().is_some_and(|(_, clock)| !clock) {
-        clocks::set_again(&wire, &devices).await?;
-    }
-
+    let found = try_join_all(found).await?;
     // From here on, ethercrab only carries datagrams; see docs/decisions/0001.
     drop(group);
-    let set_up = set_up(&wire, machine, image, &mut devices, progress, listener).await;
+    let mut devices = found;
+    let reference = clocks::reference(&devices);
+    let set_up = Box::pin(set_up(
+        &wire,
+        machine,
+        image,
+        &mut devices,
+        progress,
+        &times,
+    ));
+    let set_up = clocks::distribute_during(&wire, reference.as_ref(), set_up).await;
     for device in &devices {
         device.report(listener);
     }
-    let (image, dc) = set_up?;
+    let (image, dc, clocks_settled) = set_up?;
     let devices = devices.into();
-    Ok(Bus { devices, image, dc })
+    Ok(Bus {
+        devices,
+        image,
+        dc,
+        clocks_settled,
+        times,
+    })
 }
 
-/// Takes the segment from PreOp to SafeOp.
+/// Reads what bring-up needs to know of one device.
+async fn describe(
+    wire: &DatagramClient,
+    main_device: &'static MainDevice<'static>,
+    group: &Group,
+    config: &DeviceConfig,
+    position: u16,
+) -> Result<BusDevice, Error> {
+    let sub_device = group
+        .subdevice(main_device, usize::from(position))
+        .map_err(|e| scan_error("reading the scan's result", &e))?;
+    let at = DeviceRef {
+        name: config.name.clone(),
+        position,
+        station: sub_device.configured_address(),
+    };
+    let propagation_delay = sub_device.propagation_delay();
+    tracing::debug!(
+        device = %at,
+        "found {}, {:?}, {propagation_delay} ns behind the first clock",
+        config.selection.device_name,
+        sub_device.dc_support(),
+    );
+    let receive_times = !matches!(sub_device.dc_support(), DcSupport::None);
+    let dc = receive_times && clocks::has_system_time(wire, &at).await?;
+    let info = &config.device.info;
+    let coe = mailbox::open(wire, config, &at).await?;
+    Ok(BusDevice {
+        coe: coe.map(|layout| CoeClient::new(layout).with_timeouts(mailbox_timeouts(info))),
+        timeouts: StateTimeouts::new(info),
+        at,
+        held: Vec::new(),
+        adopted: None,
+        limits: Vec::new(),
+        dc,
+        follows: false,
+        propagation_delay,
+        // Used only for a later comparison; 0 if unreadable.
+        dl_status: enumerate::at(wire, position, "reading its ports", registers::DL_STATUS)
+            .await
+            .map_or(0, u16::from_le_bytes),
+        op_only: Vec::new(),
+    })
+}
+
+/// Takes the segment from PreOp to SafeOp. Devices are configured at the same time, and their clocks
+/// settle meanwhile. Returns also whether all clocks have settled.
 async fn set_up(
     wire: &DatagramClient,
     machine: &Machine,
     mut image: ImagePlan,
     devices: &mut [BusDevice],
-    progress: &mut dyn FnMut(Step),
-    listener: &dyn EmergencySink,
-) -> Result<(ImagePlan, Option<ClockPlan>), Error> {
-    for (config, device) in machine.devices.iter().zip(&mut *devices) {
-        device::start_up(wire, config, device, StartupPhase::InPreOp, progress).await?;
-        mapping::compare(wire, config, device).await?;
-        drive_units::compare(wire, config, device, progress).await?;
-        limits::compare(wire, config, device, progress).await?;
-        output_defaults::read(wire, config, device).await?;
-        device.report(listener);
-    }
-
-    if let Some(without) = without_lrw(wire, machine, devices).await? {
-        image = without;
-    }
-
-    let regions = machine
+    progress: &dyn Fn(Step),
+    times: &StepTimes,
+) -> Result<(ImagePlan, Option<ClockPlan>, bool), Error> {
+    let start = clocks::set_offsets(wire, devices);
+    times.measure("clock offsets", None, start).await?;
+    let each = machine
         .devices
         .iter()
-        .zip(devices.iter_mut())
+        .zip(&mut *devices)
         .zip(&image.regions);
-    for (index, ((config, device), region)) in (0..).map(DeviceIndex).zip(regions) {
+    let each = (0..).map(DeviceIndex).zip(each);
+    let each = each.map(async |(index, ((config, device), region))| {
         let status = image.mailboxes.as_ref().and_then(|m| m.logical_of(index));
-        device::map_process_data(wire, config, device, *region, status).await?;
-        watchdog::set(wire, &machine.bus, config, device, progress).await?;
+        configure(
+            wire,
+            machine,
+            (config, device),
+            (*region, status),
+            progress,
+            times,
+        )
+        .await
+    });
+    try_join_all(each).await?;
+    if let Some(without) = without_lrw(wire, machine, devices).await? {
+        image = without;
     }
     progress(Step::ProcessData {
         bytes: image.len,
         frames: image.frames(),
     });
 
-    let dc = clocks::configure(wire, machine, devices, progress).await?;
+    let settle = clocks::settle(wire, machine, devices);
+    let clocks_settled = times.measure("clock settling", None, settle).await?;
+    let dc = clocks::configure(wire, machine, devices, &image, progress);
+    let dc = times.measure("SYNC0", None, dc).await?;
 
-    let transitions: Vec<_> = devices
-        .iter()
-        .map(|device| device.transition(AlState::SafeOp, false))
-        .collect();
-    al::change_states(wire, &transitions, AlState::SafeOp).await?;
+    let changes = devices.iter().map(|device| {
+        let change = async {
+            let transition = [device.transition(AlState::SafeOp, false)];
+            al::change_states(wire, &transition, AlState::SafeOp).await
+        };
+        times.measure("SafeOp", Some(&device.at.name), change)
+    });
+    try_join_all(changes).await?;
     progress(Step::State(AlState::SafeOp));
-    for (config, device) in machine.devices.iter().zip(devices) {
-        device::start_up(wire, config, device, StartupPhase::InSafeOp, progress).await?;
-    }
-    Ok((image, dc))
+    let last = machine.devices.iter().zip(devices);
+    let last = last.map(|(config, device)| {
+        let sdos = device::start_up(wire, config, device, StartupPhase::InSafeOp, progress);
+        times.measure("start-up SDOs in SafeOp", Some(&config.name), sdos)
+    });
+    try_join_all(last).await?;
+    Ok((image, dc, clocks_settled))
+}
+
+/// Configures one device in PreOp. `region` and `status`: its process data and the status of its
+/// mailbox in the process image.
+async fn configure(
+    wire: &DatagramClient,
+    machine: &Machine,
+    (config, device): (&DeviceConfig, &mut BusDevice),
+    (region, status): (Option<DeviceRegion>, Option<u32>),
+    progress: &dyn Fn(Step),
+    times: &StepTimes,
+) -> Result<(), Error> {
+    let name = Some(config.name.as_str());
+    let step = device::start_up(wire, config, device, StartupPhase::InPreOp, progress);
+    times.measure("start-up SDOs", name, step).await?;
+    let step = mapping::compare(wire, config, device);
+    times.measure("mapping read back", name, step).await?;
+    let step = async {
+        drive_units::compare(wire, config, device, progress).await?;
+        limits::compare(wire, config, device, progress).await?;
+        output_defaults::read(wire, config, device).await
+    };
+    times.measure("units and limits", name, step).await?;
+    let step = async {
+        device::map_process_data(wire, config, device, region, status).await?;
+        watchdog::set(wire, &machine.bus, config, device, progress).await
+    };
+    times.measure("process data, watchdogs", name, step).await
 }
 
 impl BusDevice {
@@ -325,11 +402,14 @@ async fn without_lrw(
     devices: &[BusDevice],
 ) -> Result<Option<ImagePlan>, Error> {
     const NO_LRW: u16 = 1 << 9;
+    let features = devices.iter().map(|device| {
+        let step = "reading what its controller can do";
+        device::read(wire, &device.at, step, registers::FEATURES)
+    });
+    let features = try_join_all(features).await?;
     let mut process_data = machine.rt_config().devices;
     let mut more = false;
-    for (device, data) in devices.iter().zip(&mut process_data) {
-        let step = "reading what its controller can do";
-        let features = device::read(wire, &device.at, step, registers::FEATURES).await?;
+    for (features, data) in features.into_iter().zip(&mut process_data) {
         if data.lrw && u16::from_le_bytes(features) & NO_LRW != 0 {
             data.lrw = false;
             more = true;

@@ -23,7 +23,7 @@ pub(super) async fn set(
     bus: &Bus,
     config: &DeviceConfig,
     device: &BusDevice,
-    progress: &mut dyn FnMut(Step),
+    progress: &dyn Fn(Step),
 ) -> Result<(), Error> {
     let has_axis = config.axis.is_some();
     let outputs = &config.selection.layout.outputs;

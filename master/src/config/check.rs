@@ -219,6 +219,8 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
             .unwrap_or(defaults.enable_timeout_ns),
         watchdog_ns,
         clock_window_ns: raw.clock_window.value().unwrap_or(defaults.clock_window_ns),
+        sync_window_ns: raw.sync_window.value().unwrap_or(defaults.sync_window_ns),
+        sync_timeout_ns: raw.sync_timeout.value().unwrap_or(defaults.sync_timeout_ns),
         exchange: raw.exchange.value().unwrap_or(defaults.exchange),
         link: raw.link.value().unwrap_or(defaults.link),
         written: raw.written.keys,

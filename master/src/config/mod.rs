@@ -126,6 +126,10 @@ pub struct Bus {
     pub watchdog_ns: u64,
     /// The clock difference (0x092C) above which a SubDevice is reported.
     pub clock_window_ns: u64,
+    /// The clock difference (0x092C) within which every SubDevice with SYNC0 must be before Op.
+    pub sync_window_ns: u64,
+    /// The timeout for the clocks to settle and for frames to be in phase with SYNC0.
+    pub sync_timeout_ns: u64,
     pub exchange: ExchangeMode,
     /// The way frames are exchanged with the network interface.
     pub link: SocketKind,
@@ -162,6 +166,8 @@ impl Default for Bus {
             enable_timeout_ns: 5_000_000_000,
             watchdog_ns: 100_000_000,
             clock_window_ns: 10_000,
+            sync_window_ns: 1_000,
+            sync_timeout_ns: 5_000_000_000,
             exchange: ExchangeMode::SameCycle,
             link: SocketKind::default(),
             written: Vec::new(),

@@ -8,12 +8,12 @@ use std::future::poll_fn;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::task::{Poll, Waker};
 
-/// The size of the window, counted from the oldest permit. Each cycle sends one frame, and an
-/// answer takes at most two cycles: more datagrams would only wait.
-const MAX_IN_FLIGHT: u64 = 3;
-
-#[derive(Debug, Default)]
-pub(super) struct InFlightLimiter(Mutex<State>);
+#[derive(Debug)]
+pub(super) struct InFlightLimiter {
+    /// The size of the window, counted from the oldest permit.
+    max: u64,
+    state: Mutex<State>,
+}
 
 #[derive(Debug, Default)]
 struct State {
@@ -32,8 +32,15 @@ pub(super) struct Permit<'a> {
 }
 
 impl InFlightLimiter {
+    pub fn new(max: u64) -> Self {
+        Self {
+            max,
+            state: Mutex::default(),
+        }
+    }
+
     fn state(&self) -> MutexGuard<'_, State> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     pub async fn take(&self) -> Permit<'_> {
@@ -49,7 +56,7 @@ impl InFlightLimiter {
         };
         poll_fn(|context| {
             let mut state = self.state();
-            if number < state.oldest + MAX_IN_FLIGHT {
+            if number < state.oldest + self.max {
                 return Poll::Ready(());
             }
             if !state.waiting.iter().any(|w| w.will_wake(context.waker())) {
@@ -91,7 +98,7 @@ mod tests {
 
     #[test]
     fn limiter_bounds_overtaking() {
-        let turns = InFlightLimiter::default();
+        let turns = InFlightLimiter::new(3);
         let mut context = Context::from_waker(Waker::noop());
         let mut at_once = || match pin!(turns.take()).poll(&mut context) {
             Poll::Ready(turn) => Some(turn),
@@ -112,7 +119,7 @@ mod tests {
 
     #[test]
     fn limiter_grants_permits_in_order_of_request() {
-        let turns = InFlightLimiter::default();
+        let turns = InFlightLimiter::new(3);
         let mut context = Context::from_waker(Waker::noop());
         let mut asked: Vec<_> = (0..8).map(|_| Box::pin(turns.take())).collect();
         let mut had = Vec::new();

@@ -18,6 +18,7 @@ pub mod capture;
 pub mod filter;
 mod frame_queue;
 pub mod interface;
+mod joined_frame;
 pub mod lock;
 pub mod nic;
 pub mod pdu_loop;
@@ -105,15 +106,15 @@ pub fn open(
 /// The listening time before anything is sent. The slowest cycles take some tens of milliseconds.
 pub const LISTEN: Duration = Duration::from_millis(100);
 
-/// Returns the EtherCAT frames received within [`LISTEN`] without sending: frames of another
-/// MainDevice. Blocks, on the monotonic clock.
+/// Returns the EtherCAT frames received within [`LISTEN`] from `start` without sending: frames of
+/// another MainDevice. Blocks, on the monotonic clock. The link must have been open since `start`.
 ///
 /// # Errors
 /// Errors of the link.
-pub fn sniff_foreign_frames(link: &mut dyn Link) -> Result<u64, LinkError> {
+pub fn sniff_foreign_frames(link: &mut dyn Link, start: Instant) -> Result<u64, LinkError> {
     let mut buf = [0; MAX_FRAME];
     let mut frames = 0;
-    let end = Instant::now() + LISTEN;
+    let end = start + LISTEN;
     while Instant::now() < end {
         while link.recv(&mut buf)?.is_some() {
             // A program that only accesses a running segment is not a MainDevice.

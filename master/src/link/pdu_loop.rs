@@ -1,5 +1,6 @@
-//! Connects ethercrab to a link. ethercrab builds its own frames. The owner of the link moves them:
-//! the pump during bring-up, the cycle afterwards.
+//! Connects ethercrab to a link. ethercrab builds its own frames with one datagram each. The owner
+//! of the link moves them: the pump during bring-up, the cycle afterwards. The pump joins the
+//! datagrams of all frames that wait into as few Ethernet frames as possible.
 
 use std::future::Future;
 use std::pin::pin;
@@ -8,6 +9,7 @@ use std::time::Duration;
 
 use ethercrab::{MainDevice, MainDeviceConfig, PduRx, PduStorage, PduTx, RetryBehaviour, Timeouts};
 
+use super::joined_frame::{JoinedFrame, datagrams};
 use super::{Link, LinkError, MAX_DATA, MAX_FRAME};
 use crate::clock::{self, Clock, Nanos};
 
@@ -18,8 +20,12 @@ pub const ETHERCAT: [u8; 2] = [0x88, 0xa4];
 /// `rt::exchange`.
 const ETHERCRAB_MAC_TAIL: u8 = 0x10;
 
-/// The maximum of ethercrab frames in flight; each awaited datagram takes one.
-const FRAMES: usize = 16;
+/// The maximum of ethercrab frames in flight; each awaited datagram takes one. As many datagrams of
+/// 10 bytes fill an Ethernet frame.
+const FRAMES: usize = 64;
+/// The maximum of datagrams in flight of one [`crate::datagram::DatagramClient`] during bring-up.
+/// The remaining frames are ethercrab's own and those of clients before and after.
+pub(crate) const MAX_DATAGRAMS: u64 = 48;
 /// Bytes per frame: the maximum, so that the largest mailbox fits.
 const FRAME_BYTES: usize = PduStorage::element_size(MAX_DATA as usize);
 const _: () = assert!(FRAME_BYTES == MAX_FRAME);
@@ -30,13 +36,11 @@ const IDLE_STEP: Nanos = 20_000;
 /// The minimum timeout of a datagram; a busy host answers late.
 const PDU_TIMEOUT: Duration = Duration::from_millis(30);
 
-/// Cycles of static drift compensation; the cyclic exchange continues the compensation.
-const STATIC_SYNC_CYCLES: u32 = 1_000;
-
 /// Both ends of ethercrab's PDU loop.
 pub struct PduLoop {
     tx: PduTx<'static>,
     rx: PduRx<'static>,
+    joined: JoinedFrame,
     /// Frames that ethercrab rejected: late, unknown or damaged.
     pub refused: u64,
 }
@@ -71,45 +75,70 @@ pub fn main_device(cycle_ns: Nanos, pre_op: Duration) -> (&'static MainDevice<'s
         ..Timeouts::default()
     };
     let config = MainDeviceConfig {
-        dc_static_sync_iterations: STATIC_SYNC_CYCLES,
+        // `bringup::clocks` compensates the drift while the devices are configured.
+        dc_static_sync_iterations: 0,
         retry_behaviour: RetryBehaviour::Count(3),
     };
     let device = Box::leak(Box::new(MainDevice::new(pdu_loop, timeouts, config)));
-    (device, PduLoop { tx, rx, refused: 0 })
+    let joined = JoinedFrame::default();
+    let refused = 0;
+    (
+        device,
+        PduLoop {
+            tx,
+            rx,
+            joined,
+            refused,
+        },
+    )
 }
 
 impl PduLoop {
-    /// Sends at most `most` frames that ethercrab has ready; returns how many. RT.
-    pub fn send(&mut self, link: &mut dyn Link, most: usize) -> Result<usize, LinkError> {
+    /// Sends one frame that ethercrab has ready, if there is one. RT.
+    pub fn send_one(&mut self, link: &mut dyn Link) -> Result<(), LinkError> {
+        let Some(frame) = self.tx.next_sendable_frame() else {
+            return Ok(());
+        };
+        let mut sent = Ok(());
+        // On an error, ethercrab keeps the frame for the next attempt.
+        let _ = frame.send_blocking(|bytes| {
+            sent = link.send(bytes);
+            sent.map(|()| bytes.len())
+                .map_err(|_| ethercrab::error::Error::SendFrame)
+        });
+        sent
+    }
+
+    /// Sends the datagrams of all frames that ethercrab has ready, in as few frames as possible.
+    /// Returns the number of datagrams.
+    pub fn send_all(&mut self, link: &mut dyn Link) -> Result<usize, LinkError> {
         let mut sent = 0;
-        while sent < most {
-            let Some(frame) = self.tx.next_sendable_frame() else {
-                break;
-            };
-            let mut failure = None;
-            let result = frame.send_blocking(|bytes| match link.send(bytes) {
-                Ok(()) => Ok(bytes.len()),
-                Err(error) => {
-                    failure = Some(error);
-                    Err(ethercrab::error::Error::SendFrame)
+        while let Some(frame) = self.tx.next_sendable_frame() {
+            let mut flushed = Ok(());
+            let _ = frame.send_blocking(|bytes| {
+                if !self.joined.append(bytes) {
+                    flushed = self.joined.flush(link);
+                    self.joined.append(bytes);
                 }
+                Ok(bytes.len())
             });
-            if let Some(error) = failure {
-                return Err(error);
-            }
-            if result.is_err() {
-                break;
-            }
+            flushed?;
             sent += 1;
         }
+        self.joined.flush(link)?;
         Ok(sent)
     }
 
-    /// Passes a received frame to ethercrab if it is an ethercrab frame. Frames that ethercrab
-    /// rejects (late or damaged answers) are counted and dropped. RT.
+    /// Passes the datagrams of a received frame to ethercrab if they are ethercrab's. Datagrams that
+    /// ethercrab rejects (late or damaged answers) are counted and dropped. RT.
     pub fn receive(&mut self, frame: &[u8]) {
-        if belongs_to_ethercrab(frame) && self.rx.receive_frame(frame).is_err() {
-            self.refused += 1;
+        if !belongs_to_ethercrab(frame) {
+            return;
+        }
+        for datagram in datagrams(frame) {
+            if self.rx.receive_frame(datagram.frame()).is_err() {
+                self.refused += 1;
+            }
         }
     }
 }
@@ -134,7 +163,7 @@ pub fn drive_pdu_loop<F: Future>(
         if let Poll::Ready(output) = future.as_mut().poll(&mut context) {
             return Ok(output);
         }
-        let mut moved = port.send(link, usize::MAX)? > 0;
+        let mut moved = port.send_all(link)? > 0;
         while let Some(len) = link.recv(&mut buf)? {
             port.receive(&buf[..len]);
             moved = true;

@@ -11,15 +11,15 @@ use ecaxis_ecat::al_status_code::al_status_text;
 /// The cause that stopped a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Diagnosis {
-    pub cause: Cause,
+    pub cause: DiagnosedCause,
     /// Other observations that may be related.
-    pub also: Vec<Cause>,
+    pub also: Vec<DiagnosedCause>,
 }
 
 /// A cause. Its text names the device first.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "cause", rename_all = "kebab-case")]
-pub enum Cause {
+pub enum DiagnosedCause {
     /// This computer was too late.
     Overload {
         missed: u64,
@@ -117,7 +117,7 @@ pub enum Cause {
     Unexplained { text: String },
 }
 
-impl fmt::Display for Cause {
+impl fmt::Display for DiagnosedCause {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let time = |ns: &Nanos| about(*ns);
         match self {

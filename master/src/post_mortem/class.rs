@@ -57,9 +57,10 @@ impl Class {
             {
                 Self::Bus
             }
-            Cause::NoStart | Cause::PhaseNotLocked { .. } | Cause::ClockNotSettled { .. } => {
-                Self::Timing
-            }
+            Cause::NoStart
+            | Cause::ClockDoesNotFollow
+            | Cause::PhaseNotLocked { .. }
+            | Cause::ClockNotSettled { .. } => Self::Timing,
             _ => Self::Device,
         }
     }

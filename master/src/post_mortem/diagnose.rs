@@ -7,7 +7,7 @@ use ecaxis_axis::Trip;
 
 use ecaxis_esi::address;
 
-use super::cause::{Cause, Diagnosis};
+use super::cause::{DiagnosedCause, Diagnosis};
 use super::class::Class;
 use super::evidence::{DeviceEvidence, Evidence, Lateness, place};
 use super::snapshot::SyncSnapshot;
@@ -27,12 +27,12 @@ const FOLLOWING_ERROR: [u16; 2] = [0x8611, 0x8600];
 
 /// An observation, and whether it explains what stopped the run.
 struct Seen {
-    cause: Cause,
+    cause: DiagnosedCause,
     explains: bool,
 }
 
 impl Seen {
-    fn when(explains: bool, cause: Cause) -> Self {
+    fn when(explains: bool, cause: DiagnosedCause) -> Self {
         Self { cause, explains }
     }
 }
@@ -65,19 +65,26 @@ pub fn diagnose(error: &Error, evidence: &Evidence) -> Diagnosis {
         Some(first) => {
             let cause = seen.remove(first).cause;
             // A missing device takes its link with it.
-            if matches!(cause, Cause::Restarted { .. } | Cause::OutOfReach { .. }) {
-                let follows =
-                    |c: &Cause| matches!(c, Cause::OutOfReach { .. } | Cause::LinkFlapping { .. });
+            if matches!(
+                cause,
+                DiagnosedCause::Restarted { .. } | DiagnosedCause::OutOfReach { .. }
+            ) {
+                let follows = |c: &DiagnosedCause| {
+                    matches!(
+                        c,
+                        DiagnosedCause::OutOfReach { .. } | DiagnosedCause::LinkFlapping { .. }
+                    )
+                };
                 seen.retain(|seen| !follows(&seen.cause));
             }
             cause
         }
-        None => device_cause(error, evidence).unwrap_or_else(|| Cause::Unexplained {
+        None => device_cause(error, evidence).unwrap_or_else(|| DiagnosedCause::Unexplained {
             text: error.without_bring_up(),
         }),
     };
     // The other observations imply the outage.
-    seen.retain(|seen| !matches!(seen.cause, Cause::TemporaryOutage { .. }));
+    seen.retain(|seen| !matches!(seen.cause, DiagnosedCause::TemporaryOutage { .. }));
     Diagnosis {
         cause,
         also: seen.into_iter().map(|seen| seen.cause).collect(),
@@ -111,7 +118,7 @@ fn overload(error: &Error, evidence: &Evidence, class: Class) -> Option<Seen> {
         let Lateness { missed, longest } = found;
         Seen::when(
             explains,
-            Cause::Overload {
+            DiagnosedCause::Overload {
                 missed,
                 longest_ns: longest,
                 then,
@@ -144,7 +151,7 @@ fn other_main_device(error: &Error, evidence: &Evidence, class: Class) -> Option
     let silent = is_silent(error);
     Some(Seen::when(
         class == Class::Bus && (sent.is_some() || !silent),
-        Cause::OtherMainDevice {
+        DiagnosedCause::OtherMainDevice {
             frames,
             device: sent.map(DeviceEvidence::place),
             state: sent
@@ -164,7 +171,7 @@ fn restarted(evidence: &Evidence, class: Class) -> Option<Seen> {
     // If no device has an address, the bring-up has not assigned any yet.
     let addressed = |device: &DeviceEvidence| device.look.station.is_some_and(|at| at != 0);
     let all = !evidence.devices.iter().any(addressed) && evidence.notes.is_empty();
-    let cause = || Cause::Restarted {
+    let cause = || DiagnosedCause::Restarted {
         device: device.place(),
         behind: downstream(evidence, index).count(),
     };
@@ -187,7 +194,7 @@ fn damaged_frames(error: &Error, evidence: &Evidence, class: Class) -> Option<Se
         report::Cause::BusLost { .. } => u64::from(count) >= evidence.lost_at_stop(),
         _ => count > 1,
     };
-    let cause = || Cause::DamagedFrames {
+    let cause = || DiagnosedCause::DamagedFrames {
         device: device.place(),
         port,
         partner: evidence.partner(index, port),
@@ -216,7 +223,7 @@ fn out_of_reach(error: &Error, evidence: &Evidence, class: Class) -> Option<Seen
     });
     Some(Seen::when(
         class == Class::Bus && !evidence.all_in_op(),
-        Cause::OutOfReach {
+        DiagnosedCause::OutOfReach {
             device: device.place(),
             behind: downstream(evidence, index).filter(|d| missing(d)).count(),
             upstream: evidence.upstream(device),
@@ -230,7 +237,7 @@ fn no_response(error: &Error, evidence: &Evidence) -> Option<Seen> {
     let silent = is_silent(error) || matches!(*error.cause, report::Cause::Gone);
     let unknown = |device: &DeviceEvidence| !device.look.answers && !device.look.absent;
     let first = evidence.devices.first()?;
-    let cause = || Cause::NoResponse {
+    let cause = || DiagnosedCause::NoResponse {
         first: Some(first.place()),
     };
     (silent && evidence.devices.iter().all(unknown)).then(|| Seen::when(true, cause()))
@@ -243,7 +250,7 @@ fn late_frames(error: &Error, evidence: &Evidence) -> Option<Seen> {
     (late > 0).then(|| {
         Seen::when(
             silent && late * 2 >= evidence.lost_at_stop(),
-            Cause::LateFrames {
+            DiagnosedCause::LateFrames {
                 late,
                 cycle_ns: evidence.cycle_ns,
             },
@@ -262,7 +269,7 @@ fn silence(error: &Error, evidence: &Evidence) -> Option<Seen> {
     let silence_ns = evidence.silence();
     let back = !evidence.devices.is_empty() && evidence.devices.iter().all(|d| d.look.answers);
     let there = silent && silence_ns > 0 && (back || evidence.all_in_op());
-    there.then(|| Seen::when(true, Cause::TemporaryOutage { silence_ns }))
+    there.then(|| Seen::when(true, DiagnosedCause::TemporaryOutage { silence_ns }))
 }
 
 /// Finds refusals of the network interface.
@@ -273,7 +280,8 @@ fn interface(evidence: &Evidence, class: Class) -> Option<Seen> {
         Some(_) => evidence.refused(),
         None => evidence.counters.link_errors,
     };
-    (refused >= SOME).then(|| Seen::when(class == Class::Bus, Cause::Interface { refused }))
+    (refused >= SOME)
+        .then(|| Seen::when(class == Class::Bus, DiagnosedCause::Interface { refused }))
 }
 
 fn loose_link(error: &Error, evidence: &Evidence, class: Class) -> Option<Seen> {
@@ -288,7 +296,7 @@ fn loose_link(error: &Error, evidence: &Evidence, class: Class) -> Option<Seen> 
     let first_cable = (index, port) == (0, 0);
     Some(Seen::when(
         class == Class::Bus && (first_cable || !silent || evidence.lost_at_stop() <= 2),
-        Cause::LinkFlapping {
+        DiagnosedCause::LinkFlapping {
             device: evidence.devices.get(index)?.place(),
             port,
             partner: evidence.partner(index, port),
@@ -313,7 +321,7 @@ fn downstream(evidence: &Evidence, index: usize) -> impl Iterator<Item = &Device
     evidence.devices.iter().filter(hangs)
 }
 
-fn device_cause(error: &Error, evidence: &Evidence) -> Option<Cause> {
+fn device_cause(error: &Error, evidence: &Evidence) -> Option<DiagnosedCause> {
     let (device, action) = (error.device(), error.action);
     match &*error.cause {
         report::Cause::LeftOp { state, code } => Some(left_op(device?, *state, *code, evidence)),
@@ -353,7 +361,7 @@ fn device_cause(error: &Error, evidence: &Evidence) -> Option<Cause> {
             let device = device?;
             let watchdog = evidence.named(&device.name)?.look.watchdog?;
             let expired = watchdog.time_ns > 0 && watchdog.expired > 0 && !watchdog.in_time;
-            expired.then(|| Cause::OutputsNotTaken {
+            expired.then(|| DiagnosedCause::OutputsNotTaken {
                 device: place(device),
                 watchdog_ns: watchdog.time_ns,
             })
@@ -364,11 +372,11 @@ fn device_cause(error: &Error, evidence: &Evidence) -> Option<Cause> {
             name,
             source,
             ..
-        } if source.is_timeout() => Some(Cause::Mailbox {
+        } if source.is_timeout() => Some(DiagnosedCause::Mailbox {
             device: place(device?),
             doing: format!("start-up SDO {} {name}", address(*index, *sub)),
         }),
-        report::Cause::Sdo(error) if error.is_timeout() => Some(Cause::Mailbox {
+        report::Cause::Sdo(error) if error.is_timeout() => Some(DiagnosedCause::Mailbox {
             device: place(device?),
             doing: action?.to_owned(),
         }),
@@ -376,7 +384,7 @@ fn device_cause(error: &Error, evidence: &Evidence) -> Option<Cause> {
             esi,
             revisions: Some((expected, found)),
             ..
-        } => Some(Cause::Revision {
+        } => Some(DiagnosedCause::Revision {
             device: place(device?),
             expected: *expected,
             found: *found,
@@ -388,33 +396,38 @@ fn device_cause(error: &Error, evidence: &Evidence) -> Option<Cause> {
     }
 }
 
-fn left_op(device: &DeviceRef, state: AlState, code: u16, evidence: &Evidence) -> Cause {
+fn left_op(device: &DeviceRef, state: AlState, code: u16, evidence: &Evidence) -> DiagnosedCause {
     if code == WATCHDOG {
         let others = evidence.devices.iter().filter(|other| {
             other.at.position != device.position && other.look.al_code == Some(WATCHDOG)
         });
         let look = evidence.named(&device.name).map(|found| &found.look);
-        return Cause::Watchdog {
+        return DiagnosedCause::Watchdog {
             device: place(device),
             others: others.count(),
             silence_ns: evidence.silence(),
             watchdog_ns: look.and_then(|look| Some(look.watchdog?.time_ns)),
         };
     }
-    sync(device, code, false, evidence).unwrap_or_else(|| Cause::LeftOp {
+    sync(device, code, false, evidence).unwrap_or_else(|| DiagnosedCause::LeftOp {
         device: place(device),
         state: state.to_string(),
         code,
     })
 }
 
-fn sync(device: &DeviceRef, code: u16, refused: bool, evidence: &Evidence) -> Option<Cause> {
+fn sync(
+    device: &DeviceRef,
+    code: u16,
+    refused: bool,
+    evidence: &Evidence,
+) -> Option<DiagnosedCause> {
     if !SYNC_CODES.contains(&code) {
         return None;
     }
     let look = evidence.named(&device.name).map(|found| &found.look);
     let sync = look.and_then(|look| look.sync);
-    Some(Cause::Sync {
+    Some(DiagnosedCause::Sync {
         device: place(device),
         code,
         refused,
@@ -424,11 +437,11 @@ fn sync(device: &DeviceRef, code: u16, refused: bool, evidence: &Evidence) -> Op
 }
 
 /// Finds a device that waits for a SYNC0 that never arrives.
-fn late_sync(device: &DeviceRef, evidence: &Evidence) -> Option<Cause> {
+fn late_sync(device: &DeviceRef, evidence: &Evidence) -> Option<DiagnosedCause> {
     let sync = evidence.named(&device.name)?.look.sync?;
     let cycle = i64::from(sync.cycle_ns);
     let off = sync.activation & 3 != 3 || sync.next_ns < 0 || sync.next_ns > 2 * cycle;
-    (cycle > 0 && off).then(|| Cause::Sync {
+    (cycle > 0 && off).then(|| DiagnosedCause::Sync {
         device: place(device),
         code: 0,
         refused: true,
@@ -437,9 +450,9 @@ fn late_sync(device: &DeviceRef, evidence: &Evidence) -> Option<Cause> {
     })
 }
 
-fn interpolation(device: &DeviceRef, error: &Error, evidence: &Evidence) -> Option<Cause> {
+fn interpolation(device: &DeviceRef, error: &Error, evidence: &Evidence) -> Option<DiagnosedCause> {
     let drive_ns = evidence.named(&device.name)?.look.interpolation_ns?;
-    (drive_ns != evidence.cycle_ns).then(|| Cause::Interpolation {
+    (drive_ns != evidence.cycle_ns).then(|| DiagnosedCause::Interpolation {
         device: place(device),
         drive_ns,
         cycle_ns: evidence.cycle_ns,

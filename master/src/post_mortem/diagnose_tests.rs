@@ -433,7 +433,10 @@ fn diagnose_returns_the_cause_of_a_stopped_group() {
     .with_device(at(1));
     let evidence = with(|e| absent(e, 2));
     let found = diagnose(&error, &evidence);
-    assert!(matches!(found.cause, Cause::OutOfReach { .. }), "{found:?}");
+    assert!(
+        matches!(found.cause, DiagnosedCause::OutOfReach { .. }),
+        "{found:?}"
+    );
     assert_eq!(found.also, [], "a lost link goes with it");
 }
 
@@ -452,15 +455,15 @@ fn diagnose_keeps_other_observations() {
     });
     let found = diagnose(&error, &evidence);
     assert!(
-        matches!(found.cause, Cause::Unexplained { .. }),
+        matches!(found.cause, DiagnosedCause::Unexplained { .. }),
         "{found:?}"
     );
     assert!(
         matches!(
             *found.also,
             [
-                Cause::OtherMainDevice { device: None, .. },
-                Cause::DamagedFrames { count: 7, .. }
+                DiagnosedCause::OtherMainDevice { device: None, .. },
+                DiagnosedCause::DamagedFrames { count: 7, .. }
             ]
         ),
         "{found:?}"

@@ -16,7 +16,7 @@ pub mod evidence;
 pub mod report;
 pub mod snapshot;
 
-pub use cause::{Cause, Diagnosis};
+pub use cause::{DiagnosedCause, Diagnosis};
 pub use diagnose::diagnose;
 pub use evidence::{DeviceEvidence, Evidence};
 pub use report::FaultReport;

@@ -3,7 +3,7 @@
 use ecaxis_axis::cia402::describe;
 use serde::Serialize;
 
-use super::Cause;
+use super::DiagnosedCause;
 use super::evidence::Evidence;
 use super::snapshot::{SyncSnapshot, WatchdogSnapshot};
 use crate::acyclic::AlState;
@@ -21,9 +21,9 @@ use ecaxis_ecat::al_status_code::al_status_text;
 pub struct FaultReport {
     /// One line: device and cause.
     pub headline: String,
-    pub cause: Cause,
+    pub cause: DiagnosedCause,
     /// Other observations.
-    pub also: Vec<Cause>,
+    pub also: Vec<DiagnosedCause>,
     /// The error that ended the run.
     pub error: String,
     pub machine: String,

@@ -122,28 +122,28 @@ pub async fn read_registers(
     depth: Depth,
 ) {
     let mut asker = SnapshotReader::new(wire);
-    let places = asker.everybody(stations, looks).await;
-    for (place, look) in places
+    let addresses = asker.everybody(stations, looks).await;
+    for (address, look) in addresses
         .iter()
         .zip(looks.iter_mut())
         .filter(|(_, l)| l.answers)
     {
         if let Some(bytes) = asker
-            .read::<ERROR_COUNTERS_LEN>(*place, registers::RX_ERROR_COUNTERS)
+            .read::<ERROR_COUNTERS_LEN>(*address, registers::RX_ERROR_COUNTERS)
             .await
         {
             look.errors = Some(counters(&bytes));
         }
     }
     // Devices with an error come first, while time remains.
-    let mut rest: Vec<_> = places.iter().zip(looks).collect();
+    let mut rest: Vec<_> = addresses.iter().zip(looks).collect();
     rest.retain(|(_, look)| look.answers && look.watchdog.is_none());
     if depth == Depth::Brief {
         rest.retain(|(_, look)| look.al_status != Some(OP));
     }
     rest.sort_by_key(|(_, look)| look.al_status == Some(OP));
-    for (place, look) in rest {
-        asker.details(*place, look).await;
+    for (address, look) in rest {
+        asker.details(*address, look).await;
     }
 }
 
@@ -202,13 +202,13 @@ enum ReadOutcome<const N: usize> {
 
 /// The address by which a device is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Place {
+enum Address {
     Station(u16),
     /// The position of a device that does not have its station address.
     Position(u16),
 }
 
-impl Place {
+impl Address {
     fn station(self) -> Option<u16> {
         match self {
             Self::Station(station) => Some(station),
@@ -252,15 +252,15 @@ impl<'a> SnapshotReader<'a> {
         Self { wire, end, lost: 0 }
     }
 
-    async fn ask<const N: usize>(&mut self, place: Place, register: u16) -> ReadOutcome<N> {
+    async fn ask<const N: usize>(&mut self, address: Address, register: u16) -> ReadOutcome<N> {
         let mut bytes = [0; N];
         for _ in 0..MAX_ATTEMPTS {
             if self.lost >= MAX_CONSECUTIVE_LOSSES || self.wire.now() >= self.end {
                 return ReadOutcome::Nothing;
             }
-            let asked = match place {
-                Place::Station(station) => self.wire.read(station, register, &mut bytes).await,
-                Place::Position(at) => self.wire.read_at(at, register, &mut bytes).await,
+            let asked = match address {
+                Address::Station(station) => self.wire.read(station, register, &mut bytes).await,
+                Address::Position(at) => self.wire.read_at(at, register, &mut bytes).await,
             };
             match asked {
                 Ok(0) => {
@@ -279,8 +279,8 @@ impl<'a> SnapshotReader<'a> {
         ReadOutcome::Nothing
     }
 
-    async fn read<const N: usize>(&mut self, place: Place, register: u16) -> Option<[u8; N]> {
-        match self.ask(place, register).await {
+    async fn read<const N: usize>(&mut self, address: Address, register: u16) -> Option<[u8; N]> {
+        match self.ask(address, register).await {
             ReadOutcome::Answer(bytes) => Some(bytes),
             ReadOutcome::NoResponse | ReadOutcome::Nothing => None,
         }
@@ -288,41 +288,41 @@ impl<'a> SnapshotReader<'a> {
 
     /// Reads the status of all devices that have not answered yet. Returns the address of each
     /// device.
-    async fn everybody(&mut self, stations: &[u16], looks: &mut [DeviceSnapshot]) -> Vec<Place> {
-        let mut places: Vec<_> = stations.iter().map(|at| Place::Station(*at)).collect();
-        for (place, look) in places.iter().zip(looks.iter_mut()) {
+    async fn everybody(&mut self, stations: &[u16], looks: &mut [DeviceSnapshot]) -> Vec<Address> {
+        let mut addresses: Vec<_> = stations.iter().map(|at| Address::Station(*at)).collect();
+        for (address, look) in addresses.iter().zip(looks.iter_mut()) {
             if !look.answers {
-                self.status(*place, look).await;
-                look.station = place.station().filter(|_| look.answers);
+                self.status(*address, look).await;
+                look.station = address.station().filter(|_| look.answers);
             }
         }
         if !looks.iter().any(|look| look.absent) {
-            return places;
+            return addresses;
         }
         let mut found = Vec::with_capacity(stations.len());
         while let Ok(position) = u16::try_from(found.len())
             && found.len() < stations.len()
             && let Some(bytes) = self
-                .read::<2>(Place::Position(position), registers::STATION_ADDRESS)
+                .read::<2>(Address::Position(position), registers::STATION_ADDRESS)
                 .await
         {
             found.push(u16::from_le_bytes(bytes));
         }
         for (index, position) in realign(stations, &found) {
-            if let (Some(place), Some(look)) = (places.get_mut(index), looks.get_mut(index))
+            if let (Some(address), Some(look)) = (addresses.get_mut(index), looks.get_mut(index))
                 && look.absent
             {
-                *place = Place::Position(position);
-                self.status(*place, look).await;
+                *address = Address::Position(position);
+                self.status(*address, look).await;
                 let station = found.get(usize::from(position));
                 look.station = station.copied().filter(|_| look.answers);
             }
         }
-        places
+        addresses
     }
 
-    async fn status(&mut self, place: Place, look: &mut DeviceSnapshot) {
-        let bytes = match self.ask(place, StatusRegisters::START).await {
+    async fn status(&mut self, address: Address, look: &mut DeviceSnapshot) {
+        let bytes = match self.ask(address, StatusRegisters::START).await {
             ReadOutcome::Answer(bytes) => bytes,
             ReadOutcome::NoResponse => {
                 look.absent = true;
@@ -337,9 +337,9 @@ impl<'a> SnapshotReader<'a> {
         look.al_code = Some(status.al_code);
     }
 
-    async fn details(&mut self, place: Place, look: &mut DeviceSnapshot) {
+    async fn details(&mut self, address: Address, look: &mut DeviceSnapshot) {
         let Some(bytes) = self
-            .read::<WATCHDOG_LEN>(place, registers::WATCHDOG_DIVIDER)
+            .read::<WATCHDOG_LEN>(address, registers::WATCHDOG_DIVIDER)
             .await
         else {
             return;
@@ -352,14 +352,14 @@ impl<'a> SnapshotReader<'a> {
             expired: bytes[0x42],
             pdi_expired: bytes[0x43],
         });
-        let status = self.read::<2>(place, registers::EEPROM_CONTROL).await;
+        let status = self.read::<2>(address, registers::EEPROM_CONTROL).await;
         look.eeprom = status.map(u16::from_le_bytes);
         // The system time is read first: a pulse between both reads then never looks missed.
-        let Some(system) = self.read::<8>(place, registers::DC_SYSTEM_TIME).await else {
+        let Some(system) = self.read::<8>(address, registers::DC_SYSTEM_TIME).await else {
             return;
         };
         let Some(sync) = self
-            .read::<SYNC_LEN>(place, registers::DC_CYCLIC_CONTROL)
+            .read::<SYNC_LEN>(address, registers::DC_CYCLIC_CONTROL)
             .await
         else {
             return;

@@ -25,7 +25,7 @@ use ecaxis_esi::sii::SiiError;
 #[error("{}{}{}{cause}", Prefix(step), Prefix(at), Prefix(action))]
 pub struct Error {
     pub step: Option<FailedStep>,
-    pub at: Option<Place>,
+    pub at: Option<Location>,
     /// What the master was doing there.
     pub action: Option<&'static str>,
     pub cause: Box<Cause>,
@@ -56,13 +56,13 @@ impl fmt::Display for FailedStep {
 
 /// The place of an error.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Place {
+pub enum Location {
     Device(DeviceRef),
     /// A device or signal of the machine file, before the bus is known.
     Name(String),
 }
 
-impl fmt::Display for Place {
+impl fmt::Display for Location {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Device(device) => device.fmt(f),
@@ -207,6 +207,10 @@ pub enum Cause {
     #[error("the ESI asks for SYNC0, the device has no distributed clock")]
     NoClock,
     #[error(
+        "its clock does not take the time of the reference clock (0x0910), so SYNC0 would drift"
+    )]
+    ClockDoesNotFollow,
+    #[error(
         "starting SYNC0: writing the start time to all devices takes longer than the time until the start"
     )]
     NoStart,
@@ -345,7 +349,7 @@ pub enum Cause {
     #[error("the controller panicked")]
     Controller,
     #[error(
-        "the supervisor thread (`ecaxis-mailbox`) did not run for 2 s: the machine was stopped"
+        "the supervisor thread (`ecaxis-services`) did not run for 2 s: the machine was stopped"
     )]
     Unsupervised,
     /// The user stopped the work. Changed states of devices have been restored.
@@ -360,7 +364,7 @@ impl Cause {
     #[must_use]
     pub fn with_device(self, device: impl Borrow<DeviceRef>) -> Error {
         Error {
-            at: Some(Place::Device(device.borrow().clone())),
+            at: Some(Location::Device(device.borrow().clone())),
             ..self.into()
         }
     }
@@ -368,7 +372,7 @@ impl Cause {
     /// Returns the error with this cause at a device or signal of the machine file.
     pub(crate) fn with_name(self, name: &str) -> Error {
         Error {
-            at: Some(Place::Name(name.to_owned())),
+            at: Some(Location::Name(name.to_owned())),
             ..self.into()
         }
     }
@@ -436,8 +440,8 @@ impl Error {
     #[must_use]
     pub fn device(&self) -> Option<&DeviceRef> {
         match self.at.as_ref()? {
-            Place::Device(device) => Some(device),
-            Place::Name(_) => None,
+            Location::Device(device) => Some(device),
+            Location::Name(_) => None,
         }
     }
 

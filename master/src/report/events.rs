@@ -87,6 +87,10 @@ fn describe_event(event: Event, machine: &Machine) -> String {
             let name = machine.devices.get(device).map_or("?", |d| d.name.as_str());
             clock_off(name, difference_ns)
         }
+        Event::ReferenceReplaced { device, .. } => {
+            let name = machine.devices.get(device).map_or("?", |d| d.name.as_str());
+            reference_replaced(name)
+        }
         Event::Stopping { cause, .. } => describe_cause(cause, &axis),
         Event::GroupStopping { group, cause, .. } => {
             format!(
@@ -128,6 +132,10 @@ fn describe_cause<'m>(cause: StopCause, axis: &impl Fn(AxisIndex) -> &'m str) ->
 }
 
 /// Returns a text with the deviation of a clock from the reference clock.
+pub(crate) fn reference_replaced(name: &str) -> String {
+    format!("the reference clock does not answer; the clock of `{name}` replaces it")
+}
+
 pub(crate) fn clock_off(name: &str, difference_ns: i32) -> String {
     format!(
         "the clock of `{name}` is {} {} the reference clock",

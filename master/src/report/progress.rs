@@ -8,7 +8,7 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use serde::Serialize;
 
 use super::{EmergencyReport, Error};
-use crate::bringup::Step;
+use crate::bringup::{Step, StepTime};
 use crate::clock::Nanos;
 use crate::config::{Machine, TorqueUnit};
 use crate::link::NicWarning;
@@ -50,6 +50,8 @@ pub enum Progress {
     Concern(NicWarning),
     /// Frames leave in phase with SYNC0.
     PhaseLocked,
+    /// Where the time of the bring-up went; after all devices have reached Op.
+    BringUpTimes(Vec<StepTime>),
     Enabled {
         axes: usize,
     },

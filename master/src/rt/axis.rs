@@ -16,7 +16,7 @@ pub struct RtAxis {
     /// The output that opens its brake; it may be on any device.
     pub brake: Option<SignalBits>,
     pub group: GroupIndex,
-    pub feed: SetpointGenerator,
+    pub generator: SetpointGenerator,
     /// Largest following error while enabled, and the status of the last enabled cycle.
     pub largest_following_error: f64,
     pub last_enabled: Option<AxisStatus>,
@@ -39,7 +39,7 @@ impl RtAxis {
             device,
             brake: None,
             group,
-            feed: SetpointGenerator::default(),
+            generator: SetpointGenerator::default(),
             largest_following_error: 0.0,
             last_enabled: None,
             heard: None,
@@ -56,7 +56,7 @@ impl RtAxis {
     }
 
     pub(super) fn command(&mut self, command: Command) -> Result<(), CommandError> {
-        if self.feed.runs() && matches!(command, Command::SetMode(_) | Command::Home { .. }) {
+        if self.generator.runs() && matches!(command, Command::SetMode(_) | Command::Home { .. }) {
             return Err(CommandError::Following);
         }
         self.ordered |= command == Command::Enable;
@@ -71,7 +71,7 @@ impl RtAxis {
                 | Command::DisarmProbe { .. }
         );
         if !aside {
-            self.feed.end();
+            self.generator.end();
         }
         Ok(())
     }

@@ -15,7 +15,7 @@ use crate::clock::Nanos;
 /// Capacity of the command queue; a batch holds at most one command per axis.
 const ORDERS: usize = 512;
 /// Commands taken per cycle; one batch never exceeds this.
-pub const ORDERS_A_CYCLE: usize = 256;
+pub const COMMANDS_PER_CYCLE: usize = 256;
 /// Capacity of the event queue; events beyond it are counted and dropped.
 const EVENTS: usize = 256;
 
@@ -31,7 +31,7 @@ pub enum RtCommand {
         command: Command,
     },
     /// Starts set-point generation for an axis.
-    Feed {
+    Generate {
         axis: AxisIndex,
         start: GeneratorRequest,
     },
@@ -41,10 +41,10 @@ pub enum RtCommand {
         value: f64,
     },
     /// Starts the bus monitor: from now on too many bad cycles stop the machine.
-    Guard,
+    StartBusMonitor,
     /// Stops the bus monitor: the segment is about to leave Op, so wrong working counters are
     /// expected.
-    Unguard,
+    StopBusMonitor,
     /// Brings every axis of the machine to rest within its limits, then disables it.
     Stop,
     /// Reports a drive's error code that was read outside the cycle.
@@ -93,6 +93,11 @@ pub enum Event {
         /// Own clock minus reference.
         difference_ns: i32,
     },
+    /// The reference clock no longer answers; this SubDevice is the reference clock from now on.
+    ReferenceReplaced {
+        cycle: u64,
+        device: DeviceIndex,
+    },
 }
 
 /// The state of the machine after one cycle.
@@ -105,7 +110,7 @@ pub struct Snapshot {
     pub inputs_fresh: bool,
     pub al_status: Option<(u8, u16)>,
     pub axes: IndexVec<AxisIndex, AxisStatus>,
-    pub feeds: IndexVec<AxisIndex, GeneratorState>,
+    pub generators: IndexVec<AxisIndex, GeneratorState>,
     /// The program's input signals, in the order of [`super::cycle::Signals::inputs`]. Each value
     /// is from the last cycle in which it was fresh.
     pub inputs: Vec<f64>,
@@ -122,7 +127,7 @@ pub struct Snapshot {
     /// Events dropped because the queue was full.
     pub events_lost: u64,
     /// Commands taken so far.
-    pub orders_taken: u64,
+    pub commands_taken: u64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -135,7 +140,7 @@ pub struct PhaseStatus {
 /// The real-time end.
 #[derive(Debug)]
 pub struct RtEndpoint {
-    pub orders: rtrb::Consumer<RtCommand>,
+    pub commands: rtrb::Consumer<RtCommand>,
     pub events: rtrb::Producer<Event>,
     pub snapshots: triple_buffer::Input<Snapshot>,
     pub heartbeat: Heartbeat,
@@ -144,7 +149,7 @@ pub struct RtEndpoint {
 /// The end of all other threads.
 #[derive(Debug)]
 pub struct HostEndpoint {
-    pub orders: rtrb::Producer<RtCommand>,
+    pub commands: rtrb::Producer<RtCommand>,
     pub events: rtrb::Consumer<Event>,
     pub snapshots: triple_buffer::Output<Snapshot>,
     pub heartbeat: Heartbeat,
@@ -153,19 +158,19 @@ pub struct HostEndpoint {
 /// Creates both ends. `first` determines the size of the snapshots.
 #[must_use]
 pub fn channel(first: &Snapshot) -> (RtEndpoint, HostEndpoint) {
-    let (order_in, order_out) = rtrb::RingBuffer::new(ORDERS);
+    let (command_in, command_out) = rtrb::RingBuffer::new(ORDERS);
     let (event_in, event_out) = rtrb::RingBuffer::new(EVENTS);
     let (snapshot_in, snapshot_out) = triple_buffer::triple_buffer(first);
     let heartbeat = Heartbeat::default();
     (
         RtEndpoint {
-            orders: order_out,
+            commands: command_out,
             events: event_in,
             snapshots: snapshot_in,
             heartbeat: heartbeat.clone(),
         },
         HostEndpoint {
-            orders: order_in,
+            commands: command_in,
             events: event_out,
             snapshots: snapshot_out,
             heartbeat,

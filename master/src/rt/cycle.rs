@@ -60,6 +60,8 @@ pub struct Engine {
     finished: bool,
     phase: Option<Phase>,
     phase_error: i64,
+    /// The reference clock as last reported.
+    reference: Option<DeviceIndex>,
     /// The AL status as last logged.
     al_status: Option<(u8, u16)>,
     /// For each SubDevice, true while its clock is reported as off.
@@ -78,7 +80,7 @@ pub struct Engine {
     plain: Plain,
     answer: CycleResult,
     events_lost: u64,
-    orders_taken: u64,
+    commands_taken: u64,
     /// Frames of other MainDevices so far.
     main_devices: u64,
     /// The start of the next window of the error counters.
@@ -146,7 +148,6 @@ impl Engine {
             window: started + flight_recorder::COUNTER_WINDOW,
             link: parts.link,
             port: parts.port,
-            exchange: parts.exchange,
             axes: parts.axes,
             groups: config
                 .groups
@@ -162,6 +163,8 @@ impl Engine {
             finished: false,
             phase: parts.phase,
             phase_error: 0,
+            reference: parts.exchange.reference(),
+            exchange: parts.exchange,
             al_status: None,
             clocks_off,
             guard: BusMonitor::new(config.lost_frames, &groups),
@@ -177,7 +180,7 @@ impl Engine {
             config,
             answer: CycleResult::default(),
             events_lost: 0,
-            orders_taken: 0,
+            commands_taken: 0,
             halted: false,
             buf: [0; MAX_FRAME],
         }
@@ -351,8 +354,8 @@ impl Engine {
         for (to, slot) in snapshot.axes.iter_mut().zip(&self.axes) {
             *to = slot.axis.status();
         }
-        for (to, slot) in snapshot.feeds.iter_mut().zip(&self.axes) {
-            *to = slot.feed.state();
+        for (to, slot) in snapshot.generators.iter_mut().zip(&self.axes) {
+            *to = slot.generator.state();
         }
         snapshot.finished = self.finished;
         snapshot.inputs.copy_from_slice(&self.inputs);
@@ -377,7 +380,7 @@ impl Engine {
             }
         }
         snapshot.events_lost = self.events_lost;
-        snapshot.orders_taken = self.orders_taken;
+        snapshot.commands_taken = self.commands_taken;
         let number = self.stats.counters.cycles;
         let cycle = flight_recorder::Cycle::new(
             number,
@@ -398,7 +401,8 @@ impl Engine {
             let missed = (now - self.next) / self.config.cycle_ns + 1;
             self.stats.counters.overruns += missed;
             self.log(LogEntryKind::Overrun(missed));
-            self.next += missed * self.config.cycle_ns;
+            let drift = self.phase.as_ref().map_or(0, Phase::holdover);
+            self.next += missed * self.config.cycle_ns.saturating_add_signed(drift);
         }
     }
 
@@ -435,7 +439,7 @@ pub fn first_snapshot(
         inputs_fresh: false,
         al_status: None,
         axes: axes.iter().map(|slot| slot.axis.status()).collect(),
-        feeds: vec![GeneratorState::None; axes.len()].into(),
+        generators: vec![GeneratorState::None; axes.len()].into(),
         inputs: vec![0.0; signals.inputs.len()],
         finished: false,
         diagnoses: vec![SubDeviceDiagnostics::default(); devices].into(),
@@ -444,6 +448,6 @@ pub fn first_snapshot(
         stop_ended: false,
         groups: vec![GroupStatus::default(); groups].into(),
         events_lost: 0,
-        orders_taken: 0,
+        commands_taken: 0,
     }
 }

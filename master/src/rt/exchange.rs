@@ -38,7 +38,7 @@ pub use bus_status::{BusStatus, MailboxStatus};
 pub use diagnostics::{DiagnosticRegister, ErrorCounters, SubDeviceDiagnostics, Window};
 use frame::{
     DATAGRAM_HEADER, DatagramSlot, FIRST_DATAGRAM, MAC_TAIL, WKC, clear_wkc, frame_number,
-    frame_tag, new_frames, same_datagram, write_header,
+    frame_tag, new_frames, same_datagram, write_header, write_station,
 };
 use frame_set::FrameSet;
 pub use poll_schedule::MAX_POLL_DATAGRAM;
@@ -49,6 +49,8 @@ use slots::DatagramSlots;
 /// After a wrong working counter each device has its own datagram, until this many cycles in a row
 /// were right.
 const SEPARATE_CYCLES: u16 = 100;
+/// The cycles in a row without a time of the reference clock after which another clock replaces it.
+const REFERENCE_CYCLES: u8 = 10;
 
 /// The exchange of process data.
 #[derive(Debug)]
@@ -69,9 +71,13 @@ pub struct Exchange {
     device_answers: IndexVec<DeviceIndex, DeviceAnswer>,
     /// For each device, true if a late answer has arrived since the last cycle.
     late: IndexVec<DeviceIndex, bool>,
-    /// The reference clock.
-    reference: DeviceIndex,
-    /// The value to which a clock is set if the reference before it does not answer: almost its own
+    /// The devices that can be the reference clock, in the order in which frames pass them, and the
+    /// one that is.
+    clocks: Vec<(u16, DeviceIndex)>,
+    reference: usize,
+    /// The cycles in a row in which the reference clock did not answer.
+    reference_missing: u8,
+    /// The value that the other clocks receive if the reference does not answer: almost their own
     /// time.
     expected_time: u64,
     cycle_ns: u64,
@@ -129,16 +135,18 @@ impl Exchange {
         // The first group exists even without members.
         let groups = plan.groups.iter().max().map_or(1, |last| last.0 + 1);
         let mut group_results = IndexVec::from(vec![GroupResult::default(); groups]);
-        for (member, &group) in members.iter().zip(&plan.groups) {
-            group_results[group].clocks += u16::from(member.clock);
-        }
         for datagram in &layouts[0].process_data {
             group_results[datagram.group].wkc.1 += datagram.expected_wkc;
         }
+        let candidates = (0..).map(DeviceIndex).zip(members);
+        let mut clocks: Vec<_> = candidates
+            .filter(|(_, member)| member.clock)
+            .map(|(device, member)| (member.station, device))
+            .collect();
+        clocks.sort_unstable();
         let reference = clock.and_then(|clock| {
-            members
-                .iter()
-                .position(|member| member.station == clock.reference)
+            let mut stations = clocks.iter().map(|(station, _)| *station);
+            stations.position(|station| station == clock.reference)
         });
         let mut exchange = Self {
             frame_sets,
@@ -150,7 +158,9 @@ impl Exchange {
             order,
             device_answers: vec![DeviceAnswer::Unknown; members.len()].into(),
             late: vec![false; members.len()].into(),
-            reference: DeviceIndex(reference.unwrap_or(0)),
+            clocks,
+            reference: reference.unwrap_or(0),
+            reference_missing: 0,
             expected_time: 0,
             cycle_ns: clock.map_or(0, |clock| clock.cycle_ns),
             bus_status: Arc::new(BusStatus::new(members.len())),
@@ -275,6 +285,12 @@ impl Exchange {
         read.then_some((device, found.clock_difference))
     }
 
+    /// Returns the reference clock; `None` without distributed clocks.
+    #[must_use]
+    pub fn reference(&self) -> Option<DeviceIndex> {
+        Some(self.clocks.get(self.reference)?.1)
+    }
+
     /// Returns the index of the oldest frame set, which is evaluated in this cycle.
     fn due(&self) -> usize {
         (self.staged + 1) % self.frame_sets.len()
@@ -293,7 +309,9 @@ impl Exchange {
             frame_set.layout = layout;
         }
         self.refresh_outputs();
-        let time = self.expected_time;
+        // Another value every cycle, so that no clock shows it by chance several times in a row.
+        let time = self.expected_time ^ u64::from(self.cycle.wrapping_mul(0x9e37_79b1) >> 26);
+        let reference = self.clocks.get(self.reference);
         let (Some(frame_set), Some(slots)) = (
             self.frame_sets.get_mut(self.staged),
             self.layouts.get(layout),
@@ -317,7 +335,8 @@ impl Exchange {
                 poll.len,
             );
         }
-        if let Some(slot) = slots.clock {
+        if let (Some(slot), Some((station, _))) = (slots.clock, reference) {
+            write_station(first, slot, *station);
             first[slot.data()].copy_from_slice(&time.to_le_bytes());
             clear_wkc(first, slot);
         }
@@ -325,7 +344,7 @@ impl Exchange {
         clear_wkc(first, slots.al_status);
         frame_set.poll = poll;
         frame_set.stage(self.cycle);
-        self.expected_time = time.wrapping_add(self.cycle_ns);
+        self.expected_time = self.expected_time.wrapping_add(self.cycle_ns);
     }
 
     /// Copies outputs that have changed since [`Exchange::stage`] into the frames. Call before
@@ -374,7 +393,7 @@ impl Exchange {
     /// Stores an answer until its frame set is evaluated. RT: O(frame).
     pub fn receive(&mut self, frame: &[u8]) -> Received {
         if frame.get(12..14) != Some(&ETHERCAT[..]) || frame.get(11) != Some(&MAC_TAIL) {
-            return Received::Foreign;
+            return Received::NotOurs;
         }
         let mut frame_sets = self.frame_sets.iter_mut();
         if frame_sets.any(|frame_set| frame_set.receive(frame)) {
@@ -510,6 +529,7 @@ impl Exchange {
             system_time: None,
             al_status: None,
             sent_late: frame_set.sent_late.unwrap_or(0),
+            sent_at: frame_set.sent_at,
         };
         let Some(first) = first else {
             return answer;
@@ -546,33 +566,24 @@ impl Exchange {
                 }
             }
         }
-        answer.system_time = self.system_time(first, slots.clock);
+        let Some(clock) = slots.clock else {
+            return answer;
+        };
+        answer.system_time = frame_set.changed(clock);
         if let Some(time) = answer.system_time {
             self.bus_status.set_clock(frame_set.sent_at, time);
             // The time of the frame set that is staged next; those in flight lie between.
             let ahead = self.cycle_ns.saturating_mul(self.frame_sets.len() as u64);
             self.expected_time = time.wrapping_add(ahead);
+            self.reference_missing = 0;
+        } else {
+            self.reference_missing += 1;
+        }
+        if self.reference_missing >= REFERENCE_CYCLES {
+            self.reference_missing = 0;
+            self.reference = (self.reference + 1) % self.clocks.len().max(1);
         }
         answer
-    }
-
-    /// Returns the time if the reference clock has set it. If clocks are missing, they must all be
-    /// in groups with missing devices, and the reference must have answered its last diagnostic
-    /// read.
-    fn system_time(&self, first: &[u8], slot: Option<DatagramSlot>) -> Option<u64> {
-        let slot = slot?;
-        let time = u64::from_le_bytes(first.get(slot.data())?.try_into().ok()?);
-        let wkc = slot.wkc(first);
-        let clocks = |group_results: &mut dyn Iterator<Item = &GroupResult>| -> u16 {
-            group_results
-                .map(|group| group.clocks)
-                .fold(0, u16::saturating_add)
-        };
-        let seen = self.diagnoses.get(self.reference);
-        let all = wkc == clocks(&mut self.group_results.iter());
-        let others = seen.is_some_and(|seen| seen.answers)
-            && wkc >= clocks(&mut self.group_results.iter().filter(|group| group.fresh));
-        (all || others).then_some(time)
     }
 
     /// Returns the bytes of each staged frame without FCS.

@@ -71,11 +71,20 @@ fn grouped(groups: &[usize]) -> Exchange {
 
 /// Creates an exchange; the first device has a clock.
 fn exchange(devices: &[ProcessData], mode: ExchangeMode) -> Exchange {
+    exchange_with(devices, 1, mode)
+}
+
+/// Creates an exchange of axes that all have a clock.
+fn clocks(count: usize, mode: ExchangeMode) -> Exchange {
+    exchange_with(&vec![axis(0); count], count, mode)
+}
+
+fn exchange_with(devices: &[ProcessData], clocks: usize, mode: ExchangeMode) -> Exchange {
     let plan = plan(devices).expect("fits");
     let members: Vec<_> = (0..devices.len())
         .map(|i| ExchangeDevice {
             station: 0x1000 + i as u16,
-            clock: i == 0,
+            clock: i < clocks,
             mailbox: None,
         })
         .collect();
@@ -83,6 +92,7 @@ fn exchange(devices: &[ProcessData], mode: ExchangeMode) -> Exchange {
         reference: 0x1000,
         cycle_ns: 1_000_000,
         release: 0,
+        release_at: 0,
     };
     Exchange::new(&plan, Some(&clock), &members, mode)
 }
@@ -352,25 +362,71 @@ fn each_group_has_its_own_working_counter() {
     assert_eq!(exchange.inputs(), inputs);
 }
 
-/// A clock that is missing with its group does not keep the other clocks from the reference.
+/// ETG.1000.4, FRMW: without the addressed device, the data come back as sent.
 #[test]
 fn system_time_comes_only_from_the_reference_clock() {
-    let mut exchange = grouped(&[0, 1]);
-    exchange.group_results[GroupIndex(1)].clocks = 1;
-    let mut answer = |wkc: u8, fresh: bool| {
+    let mut exchange = axes(3);
+    for wkc in [0, 1, 2, 200] {
+        for answers in [true, false] {
+            exchange.stage();
+            let clock = exchange.layouts[0].clock.expect("a clock");
+            let sent = exchange.frame_sets[0].frames()[0].bytes[clock.data()].to_vec();
+            let mut frame = reflect(&mut exchange, 0, 0x77);
+            frame[clock.data().end] = wkc;
+            if !answers {
+                frame[clock.data()].copy_from_slice(&sent);
+            }
+            exchange.receive(&frame);
+            let answer = exchange.evaluate();
+            assert_eq!(answer.system_time.is_some(), answers, "counter {wkc}");
+        }
+    }
+}
+
+/// ETG.1000.4: every clock holds the system time, so the next one can distribute it.
+#[test]
+fn next_clock_replaces_a_reference_that_does_not_answer() {
+    for mode in [ExchangeMode::SameCycle, ExchangeMode::Pipelined] {
+        let mut exchange = clocks(3, mode);
+        let asked = |exchange: &Exchange| {
+            let frame_set = &exchange.frame_sets[exchange.staged];
+            let clock = exchange.layouts[0].clock.expect("a clock");
+            let bytes = &frame_set.frames()[0].bytes;
+            u16::from_le_bytes([bytes[clock.offset + 2], bytes[clock.offset + 3]])
+        };
+        let mut seen = Vec::new();
+        for cycle in 0..200 {
+            // The first device leaves after 20 cycles, the second one after 100.
+            let gone = u16::from(cycle >= 20) + u16::from(cycle >= 100);
+            let station = asked(&exchange);
+            let clock = exchange.layouts[0].clock.expect("a clock");
+            let sent =
+                exchange.frame_sets[exchange.staged].frames()[0].bytes[clock.data()].to_vec();
+            let mut frame = reflect(&mut exchange, 0, 0x77);
+            if station < 0x1000 + gone {
+                frame[clock.data()].copy_from_slice(&sent);
+            }
+            exchange.receive(&frame);
+            exchange.evaluate();
+            exchange.stage();
+            if seen.last() != Some(&station) {
+                seen.push(station);
+            }
+        }
+        assert_eq!(seen, [0x1000, 0x1001, 0x1002], "{mode:?}");
+        assert_eq!(exchange.reference(), Some(DeviceIndex(2)));
+    }
+}
+
+#[test]
+fn lost_frames_do_not_replace_the_reference() {
+    let mut exchange = clocks(3, ExchangeMode::SameCycle);
+    for _ in 0..100 {
+        exchange.send(&mut Nowhere, 0).expect("nowhere takes all");
+        exchange.evaluate();
         exchange.stage();
-        let mut frame = reflect(&mut exchange, 0, 1);
-        let clock = exchange.layouts[0].clock.expect("a clock").data().end;
-        frame[clock] = wkc;
-        let second = exchange.layouts[0].process_data[1].slot.data().end;
-        frame[second] = if fresh { 3 } else { 0 };
-        exchange.receive(&frame);
-        exchange.evaluate().system_time.is_some()
-    };
-    assert!(answer(2, true), "both are there");
-    assert!(!answer(1, true), "one of them is missing");
-    assert!(answer(1, false), "it is the one whose group is missing");
-    assert!(!answer(0, false));
+    }
+    assert_eq!(exchange.reference(), Some(DeviceIndex(0)));
 }
 
 /// A lost frame affects only the groups in it.
@@ -516,6 +572,7 @@ fn copies_and_repeats_are_in_the_next_frames() {
         reference: 1,
         cycle_ns: 1_000_000,
         release: 0,
+        release_at: 0,
     };
     let mut exchange = Exchange::new(&plan, Some(&clock), &members, ExchangeMode::SameCycle);
     exchange.outputs_mut().fill(0xff);

@@ -3,7 +3,12 @@
 //! The phase error is the time within the SYNC0 cycle at which the frame passed the reference
 //! clock, minus the planned time. A PI controller turns the error into the length of the next
 //! cycle. Its integral is the drift between the host clock and the reference clock. The measured
-//! wake-up lateness is subtracted first, so that a late thread does not shift the phase.
+//! wake-up lateness is subtracted first, so that a late thread does not shift the phase, even if it
+//! is late by several cycles.
+//!
+//! Only the low 32 bits of the system time count, because some clocks have no more. They wrap every
+//! 4.3 s, in the middle of a cycle. The host clock bridges the time since the last measurement, or
+//! since the plan; it would need hours to be wrong by half a wrap.
 //!
 //! Before the first lock no device is in Op, and one cycle of odd length does no harm. The phase is
 //! therefore set at once, not approached.
@@ -33,9 +38,9 @@ impl Gains {
 
 /// The score at which the phase counts as locked. A measurement inside the window adds one, one
 /// outside subtracts one. A single late answer on a busy host therefore does not restart the count.
-const LOCKED_SCORE: u32 = 50;
+const LOCKED_SCORE: u32 = 20;
 /// The highest score. From here, 21 more measurements outside than inside unlock the phase.
-const BEST_SCORE: u32 = 70;
+const BEST_SCORE: u32 = 40;
 /// Measurements after the phase was set that may belong to frames released before.
 const UNDER_WAY: u8 = 2;
 
@@ -45,8 +50,11 @@ pub struct ClockPlan {
     /// Station address of the reference clock.
     pub reference: u16,
     pub cycle_ns: u64,
-    /// A system time at which a frame should pass the reference clock, repeating every cycle.
-    pub release: u64,
+    /// The low 32 bits of a system time at which a frame should pass the reference clock, repeating
+    /// every cycle.
+    pub release: u32,
+    /// The session clock's time at that system time, to a second.
+    pub release_at: Nanos,
 }
 
 /// The phase controller of one segment.
@@ -54,10 +62,8 @@ pub struct ClockPlan {
 pub struct Phase {
     gains: Gains,
     cycle: i64,
-    /// System time of the last measurement, extended to 64 bits.
-    time: Option<u64>,
-    /// The planned passing time modulo the cycle, in system time.
-    target: i64,
+    /// The last planned passing time: the system time, and the session clock's time.
+    planned: (u32, Nanos),
     /// The drift in ns per cycle.
     drift: f64,
     locked: bool,
@@ -86,12 +92,10 @@ impl Phase {
     #[must_use]
     pub fn with_gains(plan: &ClockPlan, gains: Gains) -> Self {
         let cycle = i64::try_from(plan.cycle_ns).unwrap_or(i64::MAX).max(1);
-        let target = i64::try_from(plan.release % plan.cycle_ns.max(1)).unwrap_or(0);
         Self {
             gains,
             cycle,
-            time: None,
-            target,
+            planned: (plan.release, plan.release_at),
             drift: 0.0,
             locked: false,
             acquired: false,
@@ -113,14 +117,13 @@ impl Phase {
 
     /// Processes one measurement. RT.
     ///
-    /// `system_time` is the reference clock's time as the frame passed. `lateness` is how long
-    /// after its planned release the frame was sent.
-    pub fn update(&mut self, system_time: u64, lateness: Nanos) -> PhaseStep {
-        let system_time = self.extend(system_time);
-        let passed = i64::try_from(system_time % self.cycle.unsigned_abs()).unwrap_or(0);
-        let error = self.wrap(passed - self.target);
-        let lateness = i64::try_from(lateness).unwrap_or(i64::MAX).min(self.cycle);
-        let planned = self.wrap(error - lateness);
+    /// `system_time` is the reference clock's time as the frame passed, of which the low 32 bits
+    /// count. The frame was sent at `sent_at`, `lateness` after its planned release.
+    pub fn update(&mut self, system_time: u64, sent_at: Nanos, lateness: Nanos) -> PhaseStep {
+        let passed = self.advance(system_time as u32, sent_at);
+        let error = self.wrap(passed);
+        let lateness = i64::try_from(lateness).unwrap_or(0);
+        let planned = self.wrap(error.saturating_sub(lateness));
         if self.under_way > 0 {
             self.under_way -= 1;
             let adjust = self.holdover();
@@ -171,18 +174,19 @@ impl Phase {
         self.acquired |= self.locked;
     }
 
-    /// Extends a 32-bit clock to 64 bits. Such a clock wraps every 4.3 s, in the middle of a cycle.
-    /// Measurements are less than half of that apart.
-    fn extend(&mut self, raw: u64) -> u64 {
-        let time = match self.time {
-            None => raw,
-            Some(last) => {
-                let passed = (raw as u32).wrapping_sub(last as u32) as i32;
-                last.wrapping_add_signed(i64::from(passed))
-            }
-        };
-        self.time = Some(time);
-        time
+    /// Advances the planned passing time to the last one before this system time. Returns the time
+    /// since then.
+    fn advance(&mut self, system_time: u32, at: Nanos) -> i64 {
+        let (planned, planned_at) = self.planned;
+        let by_host = at.wrapping_sub(planned_at).cast_signed();
+        let expected = planned.wrapping_add(by_host as u32);
+        let difference = system_time.wrapping_sub(expected).cast_signed();
+        let passed = (by_host + i64::from(difference)).rem_euclid(self.cycle);
+        self.planned = (
+            system_time.wrapping_sub(passed as u32),
+            at.wrapping_add_signed(-passed),
+        );
+        passed
     }
 
     /// Wraps a value into ± half a cycle.
@@ -195,11 +199,12 @@ impl Phase {
 mod tests {
     use super::*;
 
-    fn plan(cycle_ns: u64, release: u64) -> ClockPlan {
+    fn plan(cycle_ns: u64, release: u32) -> ClockPlan {
         ClockPlan {
             reference: 0x1000,
             cycle_ns,
             release,
+            release_at: u64::from(release),
         }
     }
 
@@ -207,8 +212,39 @@ mod tests {
     fn a_clock_of_32_bits_keeps_its_phase_when_it_wraps() {
         let mut phase = Phase::new(&plan(1_000_000, 0));
         for k in 0..10_000_u64 {
-            let step = phase.update((k * 1_000_000) & 0xffff_ffff, 0);
+            let time = k * 1_000_000;
+            let step = phase.update(time & 0xffff_ffff, time, 0);
             assert_eq!(step.error, 0, "cycle {k}");
+        }
+    }
+
+    /// 2^32 ns is no multiple of these cycles. The first measurement, or the next one after a broken
+    /// cable, may come several wraps later; the host clock has a drift of 100 ppm.
+    #[test]
+    fn a_clock_of_32_bits_keeps_its_phase_over_a_long_pause() {
+        for cycle in [250_000, 1_000_000, 2_000_000, 4_000_000] {
+            let start = u64::from(u32::MAX) - 3 * cycle;
+            let mut phase = Phase::new(&plan(cycle, start as u32));
+            let mut time = start;
+            for pause in [0, 1, 4_000, 100_000, 3_000_000] {
+                time += pause * cycle;
+                let host = start + (time - start) / 10_000 * 10_001;
+                let step = phase.update(time, host + 123_000, 123_000);
+                assert_eq!(step.error, 0, "{cycle} ns, after {pause} cycles");
+            }
+        }
+    }
+
+    #[test]
+    fn a_wake_up_several_cycles_late_does_not_move_the_phase() {
+        let mut phase = Phase::new(&plan(1_000_000, 0));
+        for k in 1..200 {
+            phase.update(k * 1_000_000, k * 1_000_000, 0);
+        }
+        for late in [400_000, 1_300_000, 2_700_000, 7_500_000] {
+            let step = phase.update(300_000_000 + late, 300_000_000 + late, late);
+            assert_eq!(step.adjust, 0, "{late} ns late");
+            assert!(phase.locked());
         }
     }
 
@@ -222,7 +258,7 @@ mod tests {
             let lateness = late(k);
             let local = (release + lateness) as f64;
             let system_time = (local * (1.0 + ppm * 1e-6)) as u64 + offset;
-            let step = phase.update(system_time, lateness);
+            let step = phase.update(system_time, release + lateness, lateness);
             release = release.wrapping_add_signed(cycle as i64 + step.adjust);
             match locked_at {
                 None if phase.locked() => locked_at = Some(k),
@@ -261,7 +297,7 @@ mod tests {
                 let last = releases[k];
                 let step = k
                     .checked_sub(lag)
-                    .map(|k| phase.update(releases[k], 0).adjust);
+                    .map(|k| phase.update(releases[k], releases[k], 0).adjust);
                 releases.push(last.wrapping_add_signed(20_000_000 + step.unwrap_or(0)));
             }
             assert!(phase.locked(), "lag {lag}");
@@ -282,14 +318,14 @@ mod tests {
     fn unlocks_only_after_a_run_of_bad_measurements() {
         let mut phase = Phase::new(&plan(1_000_000, 500_000));
         for _ in 0..200 {
-            phase.update(500_000, 0);
+            phase.update(500_000, 500_000, 0);
         }
         assert!(phase.locked());
         for _ in 0..BEST_SCORE - LOCKED_SCORE {
-            phase.update(0, 0);
+            phase.update(0, 0, 0);
         }
         assert!(phase.locked());
-        phase.update(0, 0);
+        phase.update(0, 0, 0);
         assert!(!phase.locked());
     }
 }

@@ -19,7 +19,7 @@ const LIMITS: Limits = Limits {
 /// An enabled axis whose drive reports the target of the previous cycle.
 struct Rig {
     axis: Axis,
-    feed: SetpointGenerator,
+    generator: SetpointGenerator,
     out: Outputs,
     before: f64,
 }
@@ -31,7 +31,7 @@ impl Rig {
         let config = AxisConfig::new(Mode::Csp, scale, limits);
         let mut rig = Self {
             axis: Axis::new(config).expect("an axis"),
-            feed: SetpointGenerator::default(),
+            generator: SetpointGenerator::default(),
             out: Outputs::default(),
             before: 0.0,
         };
@@ -60,14 +60,14 @@ impl Rig {
         };
         self.axis.observe(&inputs, DT);
         self.before = self.axis.status().target_position;
-        let _ = self.feed.advance(&mut self.axis, &[], master, DT);
+        let _ = self.generator.advance(&mut self.axis, &[], master, DT);
         self.out = self.axis.act();
         self.axis.status().target_position
     }
 
     fn begin(&mut self, start: GeneratorRequest, master: Option<Motion>) {
         let status = self.axis.status();
-        self.feed.begin(start, &status, master, false);
+        self.generator.begin(start, &status, master, false);
     }
 
     fn part(&self, target: f64, speed: f64) -> LineAxis {
@@ -116,7 +116,7 @@ fn six_axes_on_lines_there_and_back_arrive_in_the_same_cycle() {
             let sent = all.map(|i| f64::from(axes[i].out.target_position) / 400.0);
             let off = off_the_line(&all.map(|i| sent[i] - parts[i].from.position), &way);
             assert!(off.iter().all(|off| off.abs() < 1.0 / 400.0), "{off:?}");
-            let states = all.map(|i| axes[i].feed.state());
+            let states = all.map(|i| axes[i].generator.state());
             assert!(states.iter().all(|state| *state == states[0]), "{states:?}");
             if states[0] == GeneratorState::Finished {
                 break;
@@ -159,12 +159,12 @@ fn a_gear_follows_within_the_same_cycle_and_ends_with_a_command() {
         let master_motion = commanded(&master.axis.status());
         let follows = follower.cycle(Some(master_motion));
         assert!((follows + 0.5 * at).abs() < 1e-9, "{follows} {at}");
-        assert_eq!(follower.feed.state(), GeneratorState::Engaged);
+        assert_eq!(follower.generator.state(), GeneratorState::Engaged);
     }
     assert_eq!(master.axis.status().target_position, 40.0);
     follower.axis.command(Command::Stop).expect("takes it");
-    follower.feed.end();
-    assert_eq!(follower.feed.state(), GeneratorState::None);
+    follower.generator.end();
+    assert_eq!(follower.generator.state(), GeneratorState::None);
 }
 
 #[test]
@@ -181,9 +181,9 @@ fn rejected_set_point_ends_the_generator() {
         rig.cycle(None);
     }
     assert!(
-        matches!(rig.feed.state(), GeneratorState::Refused(_)),
+        matches!(rig.generator.state(), GeneratorState::Refused(_)),
         "{:?}",
-        rig.feed.state()
+        rig.generator.state()
     );
 }
 
@@ -217,7 +217,7 @@ fn moves_timed_together_arrive_in_the_same_cycle() {
             let position = rig.cycle(None);
             let change = (commanded(&rig.axis.status()).velocity - before).abs();
             assert!(change <= 2500.0 * DT * 1.000_001, "{change}");
-            if arrived[index].is_none() && rig.feed.state() == GeneratorState::Finished {
+            if arrived[index].is_none() && rig.generator.state() == GeneratorState::Finished {
                 assert_eq!(position, axes[index].0);
                 arrived[index] = Some(cycle);
             }

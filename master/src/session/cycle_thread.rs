@@ -58,7 +58,7 @@ pub(super) fn in_real_time(
     // The supervisor's thread starts first: a thread inherits scheduling class and CPU of its
     // parent.
     let during = thread::Builder::new()
-        .name("ecaxis-mailbox".to_owned())
+        .name("ecaxis-services".to_owned())
         .spawn(move || executor::block_on(supervisor.run()))
         .map_err(|error| Cause::Thread(error.to_string()))?;
     let (_held, mut denied) = CpuWakeGuard::take(config.cpu.filter(|_| config.awake));

@@ -159,14 +159,14 @@ pub(super) fn of_run(
         link: left.link,
         devices: devices.collect(),
     };
-    let mut story = build_report(machine, options, error, &evidence);
-    story.stop = Stop::of(&evidence, left.started);
-    story.events = left.events.to_vec();
+    let mut fault_report = build_report(machine, options, error, &evidence);
+    fault_report.stop = Stop::of(&evidence, left.started);
+    fault_report.events = left.events.to_vec();
     let setups = machine
         .devices
         .iter()
         .filter_map(|device| Some((device, device.axis.as_ref()?)));
-    story.axes = setups
+    fault_report.axes = setups
         .zip(left.axes)
         .map(|((device, setup), slot)| {
             let status = slot.axis.status();
@@ -180,10 +180,10 @@ pub(super) fn of_run(
         })
         .collect();
     let cycles = left.history.cycles();
-    story.cycles = cycles
+    fault_report.cycles = cycles
         .map(|(cycle, axes)| CycleRecord::new(cycle, axes, left.started))
         .collect();
-    Some(story)
+    Some(fault_report)
 }
 
 fn build_report(

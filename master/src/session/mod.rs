@@ -101,7 +101,7 @@ pub struct Outcome {
     /// The statistics behind the summary.
     pub stats: Option<Box<Stats>>,
     /// The fault report of a bus failure, or of a group that stopped and was not reset.
-    pub story: Option<Box<FaultReport>>,
+    pub fault_report: Option<Box<FaultReport>>,
 }
 
 impl From<Error> for Outcome {
@@ -110,7 +110,7 @@ impl From<Error> for Outcome {
             summary: None,
             result: Err(error),
             stats: None,
-            story: None,
+            fault_report: None,
         }
     }
 }
@@ -272,7 +272,7 @@ fn run_on_link_thread(
         Ok(prepared) => prepared,
         Err(error) => {
             return Outcome {
-                story: fault_evidence::of_bring_up(machine, options, &error, seen),
+                fault_report: fault_evidence::of_bring_up(machine, options, &error, seen),
                 ..error.into()
             };
         }
@@ -326,7 +326,7 @@ fn run_on_link_thread(
     let (unreleased, then) = ended.left.take().unzip();
     let failed = result.as_ref().err().or(unreleased.as_deref());
     let witnessed = ended.witnessed.take().or(then).unwrap_or_default();
-    let story = failed.and_then(|error| {
+    let fault_report = failed.and_then(|error| {
         let left = RunEvidence {
             places,
             witnessed,
@@ -360,6 +360,6 @@ fn run_on_link_thread(
         summary: Some(summary),
         result,
         stats: Some(Box::new(stats)),
-        story,
+        fault_report,
     }
 }

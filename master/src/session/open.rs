@@ -1,7 +1,7 @@
 //! Opens the link that the machine file's `nic` names, and records it on request.
 
 use std::borrow::Cow;
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use ecaxis_esi::sii::{self, SiiOptions};
 use ecaxis_esi::{Device, Slots};
@@ -20,6 +20,7 @@ use crate::link::replay::Replay;
 use crate::link::sim::SimLink;
 use crate::link::{self, Link, NicWarning, OpenError};
 use crate::recording;
+use crate::sys::rt_thread;
 
 /// Opens the link of the machine. Blocks.
 ///
@@ -45,8 +46,11 @@ pub fn link(
         )?)),
         (None, Nic::Interface(nic)) => {
             let (mut link, concerns) = link::open_exclusive(nic, machine.bus.link)?;
+            let opened = Instant::now();
+            // Meanwhile; `become_realtime` repeats it and reports what is denied.
+            let _ = rt_thread::lock_memory();
             // The first frame would set another MainDevice's drives to Init.
-            let frames = link::sniff_foreign_frames(link.as_mut()).map_err(Cause::Link)?;
+            let frames = link::sniff_foreign_frames(link.as_mut(), opened).map_err(Cause::Link)?;
             if frames > 0 {
                 let nic = nic.clone();
                 return Err(OpenError::Driven { nic, frames }.into());

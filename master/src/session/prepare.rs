@@ -109,7 +109,7 @@ impl RunBuilder<'_> {
                 let clock = options.clock;
                 let members = bus.devices.iter().map(|device| ExchangeDevice {
                     station: device.at.station,
-                    clock: device.dc,
+                    clock: device.follows,
                     mailbox: device.coe.as_ref().map(|coe| coe.layout().in_sm),
                 });
                 let members: Vec<_> = members.collect();
@@ -159,7 +159,7 @@ impl RunBuilder<'_> {
                     seen: Vec::new(),
                     limited: vec![false; axes.len()].into(),
                     axes,
-                    orders_given: 0,
+                    commands_sent: 0,
                     refused: VecDeque::new(),
                     captures: Vec::new(),
                     stopped: Vec::new(),
@@ -177,7 +177,7 @@ impl RunBuilder<'_> {
                     Cause::Interrupted | Cause::Panicked(_) | Cause::Link(_)
                 ) {
                     seen.looks = vec![DeviceSnapshot::default(); machine.devices.len()];
-                    let wire = DatagramClient::new(main_device);
+                    let wire = DatagramClient::without_cycle(main_device);
                     let stations: Vec<_> = (crate::acyclic::enumerate::FIRST_STATION..)
                         .take(machine.devices.len())
                         .collect();
@@ -329,7 +329,7 @@ fn bring_up_catching_panics(
     progress: &Sender<Progress>,
     log: &EmergencyLog,
 ) -> Result<Bus, Error> {
-    let mut report = |step| {
+    let report = |step| {
         let _ = progress.send(match step {
             Step::Warning(text) => Progress::Warning(text),
             step => Progress::Step(step),
@@ -343,7 +343,7 @@ fn bring_up_catching_panics(
     } = carried;
     // ethercrab panics on some wire content, for example on a SubDevice without an open port.
     let run = std::panic::AssertUnwindSafe(|| {
-        let bring_up = Box::pin(bring_up(main_device, machine, image, &mut report, log));
+        let bring_up = Box::pin(bring_up(main_device, machine, image, &report, log));
         drive_pdu_loop(port, link, clock, stop.run_until_requested(bring_up))
     });
     match std::panic::catch_unwind(run) {
@@ -370,7 +370,7 @@ pub(super) fn broadcast_init(
         let datagram = Datagram::bwr(register).ignore_wkc();
         let _ = datagram.send(main_device, value).await;
     };
-    let wire = DatagramClient::new(main_device);
+    let wire = DatagramClient::without_cycle(main_device);
     let silence = async {
         all(registers::AL_CONTROL, u16::from(AlState::Init.code())).await;
         clock::delay(TO_INIT).await;

@@ -71,11 +71,11 @@ impl Supervisor {
         }
         let line = Line::plan(&line_axes)
             .map_err(|error| self.refusal(step, axes[error.axis], &error.error))?;
-        let feeds = axes.iter().zip(&line_axes);
-        let feeds: Vec<_> = feeds
+        let generators = axes.iter().zip(&line_axes);
+        let generators: Vec<_> = generators
             .map(|(&axis, part)| (axis, GeneratorRequest::Line(line.along(part))))
             .collect();
-        self.follow(step, start, &feeds, GeneratorState::Finished)
+        self.follow(step, start, &generators, GeneratorState::Finished)
             .await
     }
 
@@ -116,11 +116,11 @@ impl Supervisor {
         }
         let first = axes.first().copied().unwrap_or_default();
         arrive_together(&mut moves).map_err(|error| self.refusal(step, first, &error))?;
-        let feeds = axes.iter().zip(&moves);
-        let feeds: Vec<_> = feeds
+        let generators = axes.iter().zip(&moves);
+        let generators: Vec<_> = generators
             .map(|(&axis, &planned)| (axis, GeneratorRequest::Move(planned)))
             .collect();
-        self.follow(step, start, &feeds, GeneratorState::Finished)
+        self.follow(step, start, &generators, GeneratorState::Finished)
             .await
     }
 
@@ -145,7 +145,7 @@ impl Supervisor {
         actual: bool,
         config: GearConfig,
     ) -> Result<(), Error> {
-        let feed = match *self.places(&devices) {
+        let generator = match *self.places(&devices) {
             [axis, master] => Some((
                 axis,
                 GeneratorRequest::Gear {
@@ -156,8 +156,8 @@ impl Supervisor {
             )),
             _ => None,
         };
-        let feeds: Vec<_> = feed.into_iter().collect();
-        self.follow(step, start, &feeds, GeneratorState::Engaged)
+        let generators: Vec<_> = generator.into_iter().collect();
+        self.follow(step, start, &generators, GeneratorState::Engaged)
             .await
     }
 
@@ -173,14 +173,14 @@ impl Supervisor {
         let snapshot = self.poll_and_query().await?;
         let limits = self.limits(device);
         let dt_s = self.machine.bus.cycle_ns as f64 * 1e-9;
-        let mut feeds = Vec::new();
+        let mut generators = Vec::new();
         for axis in axes {
             let at = commanded(&snapshot.axes[axis]);
             let wave = PositionWave::new(wave, at, limits.motion(), limits.position, dt_s)
                 .map_err(|error| self.refusal(step, axis, &error))?;
-            feeds.push((axis, GeneratorRequest::Wave(wave)));
+            generators.push((axis, GeneratorRequest::Wave(wave)));
         }
-        self.follow(step, start, &feeds, GeneratorState::Finished)
+        self.follow(step, start, &generators, GeneratorState::Finished)
             .await
     }
 
@@ -209,14 +209,14 @@ impl Supervisor {
         }
         let snapshot = self.poll_and_query().await?;
         let limits = self.limits(device).motion();
-        let mut feeds = Vec::new();
+        let mut generators = Vec::new();
         for axis in axes {
             let at = commanded(&snapshot.axes[axis]);
             let playback = Playback::new(&self.machine.tables[table].table, at, limits, 0.0)
                 .map_err(|error| self.refusal(step, axis, &error))?;
-            feeds.push((axis, GeneratorRequest::Table { table, playback }));
+            generators.push((axis, GeneratorRequest::Table { table, playback }));
         }
-        self.follow(step, start, &feeds, GeneratorState::Finished)
+        self.follow(step, start, &generators, GeneratorState::Finished)
             .await
     }
 
@@ -226,20 +226,20 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        feeds: &[(AxisIndex, GeneratorRequest)],
+        generators: &[(AxisIndex, GeneratorRequest)],
         until: GeneratorState,
     ) -> Result<(), Error> {
-        let orders = feeds
+        let commands = generators
             .iter()
-            .map(|&(axis, start)| RtCommand::Feed { axis, start });
-        self.orders(&orders.collect::<Vec<_>>()).await;
+            .map(|&(axis, start)| RtCommand::Generate { axis, start });
+        self.send_all(&commands.collect::<Vec<_>>()).await;
         let begun = clock::now();
         let mut settling = Settling::default();
         self.wait_until(step, start, |this, snapshot| {
             let mut done = true;
             let mut late = None;
-            for &(axis, _) in feeds {
-                match snapshot.feeds[axis] {
+            for &(axis, _) in generators {
+                match snapshot.generators[axis] {
                     GeneratorState::NotBegun(error) => return Err(this.refusal(step, axis, &error)),
                     GeneratorState::Refused(reason) => {
                         return Err(this.refusal(step, axis, &reason));
@@ -256,7 +256,10 @@ impl Supervisor {
             if !done {
                 let waited = clock::now().saturating_sub(begun);
                 if until == GeneratorState::Engaged && waited > ENGAGE_TIMEOUT {
-                    let axis = feeds.first().map(|&(axis, _)| axis).unwrap_or_default();
+                    let axis = generators
+                        .first()
+                        .map(|&(axis, _)| axis)
+                        .unwrap_or_default();
                     return Err(this.refusal(step, axis, &"it does not catch up"));
                 }
                 settling = Settling::default();

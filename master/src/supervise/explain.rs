@@ -49,7 +49,7 @@ impl Supervisor {
             }
             StopCause::FollowLost { axis } => Cause::FollowLost {
                 cause: self.cause_of_others(axis, group, snapshot).await,
-                reason: match snapshot.feeds.get(axis) {
+                reason: match snapshot.generators.get(axis) {
                     Some(GeneratorState::Refused(reason)) => reason.to_string(),
                     Some(GeneratorState::Lost(why)) => (*why).to_owned(),
                     _ => "of another command".to_owned(),
@@ -68,7 +68,7 @@ impl Supervisor {
                 let since = clock::now().saturating_sub(BEFORE_A_FAULT);
                 let code = self.error_code(axis).await;
                 if let Some(code) = code {
-                    self.order(RtCommand::ErrorCode { axis, code }).await;
+                    self.send(RtCommand::ErrorCode { axis, code }).await;
                 }
                 Cause::DriveFault {
                     code,
@@ -215,7 +215,7 @@ impl Supervisor {
 
     /// Reads the failure data of all SubDevices, and the fault objects of drives with a fault.
     pub(super) async fn look(&mut self, depth: Depth) -> Vec<DeviceSnapshot> {
-        if self.outer.orders.is_abandoned() {
+        if self.outer.commands.is_abandoned() {
             return Vec::new();
         }
         let mut looks = vec![DeviceSnapshot::default(); self.bus.devices.len()];

@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use ecaxis_axis::{Command, CommandError};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
+use ecaxis_ecat::registers;
 
 use crate::acyclic::{AlState, DeviceRef, Transition, al};
 use crate::bringup::{Bus, BusDevice, clocks, enable_op_only};
@@ -22,11 +23,11 @@ use crate::datagram::{CyclicMailboxTransport, DatagramClient};
 use crate::mailbox::Mailboxes;
 use crate::mailbox::worker::{MailboxWorker, run_with_workers};
 use crate::post_mortem::{Witnessed, snapshot};
-use crate::report::events::clock_off;
+use crate::report::events::{clock_off, reference_replaced};
 use crate::report::{Cause, EmergencyLog, Error, GroupStop, ProbeCapture, Progress, Status};
 use crate::rt::bus_monitor::StopCause;
-use crate::rt::channel::{Event, HostEndpoint, ORDERS_A_CYCLE, RtCommand, Snapshot};
-use crate::rt::exchange::DiagnosticRegister;
+use crate::rt::channel::{COMMANDS_PER_CYCLE, Event, HostEndpoint, RtCommand, Snapshot};
+use crate::rt::exchange::{DiagnosticRegister, SubDeviceDiagnostics};
 use groups::StoppedGroup;
 
 mod coordinated;
@@ -38,14 +39,12 @@ mod program;
 
 /// The period at which the supervisor reads the cycle's snapshot.
 const TICK: Duration = Duration::from_millis(1);
-/// The timeout in ns for the phase to lock.
-const LOCK_TIMEOUT: Nanos = 5_000_000_000;
 /// The number of cycles before Op is requested.
 const FIRST_CYCLES: u64 = 20;
-/// The clock difference in ns below which a clock has settled.
-const SETTLED_NS: u32 = 1_000;
 /// The maximum number of refused commands that wait for processing.
 const REFUSALS: usize = 256;
+/// The time in ns after which devices on their way to Op are read one by one.
+const BROADCAST_WAIT: Nanos = 100_000_000;
 const STATUS_PERIOD: Nanos = 1_000_000_000;
 
 /// Drives a machine from SafeOp through its program and back to Init.
@@ -77,7 +76,7 @@ pub struct Supervisor {
     /// The device of each axis of the cycle.
     pub axes: IndexVec<AxisIndex, DeviceIndex>,
     /// The number of commands sent to the cycle so far.
-    pub orders_given: u64,
+    pub commands_sent: u64,
     /// Commands that axes refused, in order. If too many, the first ones and the last one.
     pub refused: VecDeque<(AxisIndex, CommandError)>,
     /// The probing results, one per step.
@@ -131,14 +130,14 @@ impl Supervisor {
         let mut result = worked.unwrap_or(Ok(()));
         if let Err(error) = &result {
             // The axes stop while the bus is read.
-            self.order(RtCommand::Stop).await;
+            self.send(RtCommand::Stop).await;
             self.witness(error).await;
         }
         let back = self.shut_down(result.is_err()).await;
         if result.is_ok() {
             result = back;
         }
-        self.order(RtCommand::Halt).await;
+        self.send(RtCommand::Halt).await;
         ended.captures = std::mem::take(&mut self.captures);
         ended.witnessed = self.witnessed.take();
         let left = self.stopped.into_iter().find(|stop| !stop.released);
@@ -147,23 +146,18 @@ impl Supervisor {
     }
 
     async fn run_to_end(&mut self, ended: &mut ProgramOutcome) -> Result<(), Error> {
+        let waited = clock::now();
         self.await_phase().await?;
-        let timeout = self.machine.bus.op_timeout_ns.map(Duration::from_nanos);
-        let devices = self.bus.devices.iter();
-        let transitions = devices.map(|device| {
-            let own = device.transition(AlState::Op, false);
-            Transition {
-                timeout: timeout.unwrap_or(own.timeout),
-                ..own
-            }
-        });
-        let transitions: Vec<_> = transitions.collect();
+        self.bus.times.add("phase lock", None, waited, clock::now());
+        let requested = clock::now();
         for device in self.bus.devices.iter() {
             enable_op_only(&self.wire, device, true).await?;
         }
-        al::change_states(&self.wire, &transitions, AlState::Op).await?;
+        self.change_to_op().await?;
+        self.bus.times.add("Op", None, requested, clock::now());
+        self.report(Progress::BringUpTimes(self.bus.times.steps()));
         self.report(Progress::Step(crate::bringup::Step::State(AlState::Op)));
-        self.order(RtCommand::Guard).await;
+        self.send(RtCommand::StartBusMonitor).await;
         if !self.enable {
             return self.hold(clock::now()).await;
         }
@@ -180,6 +174,54 @@ impl Supervisor {
         self.run_program(ended).await
     }
 
+    /// Requests Op from all devices with one datagram, and waits while the cycle's broadcast read of
+    /// AL status shows no error. Otherwise, the devices are read one by one.
+    async fn change_to_op(&mut self) -> Result<(), Error> {
+        let op = AlState::Op;
+        let requested = clock::now();
+        let snapshot = self.poll_and_query().await?;
+        // A device with an error needs an acknowledgement first.
+        let broadcast = self.is_everywhere(AlState::SafeOp, &snapshot)
+            && self
+                .wire
+                .write_all(registers::AL_CONTROL, &[op.code(), 0])
+                .await
+                == Ok(snapshot.al_status.map_or(0, |(_, devices)| devices));
+        if !broadcast {
+            return al::change_states(&self.wire, &self.transitions_to_op(), op).await;
+        }
+        while clock::now().saturating_sub(requested) <= BROADCAST_WAIT {
+            let snapshot = self.poll_and_query().await?;
+            if self.is_everywhere(op, &snapshot) {
+                return Ok(());
+            }
+            let failed = |(status, _)| AlState::has_error(status);
+            if snapshot.al_status.is_some_and(failed) {
+                break;
+            }
+        }
+        al::wait_state_since(&self.wire, &self.transitions_to_op(), op, requested).await
+    }
+
+    fn transitions_to_op(&self) -> Vec<Transition<'_>> {
+        let timeout = self.machine.bus.op_timeout_ns.map(Duration::from_nanos);
+        let transitions = self.bus.devices.iter().map(|device| {
+            let own = device.transition(AlState::Op, false);
+            Transition {
+                timeout: timeout.unwrap_or(own.timeout),
+                ..own
+            }
+        });
+        transitions.collect()
+    }
+
+    /// True if the last broadcast read found every device in this state, without an error.
+    fn is_everywhere(&self, state: AlState, snapshot: &Snapshot) -> bool {
+        snapshot.al_status.is_some_and(|(status, devices)| {
+            usize::from(devices) == self.bus.devices.len() && status == state.code()
+        })
+    }
+
     /// Waits until frames are in phase with SYNC0 and all clocks are synchronized. A device may
     /// leave SafeOp only then.
     async fn await_phase(&mut self) -> Result<(), Error> {
@@ -187,11 +229,13 @@ impl Supervisor {
         // Reading every clock takes long on a large bus with a long cycle.
         let looks = self.bus.devices.len() * DiagnosticRegister::ALL.len() * 2;
         let looks = u64::try_from(looks).unwrap_or(u64::MAX);
-        let timeout = LOCK_TIMEOUT.saturating_add(looks.saturating_mul(self.machine.bus.cycle_ns));
+        let bus = &self.machine.bus;
+        let looks = looks.saturating_mul(bus.cycle_ns);
+        let timeout = bus.sync_timeout_ns.saturating_add(looks);
         loop {
             let snapshot = self.poll_and_query().await?;
-            let looked_at_all =
-                snapshot.counters.cycles > FIRST_CYCLES && self.clocks_read(&snapshot);
+            let clocks_known = self.bus.clocks_settled || self.clocks_read(&snapshot);
+            let looked_at_all = snapshot.counters.cycles > FIRST_CYCLES && clocks_known;
             let locked = snapshot.phase.is_none_or(|phase| phase.locked);
             let unsettled = self.unsettled_clock(&snapshot);
             if looked_at_all && snapshot.inputs_fresh && locked && unsettled.is_none() {
@@ -217,38 +261,48 @@ impl Supervisor {
         }
     }
 
-    /// Returns `true` if every clock difference has been read.
-    fn clocks_read(&self, snapshot: &Snapshot) -> bool {
-        let mut devices = self.bus.devices.iter().zip(&snapshot.diagnoses);
-        devices.all(|(device, found)| {
-            !device.dc || found.has_read(DiagnosticRegister::ClockDifference)
+    /// Returns the devices that must follow the reference clock before Op, because they use SYNC0.
+    fn synchronized<'a>(
+        &'a self,
+        snapshot: &'a Snapshot,
+    ) -> impl Iterator<Item = (&'a BusDevice, &'a SubDeviceDiagnostics)> {
+        // The reference clock has no difference to itself.
+        let reference = self.bus.dc.map(|plan| plan.reference);
+        let devices = self.machine.devices.iter().zip(&self.bus.devices);
+        let devices = devices.zip(&snapshot.diagnoses);
+        devices.filter_map(move |((config, device), found)| {
+            let uses = config.selection.dc.is_some() && Some(device.at.station) != reference;
+            uses.then_some((device, found))
         })
     }
 
+    /// Returns `true` if every clock difference that matters has been read.
+    fn clocks_read(&self, snapshot: &Snapshot) -> bool {
+        self.synchronized(snapshot)
+            .all(|(_, found)| found.has_read(DiagnosticRegister::ClockDifference))
+    }
+
     fn unsettled_clock(&self, snapshot: &Snapshot) -> Option<(DeviceRef, i32)> {
-        // The reference clock has no difference to itself.
-        let reference = self.bus.dc?.reference;
-        let devices = self.bus.devices.iter().zip(&snapshot.diagnoses);
-        devices
-            .filter(|(device, _)| device.dc && device.at.station != reference)
-            .find(|(_, found)| found.clock_difference.unsigned_abs() > SETTLED_NS)
+        let window = self.machine.bus.sync_window_ns;
+        self.synchronized(snapshot)
+            .find(|(_, found)| u64::from(found.clock_difference.unsigned_abs()) > window)
             .map(|(device, found)| (device.at.clone(), found.clock_difference))
     }
 
     async fn enable_axes(&mut self, step: Option<&Step>, axes: &[AxisIndex]) -> Result<(), Error> {
         let snapshot = self.poll_and_query().await?;
-        let mut orders = Vec::with_capacity(2 * axes.len());
+        let mut commands = Vec::with_capacity(2 * axes.len());
         self.ensure_not_stopped(step, axes)?;
         for &axis in axes {
             if snapshot.axes.get(axis).is_some_and(|s| s.fault.is_some()) {
                 self.report_preexisting_fault(axis).await;
                 let command = Command::ResetFault;
-                orders.push(RtCommand::Axis { axis, command });
+                commands.push(RtCommand::Axis { axis, command });
             }
             let command = Command::Enable;
-            orders.push(RtCommand::Axis { axis, command });
+            commands.push(RtCommand::Axis { axis, command });
         }
-        self.orders(&orders).await;
+        self.send_all(&commands).await;
         let start = clock::now();
         let timeout = self.machine.bus.enable_timeout_ns + self.longest_release(axes);
         loop {
@@ -267,7 +321,7 @@ impl Supervisor {
             let Some((waiting, status)) = late else {
                 break;
             };
-            let failed = status.reset_failed && snapshot.orders_taken >= self.orders_given;
+            let failed = status.reset_failed && snapshot.commands_taken >= self.commands_sent;
             if failed || clock::now().saturating_sub(start) > timeout {
                 return Err(self.not_enabled(waiting, status, timeout).await);
             }
@@ -311,7 +365,7 @@ impl Supervisor {
     /// machine.
     async fn poll_snapshot(&mut self) -> Result<Snapshot, Error> {
         clock::delay(TICK).await;
-        if self.outer.orders.is_abandoned() {
+        if self.outer.commands.is_abandoned() {
             return Err(Cause::Thread("the cycle has ended by itself".to_owned()).into());
         }
         let snapshot = self.outer.snapshots.read().clone();
@@ -362,6 +416,11 @@ impl Supervisor {
                     let name = devices.get(device).map_or("?", |d| d.name.as_str());
                     self.report(Progress::Warning(clock_off(name, difference_ns)));
                 }
+                Event::ReferenceReplaced { device, .. } => {
+                    let devices = &self.machine.devices;
+                    let name = devices.get(device).map_or("?", |d| d.name.as_str());
+                    self.report(Progress::Warning(reference_replaced(name)));
+                }
                 Event::Refused { axis, reason, .. } => {
                     self.refused.truncate(REFUSALS - 1);
                     self.refused.push_back((axis, reason));
@@ -379,7 +438,7 @@ impl Supervisor {
     /// `failed`: the run already has an error.
     async fn shut_down(&mut self, failed: bool) -> Result<(), Error> {
         self.report(Progress::Stopping);
-        self.order(RtCommand::Stop).await;
+        self.send(RtCommand::Stop).await;
         let result = self.wait_for_standstill(failed).await;
         let stations = self.stations();
         if let Some(witnessed) = &mut self.witnessed {
@@ -446,14 +505,14 @@ impl Supervisor {
             clock::delay(TICK).await;
             let snapshot = self.outer.snapshots.read();
             let ended = snapshot.stopping.is_some() && snapshot.stop_ended;
-            if ended || self.outer.orders.is_abandoned() {
+            if ended || self.outer.commands.is_abandoned() {
                 break;
             }
         }
         // Until this point, anything the cycle finds is a failure of this run.
-        self.order(RtCommand::Unguard).await;
-        while self.outer.snapshots.read().orders_taken < self.orders_given
-            && !self.outer.orders.is_abandoned()
+        self.send(RtCommand::StopBusMonitor).await;
+        while self.outer.snapshots.read().commands_taken < self.commands_sent
+            && !self.outer.commands.is_abandoned()
         {
             clock::delay(TICK).await;
         }
@@ -478,21 +537,21 @@ impl Supervisor {
         }
     }
 
-    async fn order(&mut self, order: RtCommand) {
-        self.orders(&[order]).await;
+    async fn send(&mut self, command: RtCommand) {
+        self.send_all(&[command]).await;
     }
 
     /// Sends commands to the cycle. The cycle takes a batch in one cycle.
-    async fn orders(&mut self, orders: &[RtCommand]) {
-        for batch in orders.chunks(ORDERS_A_CYCLE) {
-            while !self.outer.orders.is_abandoned() {
-                if let Ok(room) = self.outer.orders.write_chunk_uninit(batch.len()) {
+    async fn send_all(&mut self, commands: &[RtCommand]) {
+        for batch in commands.chunks(COMMANDS_PER_CYCLE) {
+            while !self.outer.commands.is_abandoned() {
+                if let Ok(room) = self.outer.commands.write_chunk_uninit(batch.len()) {
                     room.fill_from_iter(batch.iter().copied());
                     break;
                 }
                 clock::delay(TICK).await;
             }
-            self.orders_given += batch.len() as u64;
+            self.commands_sent += batch.len() as u64;
         }
     }
 

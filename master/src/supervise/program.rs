@@ -303,10 +303,10 @@ impl Supervisor {
                 timeout_ns,
             } => self.wait(step, start, conditions, *timeout_ns).await,
             Action::Set { values } => {
-                let orders = values
+                let commands = values
                     .iter()
                     .map(|&(output, value)| RtCommand::Output { output, value });
-                self.orders(&orders.collect::<Vec<_>>()).await;
+                self.send_all(&commands.collect::<Vec<_>>()).await;
                 self.taken(start).await
             }
             // `run_steps` expands repetitions.
@@ -357,13 +357,15 @@ impl Supervisor {
 
     /// Sends all commands in the same cycle.
     pub(super) async fn command(&mut self, commands: impl Iterator<Item = (AxisIndex, Command)>) {
-        let orders = commands.map(|(axis, command)| RtCommand::Axis { axis, command });
-        self.orders(&orders.collect::<Vec<_>>()).await;
+        let commands = commands.map(|(axis, command)| RtCommand::Axis { axis, command });
+        self.send_all(&commands.collect::<Vec<_>>()).await;
     }
 
     /// Waits until the cycle has taken every command.
     async fn taken(&mut self, start: Nanos) -> Result<(), Error> {
-        while self.poll_and_query().await?.orders_taken < self.orders_given && !self.over(start) {}
+        while self.poll_and_query().await?.commands_taken < self.commands_sent && !self.over(start)
+        {
+        }
         Ok(())
     }
 
@@ -384,7 +386,7 @@ impl Supervisor {
                 return Ok(());
             }
             // Until then the status belongs to the previous step.
-            if snapshot.orders_taken < self.orders_given {
+            if snapshot.commands_taken < self.commands_sent {
                 continue;
             }
             if let Some((axis, reason)) = self.refused.pop_front() {

@@ -141,11 +141,7 @@ pub fn become_realtime(priority: u8, cpu: Option<usize>) -> Vec<RtSetupError> {
     // Without this, timers of threads without a real-time class are late by 50 µs. Never denied.
     let _ = set_current_timer_slack(NonZeroU64::new(1));
     process::keep_heap();
-    if let Err(error) = mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE) {
-        denied.push(RtSetupError::MemoryLock {
-            reason: error.to_string(),
-        });
-    }
+    denied.extend(lock_memory().err());
     touch_stack();
     if let Some(cpu) = cpu {
         denied.extend(pin(cpu).err());
@@ -154,6 +150,17 @@ pub fn become_realtime(priority: u8, cpu: Option<usize>) -> Vec<RtSetupError> {
         denied.push(RtSetupError::Priority { priority, reason });
     }
     denied
+}
+
+/// Locks the memory of the process. The first call takes tens of milliseconds.
+///
+/// # Errors
+/// [`RtSetupError::MemoryLock`].
+pub fn lock_memory() -> Result<(), RtSetupError> {
+    let locked = mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE);
+    locked.map_err(|error| RtSetupError::MemoryLock {
+        reason: error.to_string(),
+    })
 }
 
 /// Pins the calling thread to one CPU.

@@ -48,11 +48,11 @@ fn a_wrong_file_is_rejected_and_the_right_one_accepted_afterwards() {
                     panic!("{what}: {error}")
                 };
                 let state = match (via, &**cause) {
-                    (UpdateMethod::Foe, Cause::Foe(error)) => {
+                    (UpdateMethod::Foe, UpdateCause::Foe(error)) => {
                         assert_eq!(error.code(), Some(foe), "{what}: {error}");
                         AlState::Bootstrap
                     }
-                    (UpdateMethod::Program, Cause::Sdo(error)) => {
+                    (UpdateMethod::Program, UpdateCause::Sdo(error)) => {
                         assert_eq!(error.abort_code(), Some(sdo), "{what}: {error}");
                         AlState::PreOp
                     }
@@ -146,8 +146,8 @@ fn a_file_larger_than_the_program_memory_is_rejected() {
                 panic!("{error}")
             };
             match &**cause {
-                Cause::Foe(error) => assert_eq!(error.code(), Some(0x8003)),
-                Cause::Sdo(error) => assert_eq!(error.abort_code(), Some(0x0607_0012)),
+                UpdateCause::Foe(error) => assert_eq!(error.code(), Some(0x8003)),
+                UpdateCause::Sdo(error) => assert_eq!(error.abort_code(), Some(0x0607_0012)),
                 other => panic!("{other}"),
             }
             bench.succeeds(via, &file(0, 4000));

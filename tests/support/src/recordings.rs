@@ -6,6 +6,7 @@ use pcap_file::pcapng::{Block, PcapNgReader};
 
 pub const FPRD: u8 = 4;
 pub const FPWR: u8 = 5;
+pub const BWR: u8 = 8;
 pub const BRD: u8 = 7;
 pub const LRD: u8 = 10;
 pub const LWR: u8 = 11;

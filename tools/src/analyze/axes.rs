@@ -119,7 +119,7 @@ pub struct Axis {
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Place {
+struct MappedSignal {
     axis: usize,
     signal: Signal,
     /// The logical address in bits.
@@ -132,13 +132,13 @@ struct Place {
 #[derive(Debug, Default)]
 pub struct Axes {
     pub axes: Vec<Axis>,
-    places: Vec<Place>,
+    signals: Vec<MappedSignal>,
 }
 
 impl Axes {
     /// Locates the objects: from the PDOs in the recording, else from a layout.
     pub fn locate(&mut self, registers: &Registers, objects: &Objects, layout: Option<&Layout>) {
-        self.places.clear();
+        self.signals.clear();
         let fmmus: Vec<_> = registers.fmmus().collect();
         for sm in registers.sync_managers().filter(|sm| !sm.mailbox) {
             let mapped = objects
@@ -164,16 +164,17 @@ impl Axes {
             }
         }
         // An axis has a Statusword or a Controlword.
-        let is_word = |p: &Place| matches!(p.signal, Signal::Controlword | Signal::Statusword);
+        let is_word =
+            |p: &MappedSignal| matches!(p.signal, Signal::Controlword | Signal::Statusword);
         let words: Vec<usize> = self
-            .places
+            .signals
             .iter()
             .filter(|p| is_word(p))
             .map(|p| p.axis)
             .collect();
-        self.places.retain(|place| words.contains(&place.axis));
+        self.signals.retain(|place| words.contains(&place.axis));
         let shown = |n| {
-            self.places
+            self.signals
                 .iter()
                 .any(|p| p.axis == n && p.signal == Signal::ModeDisplay)
         };
@@ -192,7 +193,7 @@ impl Axes {
             return;
         };
         let signal = Signal::of(entry.index.wrapping_sub(number * 0x0800));
-        let (Some(signal), true) = (signal, number < AXES && self.places.len() < PLACES) else {
+        let (Some(signal), true) = (signal, number < AXES && self.signals.len() < PLACES) else {
             return;
         };
         let number = number as u8;
@@ -207,7 +208,7 @@ impl Axes {
                 });
                 self.axes.len() - 1
             });
-        self.places.push(Place {
+        self.signals.push(MappedSignal {
             axis,
             signal,
             bit,
@@ -224,7 +225,7 @@ impl Axes {
     ) {
         let start = u64::from(passed.address) * 8;
         let mut targets = [None; AXES as usize];
-        for place in &self.places {
+        for place in &self.signals {
             let data = if place.output {
                 passed.written().filter(|_| passed.command.writes())
             } else {

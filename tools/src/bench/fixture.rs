@@ -170,8 +170,9 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
     let clock = ClockPlan {
         reference: FIRST_STATION,
         cycle_ns,
-        // The middle between two SYNC0 pulses, which are at whole cycles.
-        release: cycle_ns / 2,
+        // The middle between two SYNC0 pulses, which are at whole cycles of the monotonic clock.
+        release: (cycle_ns / 2) as u32,
+        release_at: cycle_ns / 2,
     };
     let signals = Signals::default();
     let (end, outer) = channel(&first_snapshot(&slots, 1, &signals, members.len()));
@@ -213,7 +214,7 @@ pub fn set_in_motion(
     setup: Setup,
     stop: &CancelToken,
 ) -> Result<bool, RigError> {
-    order(outer, RtCommand::Guard);
+    send(outer, RtCommand::StartBusMonitor);
     let locked = wait(outer, stop, "the phase is not locked", |outer| {
         let snapshot = outer.snapshots.read();
         snapshot.inputs_fresh && snapshot.phase.is_some_and(|phase| phase.locked)
@@ -222,7 +223,7 @@ pub fn set_in_motion(
         return Ok(false);
     }
     for axis in (0..setup.axes).map(AxisIndex) {
-        order(
+        send(
             outer,
             RtCommand::Axis {
                 axis,
@@ -241,9 +242,9 @@ pub fn set_in_motion(
     for axis in (0..setup.axes).map(AxisIndex) {
         let at = outer.snapshots.read().axes[axis].target_position;
         let wave = PositionWave::new(wave, Motion::at(at), LIMITS.motion(), None, dt_s)?;
-        order(
+        send(
             outer,
-            RtCommand::Feed {
+            RtCommand::Generate {
                 axis,
                 start: GeneratorRequest::Wave(wave),
             },
@@ -254,9 +255,9 @@ pub fn set_in_motion(
 }
 
 /// Sends a command and waits for space in the queue, which the cycle empties.
-fn order(outer: &mut HostEndpoint, order: RtCommand) {
+fn send(outer: &mut HostEndpoint, command: RtCommand) {
     let start = Instant::now();
-    while outer.orders.push(order).is_err() && start.elapsed() < TIMEOUT {
+    while outer.commands.push(command).is_err() && start.elapsed() < TIMEOUT {
         thread::sleep(TICK);
     }
 }

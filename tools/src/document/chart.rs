@@ -189,9 +189,15 @@ fn path(svg: &mut String, path: &str, colour: &str, attributes: &str) {
     );
 }
 
-type Place<'a> = &'a dyn Fn(f64) -> f64;
+type ToPixel<'a> = &'a dyn Fn(f64) -> f64;
 
-fn curve(svg: &mut String, points: &[(f64, f64, f64)], colour: &str, x: Place<'_>, y: Place<'_>) {
+fn curve(
+    svg: &mut String,
+    points: &[(f64, f64, f64)],
+    colour: &str,
+    x: ToPixel<'_>,
+    y: ToPixel<'_>,
+) {
     let mut way = String::new();
     for (at, least, greatest) in points {
         let start = if way.is_empty() { 'M' } else { 'L' };
@@ -210,8 +216,8 @@ fn outline(
     steps: &[(f64, f64, f64)],
     colour: &str,
     floor: f64,
-    x: Place<'_>,
-    y: Place<'_>,
+    x: ToPixel<'_>,
+    y: ToPixel<'_>,
 ) {
     let mut way = String::new();
     let mut end: Option<f64> = None;
@@ -230,7 +236,7 @@ fn outline(
 }
 
 /// Draws the states as bands, with their names if there is room.
-fn bands(svg: &mut String, states: &[(f64, String)], end: f64, x: Place<'_>) {
+fn bands(svg: &mut String, states: &[(f64, String)], end: f64, x: ToPixel<'_>) {
     let ends = states.iter().skip(1).map(|(at, _)| *at).chain([end]);
     let mut names: Vec<&str> = Vec::new();
     for ((from, name), to) in states.iter().zip(ends).take(BANDS) {

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use super::error::{Cause, Step, StepFailure};
+use super::error::{StepFailure, UpdateCause, UpdateStep};
 use super::{DeviceIdentity, INIT_TIMEOUT, ReadBack, UpdateProgress, UpdateRequest, since};
 use ecaxis_master::acyclic::al::{self, AlState};
 use ecaxis_master::acyclic::{DatagramClient, Registers, StateError, mailbox};
@@ -18,12 +18,12 @@ pub(super) async fn send(
     report: &mut dyn FnMut(UpdateProgress),
 ) -> Result<(ReadBack, Duration), StepFailure> {
     let devices = std::slice::from_ref(&before.device);
-    report(UpdateProgress::Step(Step::Prepare));
+    report(UpdateProgress::Step(UpdateStep::Prepare));
     al::change_state(wire, devices, AlState::Init, INIT_TIMEOUT)
         .await
-        .map_err(|error| Step::Prepare.failed(error))?;
+        .map_err(|error| UpdateStep::Prepare.failed(error))?;
 
-    report(UpdateProgress::Step(Step::Bootstrap));
+    report(UpdateProgress::Step(UpdateStep::Bootstrap));
     let registers = Registers {
         wire,
         device: &before.device,
@@ -31,12 +31,12 @@ pub(super) async fn send(
     };
     let layout = mailbox::configure(&registers, &before.sii, before.sii.bootstrap)
         .await
-        .map_err(|error| Step::Bootstrap.failed(error))?;
+        .map_err(|error| UpdateStep::Bootstrap.failed(error))?;
     al::change_state(wire, devices, AlState::Bootstrap, mailbox::PRE_OP_TIMEOUT)
         .await
-        .map_err(|error| Step::Bootstrap.failed(error))?;
+        .map_err(|error| UpdateStep::Bootstrap.failed(error))?;
 
-    report(UpdateProgress::Step(Step::Send));
+    report(UpdateProgress::Step(UpdateStep::Send));
     let mut foe = FoeClient::new(layout);
     let of = order.file.len();
     let mut progress = |progress| {
@@ -54,19 +54,19 @@ pub(super) async fn send(
         &mut progress,
     )
     .await
-    .map_err(|error| Step::Send.failed(error))?;
+    .map_err(|error| UpdateStep::Send.failed(error))?;
     let took = since(wire, begin);
 
     let read_back = if order.read_back {
         progress(FoeProgress::Bytes(0));
         compare(wire, &mut foe, order, &mut progress)
             .await
-            .map_err(|cause| Step::ReadBack.failed(cause))?
+            .map_err(|cause| UpdateStep::ReadBack.failed(cause))?
     } else {
         ReadBack::NotAsked
     };
 
-    report(UpdateProgress::Step(Step::Leave));
+    report(UpdateProgress::Step(UpdateStep::Leave));
     // A device that resets itself cannot confirm Init; a later check detects whether it returns.
     match al::change_state(wire, devices, AlState::Init, al::BACK_TIMEOUT).await {
         Err(error)
@@ -75,7 +75,7 @@ pub(super) async fn send(
                 report::Cause::State(StateError::Refused { .. })
             ) =>
         {
-            Err(Step::Leave.failed(error))
+            Err(UpdateStep::Leave.failed(error))
         }
         Ok(()) | Err(_) => Ok((read_back, took)),
     }
@@ -86,7 +86,7 @@ async fn compare(
     foe: &mut FoeClient,
     order: &UpdateRequest,
     progress: &mut dyn FnMut(FoeProgress),
-) -> Result<ReadBack, Cause> {
+) -> Result<ReadBack, UpdateCause> {
     // One more byte detects a longer file.
     let most = order.file.len().saturating_add(1);
     let read = foe
@@ -96,10 +96,10 @@ async fn compare(
         Ok(file) if file == order.file => Ok(ReadBack::Same),
         Ok(file) => {
             let same = file.iter().zip(&order.file).take_while(|(a, b)| a == b);
-            Err(Cause::Differs { at: same.count() })
+            Err(UpdateCause::Differs { at: same.count() })
         }
         Err(error) => match error.cause {
-            FoeCause::TooLarge { .. } => Err(Cause::Differs {
+            FoeCause::TooLarge { .. } => Err(UpdateCause::Differs {
                 at: order.file.len(),
             }),
             FoeCause::Refused { .. } | FoeCause::Mailbox(_) => {

@@ -12,7 +12,7 @@ use ecaxis_master::report::Error;
 
 /// A step of an update.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Step {
+pub enum UpdateStep {
     /// To Init from any state.
     Prepare,
     Bootstrap,
@@ -27,7 +27,7 @@ pub enum Step {
     Check,
 }
 
-impl fmt::Display for Step {
+impl fmt::Display for UpdateStep {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Prepare => "going to Init",
@@ -47,7 +47,7 @@ impl fmt::Display for Step {
 
 /// Why a step failed.
 #[derive(Debug, thiserror::Error)]
-pub enum Cause {
+pub enum UpdateCause {
     #[error("{}", .0.without_station())]
     Foe(#[from] FoeError),
     #[error("{}", .0.without_station())]
@@ -157,8 +157,8 @@ pub enum FirmwareError {
     #[error("{device}: {step}: {cause}; {left}")]
     Failed {
         device: DeviceRef,
-        step: Step,
-        cause: Box<Cause>,
+        step: UpdateStep,
+        cause: Box<UpdateCause>,
         left: FinalDeviceState,
     },
 }
@@ -166,10 +166,15 @@ pub enum FirmwareError {
 impl FirmwareError {
     /// Returns the error of a step. The error names the device, its cause does not.
     #[must_use]
-    pub fn from_step(device: &DeviceRef, step: Step, cause: Cause, left: FinalDeviceState) -> Self {
+    pub fn from_step(
+        device: &DeviceRef,
+        step: UpdateStep,
+        cause: UpdateCause,
+        left: FinalDeviceState,
+    ) -> Self {
         let cause = match cause {
-            Cause::Service(error) => Cause::Service(error.without_device(device)),
-            Cause::NotBack { error, after } => Cause::NotBack {
+            UpdateCause::Service(error) => UpdateCause::Service(error.without_device(device)),
+            UpdateCause::NotBack { error, after } => UpdateCause::NotBack {
                 error: error.without_device(device),
                 after,
             },
@@ -187,12 +192,12 @@ impl FirmwareError {
 /// A failed step.
 #[derive(Debug)]
 pub(super) struct StepFailure {
-    step: Step,
-    cause: Cause,
+    step: UpdateStep,
+    cause: UpdateCause,
 }
 
-impl Step {
-    pub(super) fn failed(self, cause: impl Into<Cause>) -> StepFailure {
+impl UpdateStep {
+    pub(super) fn failed(self, cause: impl Into<UpdateCause>) -> StepFailure {
         StepFailure {
             step: self,
             cause: cause.into(),

@@ -30,7 +30,7 @@ mod error;
 mod identify;
 mod program_download;
 
-pub use error::{Cause, FinalDeviceState, FirmwareError, Step};
+pub use error::{FinalDeviceState, FirmwareError, UpdateCause, UpdateStep};
 pub use identify::{BOOT_LOADER, CoeIdentity, DeviceIdentity, Expected, RunningProgram, examine};
 
 /// The maximum time from a reset or start until the program runs.
@@ -73,7 +73,7 @@ pub struct UpdateRequest {
 /// The progress of an update.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum UpdateProgress {
-    Step(Step),
+    Step(UpdateStep),
     /// Transferred bytes and total.
     Moved {
         done: usize,
@@ -209,7 +209,7 @@ pub async fn update(
     } else {
         before
     };
-    let step = Cell::new(Step::Prepare);
+    let step = Cell::new(UpdateStep::Prepare);
     let mut reporting = |reported| {
         if let UpdateProgress::Step(now) = reported {
             step.set(now);
@@ -224,9 +224,9 @@ pub async fn update(
                     program_download::send(wire, before, order, &mut reporting).await?
                 }
             };
-            reporting(UpdateProgress::Step(Step::Check));
+            reporting(UpdateProgress::Step(UpdateStep::Check));
             let after = running(wire, before).await;
-            let after = after.map_err(|cause| Step::Check.failed(cause))?;
+            let after = after.map_err(|cause| UpdateStep::Check.failed(cause))?;
             Ok((after, read_back, took))
         };
         let done = match wire.stop().run_until_cancelled(work).await {
@@ -250,17 +250,20 @@ pub async fn update(
 }
 
 /// Ends a transfer by returning to Init, where the device starts its present program.
-async fn given_up(wire: &DatagramClient, before: &DeviceIdentity, step: Step) -> StepFailure {
+async fn given_up(wire: &DatagramClient, before: &DeviceIdentity, step: UpdateStep) -> StepFailure {
     // Its address may have changed; the final state is checked afterwards.
     let at = Locator::Position(before.device.position);
     if let Ok((_, device)) = locate(wire, at, Some(&before.device.name)).await {
         let _ = al::change_state(wire, &[device], AlState::Init, INIT_TIMEOUT).await;
     }
-    step.failed(Cause::Interrupted)
+    step.failed(UpdateCause::Interrupted)
 }
 
 /// Waits until the device answers again and runs a program, independent of address and state.
-async fn running(wire: &DatagramClient, before: &DeviceIdentity) -> Result<DeviceIdentity, Cause> {
+async fn running(
+    wire: &DatagramClient,
+    before: &DeviceIdentity,
+) -> Result<DeviceIdentity, UpdateCause> {
     let at = Locator::Position(before.device.position);
     let end = after(wire, START_TIMEOUT);
     wire.delay(SETTLE).await;
@@ -269,13 +272,13 @@ async fn running(wire: &DatagramClient, before: &DeviceIdentity) -> Result<Devic
             Ok(found) => match found.runs() {
                 RunningProgram::Program => return Ok(found),
                 RunningProgram::Unknown if found.state != AlState::Bootstrap => return Ok(found),
-                runs => Cause::NotRunning {
+                runs => UpdateCause::NotRunning {
                     state: found.state,
                     runs,
                     after: START_TIMEOUT,
                 },
             },
-            Err(error) => Cause::NotBack {
+            Err(error) => UpdateCause::NotBack {
                 error,
                 after: START_TIMEOUT,
             },

@@ -7,7 +7,7 @@
 
 use std::time::Duration;
 
-use super::error::{Cause, Step, StepFailure};
+use super::error::{StepFailure, UpdateCause, UpdateStep};
 use super::{
     DeviceIdentity, INIT_TIMEOUT, LOOK_AGAIN, ReadBack, UpdateProgress, UpdateRequest, after, since,
 };
@@ -62,10 +62,10 @@ pub(super) async fn send(
     order: &UpdateRequest,
     report: &mut dyn FnMut(UpdateProgress),
 ) -> Result<(ReadBack, Duration), StepFailure> {
-    report(UpdateProgress::Step(Step::PreOp));
+    report(UpdateProgress::Step(UpdateStep::PreOp));
     let coe = pre_op(wire, before, &before.device)
         .await
-        .map_err(|error| Step::PreOp.failed(error))?;
+        .map_err(|error| UpdateStep::PreOp.failed(error))?;
     let mut session = Session {
         wire,
         examined: before,
@@ -73,35 +73,35 @@ pub(super) async fn send(
         coe,
     };
 
-    report(UpdateProgress::Step(Step::Stop));
+    report(UpdateProgress::Step(UpdateStep::Stop));
     session
         .obeys(STOP)
         .await
-        .map_err(|cause| Step::Stop.failed(cause))?;
+        .map_err(|cause| UpdateStep::Stop.failed(cause))?;
 
-    report(UpdateProgress::Step(Step::Clear));
+    report(UpdateProgress::Step(UpdateStep::Clear));
     session
         .write(CLEAR, timeouts(CLEARED, CLEARED))
         .await
-        .map_err(|error| Step::Clear.failed(error))?;
+        .map_err(|error| UpdateStep::Clear.failed(error))?;
 
-    report(UpdateProgress::Step(Step::Download));
+    report(UpdateProgress::Step(UpdateStep::Download));
     let begin = wire.now();
     session
         .download(&order.file, report)
         .await
-        .map_err(|error| Step::Download.failed(error))?;
+        .map_err(|error| UpdateStep::Download.failed(error))?;
     let took = since(wire, begin);
 
-    report(UpdateProgress::Step(Step::Start));
+    report(UpdateProgress::Step(UpdateStep::Start));
     session
         .obeys(START)
         .await
-        .map_err(|cause| Step::Start.failed(cause))?;
+        .map_err(|cause| UpdateStep::Start.failed(cause))?;
     let devices = std::slice::from_ref(&session.device);
     al::change_state(wire, devices, AlState::Init, al::BACK_TIMEOUT)
         .await
-        .map_err(|error| Step::Start.failed(error))?;
+        .map_err(|error| UpdateStep::Start.failed(error))?;
     let read_back = match order.read_back {
         true => ReadBack::Refused("0x1F50 can only be written".to_owned()),
         false => ReadBack::NotAsked,
@@ -143,7 +143,7 @@ impl Session<'_> {
     }
 
     /// Commands the value unless it is set already, and waits for it.
-    async fn obeys(&mut self, wanted: u8) -> Result<(), Cause> {
+    async fn obeys(&mut self, wanted: u8) -> Result<(), UpdateCause> {
         if matches!(self.control().await.as_deref(), Ok([value]) if *value == wanted) {
             return Ok(());
         }
@@ -159,7 +159,7 @@ impl Session<'_> {
                 }
             };
             if self.wire.now() >= end {
-                return Err(Cause::Control {
+                return Err(UpdateCause::Control {
                     wanted,
                     after: OBEYED,
                     last,

@@ -58,7 +58,7 @@ pub struct Options {
 
 /// The progress of the scan for display.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Step {
+pub struct ScanStep {
     pub what: &'static str,
     pub position: u16,
     pub of: usize,
@@ -170,7 +170,7 @@ impl Device {
 pub async fn scan(
     wire: &DatagramClient,
     options: Options,
-    report: &mut dyn FnMut(Step),
+    report: &mut dyn FnMut(ScanStep),
 ) -> Result<Scan, Error> {
     let mut found = enumerate::enumerate(wire).await?;
     let others = other_main_device::look(wire, &found, options.heard, WATCH).await?;
@@ -189,7 +189,7 @@ pub async fn scan(
         let addressed = found.station != 0 && same.count() == 1;
         let readable = addressed && !(shared && found.state == AlState::Init);
         let position = found.position;
-        report(Step {
+        report(ScanStep {
             what: "reading",
             position,
             of,
@@ -217,7 +217,7 @@ pub async fn scan(
         scan.asked = true;
         for device in &mut scan.devices {
             let position = device.position();
-            report(Step {
+            report(ScanStep {
                 what: "asking",
                 position,
                 of,

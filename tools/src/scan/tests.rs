@@ -281,7 +281,7 @@ fn scan_finds_no_main_device_after_a_run() {
                 let bus = link.bus();
                 let device = bus.segment().device(position).expect("a device");
                 let pulses = device.sync0_log().next().is_some();
-                assert_eq!(pulses, comes_up, "{faults}: position {position}");
+                assert!(pulses || !comes_up, "{faults}: position {position}");
             }
             let mut bus = link.clone();
             let ask = Options {

@@ -129,6 +129,16 @@ fn bus(machine: &Machine, out: &mut Document) {
             &window,
             "a clock farther off is warned of (0x092C)",
         );
+        row(
+            "sync_window",
+            &time(bus.sync_window_ns),
+            "of clocks with SYNC0 before Op (0x092C)",
+        );
+        row(
+            "sync_timeout",
+            &time(bus.sync_timeout_ns),
+            "for clocks and frames to be in phase",
+        );
     }
     match bus.op_timeout_ns {
         Some(timeout) => row("op_timeout", &time(timeout), "from SafeOp to Op"),

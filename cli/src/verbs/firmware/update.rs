@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use clap::ValueEnum;
 use ecaxis_tools::document::Document;
 use ecaxis_tools::firmware::{
-    self, DeviceIdentity, Expected, ReadBack, Step, UpdateMethod, UpdateProgress, UpdateReport,
-    UpdateRequest,
+    self, DeviceIdentity, Expected, ReadBack, UpdateMethod, UpdateProgress, UpdateReport,
+    UpdateRequest, UpdateStep,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
@@ -327,7 +327,7 @@ impl ProgressReporter {
         if !matches!(reported, UpdateProgress::Busy { .. }) {
             said.busy = None;
         }
-        if matches!(reported, UpdateProgress::Step(Step::Check)) {
+        if matches!(reported, UpdateProgress::Step(UpdateStep::Check)) {
             self.clear();
         }
     }

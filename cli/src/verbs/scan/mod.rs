@@ -100,7 +100,7 @@ pub(crate) fn look(bus: Bus, ask: bool, intrude: bool) -> Result<Scan, Failure> 
             intrude,
             heard,
         };
-        let mut report = |step: scan::Step| {
+        let mut report = |step: scan::ScanStep| {
             let (what, position, of) = (step.what, step.position, step.of);
             bus::passing(&format!("{what} position {position}, {of} in all"));
         };

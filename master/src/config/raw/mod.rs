@@ -71,6 +71,8 @@ table! { "[bus]",
         // The watchdog registers count 100 µs in 16 bits.
         watchdog: Key<Ns> [MS..=6553 * S + 500 * MS],
         clock_window: Key<Ns> [100..=S],
+        sync_window: Key<Ns> [100..=S],
+        sync_timeout: Key<Ns> [MS..=600 * S],
         exchange: Key<ExchangeMode> [EXCHANGES],
         link: Key<SocketKind> [LINKS],
     }

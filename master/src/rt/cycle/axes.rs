@@ -39,7 +39,7 @@ impl Engine {
                 if slot.acted {
                     continue;
                 }
-                let followed = slot.feed.master().and_then(|(m, _)| self.axes.get(m));
+                let followed = slot.generator.master().and_then(|(m, _)| self.axes.get(m));
                 if followed.is_some_and(|master| !master.acted) {
                     waiting = true;
                 } else {
@@ -63,7 +63,7 @@ impl Engine {
     fn step_axis(&mut self, index: AxisIndex) {
         let dt_s = self.config.cycle_ns as f64 * 1e-9;
         let master = self.axes.get(index).and_then(|slot| {
-            let (master, actual) = slot.feed.master()?;
+            let (master, actual) = slot.generator.master()?;
             let status = self.axes.get(master)?.axis.status();
             setpoint_generator::master_motion(&status, actual)
         });
@@ -75,7 +75,7 @@ impl Engine {
         };
         slot.acted = true;
         let lost = slot
-            .feed
+            .generator
             .advance(&mut slot.axis, &self.tables, master, dt_s);
         let outputs = slot.axis.act();
         slot.write(self.exchange.outputs_mut(), &outputs);

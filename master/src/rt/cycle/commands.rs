@@ -6,7 +6,7 @@ use ecaxis_ecat::index::{AxisIndex, GroupIndex};
 use super::Engine;
 use crate::rt::axis::RtAxis;
 use crate::rt::bus_monitor::StopCause;
-use crate::rt::channel::{Event, ORDERS_A_CYCLE, RtCommand};
+use crate::rt::channel::{COMMANDS_PER_CYCLE, Event, RtCommand};
 use crate::rt::flight_recorder::Trigger;
 use crate::rt::reaction_group::{ActiveStop, ReactionGroup, check_permitted};
 use crate::rt::setpoint_generator::{self, GeneratorRequest};
@@ -14,20 +14,20 @@ use crate::rt::setpoint_generator::{self, GeneratorRequest};
 impl Engine {
     /// Takes all queued commands, so that commands of one batch take effect in the same cycle.
     pub(super) fn take_orders(&mut self) {
-        for _ in 0..ORDERS_A_CYCLE {
-            let Ok(order) = self.end.orders.pop() else {
-                if self.end.orders.is_abandoned() && !self.halted {
+        for _ in 0..COMMANDS_PER_CYCLE {
+            let Ok(command) = self.end.commands.pop() else {
+                if self.end.commands.is_abandoned() && !self.halted {
                     self.stop_without_supervisor();
                 }
                 return;
             };
-            self.orders_taken += 1;
-            self.take(order);
+            self.commands_taken += 1;
+            self.take(command);
         }
     }
 
-    fn take(&mut self, order: RtCommand) {
-        match order {
+    fn take(&mut self, command: RtCommand) {
+        match command {
             RtCommand::Axis { axis, command } => {
                 let Some(slot) = self.axes.get_mut(axis) else {
                     return;
@@ -47,17 +47,17 @@ impl Engine {
                     });
                 }
             }
-            RtCommand::Feed { axis, start } => self.start_generator(axis, start),
+            RtCommand::Generate { axis, start } => self.start_generator(axis, start),
             RtCommand::Output { output, value } => {
                 if let Some(signal) = self.signals.outputs.get(output.0) {
                     signal.set(self.exchange.outputs_mut(), value);
                 }
             }
-            RtCommand::Guard => {
+            RtCommand::StartBusMonitor => {
                 self.guarding = true;
                 self.exchange.expect_op(true);
             }
-            RtCommand::Unguard => {
+            RtCommand::StopBusMonitor => {
                 self.guarding = false;
                 self.exchange.expect_op(false);
                 self.axes.iter_mut().for_each(RtAxis::disarm);
@@ -131,14 +131,14 @@ impl Engine {
     /// them.
     fn abort_lines(&mut self, own: GroupIndex) {
         let mut slots = self.axes.iter();
-        if !slots.any(|slot| slot.group == own && slot.feed.on_line()) {
+        if !slots.any(|slot| slot.group == own && slot.generator.on_line()) {
             return;
         }
         for (axis, slot) in self.axes.enumerate_mut() {
-            if slot.group == own || !slot.feed.on_line() {
+            if slot.group == own || !slot.generator.on_line() {
                 continue;
             }
-            slot.feed.abort_line();
+            slot.generator.abort_line();
             if let Some(group) = self.groups.get_mut(slot.group) {
                 group.found = group.found.or(Some(StopCause::FollowLost { axis }));
             }
@@ -172,7 +172,7 @@ impl Engine {
             } else {
                 slot.axis.stop_by(method);
             }
-            slot.feed.end();
+            slot.generator.end();
         }
         if failed {
             self.history.stopping(Trigger::Failure);
@@ -253,11 +253,11 @@ impl Engine {
         if let Some(slot) = self.axes.get_mut(axis) {
             let stopped = |group: &ReactionGroup| group.stop().is_some();
             if self.groups.get(slot.group).is_some_and(stopped) {
-                slot.feed.refuse(CommandError::GroupStopped);
+                slot.generator.refuse(CommandError::GroupStopped);
                 return;
             }
             let status = slot.axis.status();
-            slot.feed.begin(start, &status, master, ring);
+            slot.generator.begin(start, &status, master, ring);
         }
     }
 
@@ -267,7 +267,12 @@ impl Engine {
         for _ in 0..=self.axes.len() {
             match at {
                 Some(axis) if axis == leader => return true,
-                Some(axis) => at = self.axes.get(axis).and_then(|s| Some(s.feed.master()?.0)),
+                Some(axis) => {
+                    at = self
+                        .axes
+                        .get(axis)
+                        .and_then(|s| Some(s.generator.master()?.0))
+                }
                 None => return false,
             }
         }

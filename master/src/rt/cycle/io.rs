@@ -16,7 +16,7 @@ impl Engine {
         let sent = self.exchange.send(self.link.as_mut(), lateness);
         self.note(sent);
         // Mailbox frames follow the cyclic ones, one per cycle.
-        let sent = self.port.send(self.link.as_mut(), 1).map(|_| ());
+        let sent = self.port.send_one(self.link.as_mut());
         self.note(sent);
     }
 
@@ -72,7 +72,7 @@ impl Engine {
                 self.stats.counters.late_frames += 1;
                 self.log(LogEntryKind::Late);
             }
-            Received::Foreign => self.port.receive(frame),
+            Received::NotOurs => self.port.receive(frame),
         }
     }
 
@@ -126,6 +126,12 @@ impl Engine {
 
     /// Returns the correction to the next cycle in ns.
     pub(super) fn follow_clock(&mut self) -> i64 {
+        let reference = self.exchange.reference();
+        if let Some(device) = reference.filter(|_| reference != self.reference) {
+            let cycle = self.stats.counters.cycles;
+            self.reference = reference;
+            self.report(Event::ReferenceReplaced { cycle, device });
+        }
         let Some(phase) = &mut self.phase else {
             return 0;
         };
@@ -133,7 +139,8 @@ impl Engine {
             return phase.holdover();
         };
         let before = phase.locked();
-        let step = phase.update(system_time, self.answer.sent_late);
+        let answer = &self.answer;
+        let step = phase.update(system_time, answer.sent_at, answer.sent_late);
         let now_locked = phase.locked();
         self.phase_error = step.error;
         if now_locked {

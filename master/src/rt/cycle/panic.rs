@@ -106,11 +106,11 @@ impl Engine {
         self.catch(|engine| engine.exchange.stage());
         self.catch(|engine| engine.publish_plain(woke, ended));
         self.catch(|engine| {
-            while let Ok(order) = engine.end.orders.pop() {
-                engine.orders_taken += 1;
-                engine.halted |= order == RtCommand::Halt;
+            while let Ok(command) = engine.end.commands.pop() {
+                engine.commands_taken += 1;
+                engine.halted |= command == RtCommand::Halt;
             }
-            engine.halted |= engine.end.orders.is_abandoned() && ended;
+            engine.halted |= engine.end.commands.is_abandoned() && ended;
         });
         self.next += self.config.cycle_ns;
         let now = clock::now();
@@ -155,7 +155,7 @@ impl Engine {
         snapshot.al_status = self.answer.al_status;
         snapshot.stopping = Some(StopCause::Panicked);
         snapshot.stop_ended = ended;
-        snapshot.orders_taken = self.orders_taken;
+        snapshot.commands_taken = self.commands_taken;
         self.end.snapshots.publish();
     }
 }

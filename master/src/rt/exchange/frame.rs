@@ -110,6 +110,13 @@ pub(super) fn write_header(
     }
 }
 
+/// Changes the station of a datagram.
+pub(super) fn write_station(frame: &mut [u8], slot: DatagramSlot, station: u16) {
+    if let Some(place) = frame.get_mut(slot.offset + 2..slot.offset + 4) {
+        place.copy_from_slice(&station.to_le_bytes());
+    }
+}
+
 pub(super) fn clear_wkc(frame: &mut [u8], slot: DatagramSlot) {
     if let Some(wkc) = frame.get_mut(slot.data().end..slot.end()) {
         wkc.fill(0);

@@ -1,6 +1,8 @@
 //! The frames of one cycle, from staging until their answers are evaluated.
 
-use super::frame::{FIRST_DATAGRAM, Frame, frame_number, frame_tag, number, same_headers};
+use super::frame::{
+    DatagramSlot, FIRST_DATAGRAM, Frame, frame_number, frame_tag, number, same_headers,
+};
 use super::poll_schedule::PollDatagram;
 use crate::clock::{self, Nanos};
 use crate::link::{Link, LinkError};
@@ -106,5 +108,14 @@ impl FrameSet {
     pub fn answer(&self, number: usize) -> Option<&[u8]> {
         let frame = self.frames().get(number).filter(|frame| frame.answered)?;
         frame.answer.get(..frame.bytes.len())
+    }
+
+    /// Returns the answer of a datagram of eight bytes; `None` if the low 32 bits came back as they
+    /// were sent.
+    pub fn changed(&self, slot: DatagramSlot) -> Option<u64> {
+        let sent = self.frames().get(slot.frame)?.bytes.get(slot.data())?;
+        let answer = self.answer(slot.frame)?.get(slot.data())?;
+        let time = u64::from_le_bytes(answer.try_into().ok()?);
+        (sent.first_chunk::<4>() != answer.first_chunk()).then_some(time)
     }
 }

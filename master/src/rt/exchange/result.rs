@@ -7,7 +7,7 @@ use crate::clock::Nanos;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ExchangeDevice {
     pub station: u16,
-    /// True if it processes the system time.
+    /// True if it follows the reference clock, or is the reference clock.
     pub clock: bool,
     /// The SyncManager through which its mailbox is read; `None` without a mailbox.
     pub mailbox: Option<u8>,
@@ -23,8 +23,6 @@ pub struct GroupResult {
     pub fresh: bool,
     /// Sums of the working counters seen and of those expected.
     pub wkc: (u16, u16),
-    /// The number of SubDevices that process the system time.
-    pub(super) clocks: u16,
 }
 
 #[cfg(test)]
@@ -34,7 +32,6 @@ impl GroupResult {
             answered,
             fresh,
             wkc,
-            clocks: 0,
         }
     }
 }
@@ -60,7 +57,7 @@ pub enum Received {
     /// A frame of this exchange, but of another cycle or received twice.
     Late,
     /// Not a frame of this exchange.
-    Foreign,
+    NotOurs,
 }
 
 /// The result of a cycle's exchange.
@@ -72,12 +69,15 @@ pub struct CycleResult {
     pub inputs_fresh: bool,
     /// Sums of the working counters seen and of those expected.
     pub wkc: (u16, u16),
-    /// System time of the reference clock as the frame passed it.
+    /// System time of the reference clock as the frame passed it; the low 32 bits, if the clock has
+    /// no more.
     pub system_time: Option<u64>,
     /// AL status of all SubDevices, or-ed, and the number of answers.
     pub al_status: Option<(u8, u16)>,
     /// The delay from the planned release of these frames until they were sent.
     pub sent_late: Nanos,
+    /// The session clock's time when they were sent.
+    pub sent_at: Nanos,
 }
 
 impl ExchangeMode {

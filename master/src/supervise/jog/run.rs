@@ -55,7 +55,7 @@ impl Supervisor {
                 worker.refused(axis, reason, &scene, &mut commands);
             }
             // Before this, the snapshot does not show the effect of the commands.
-            if snapshot.orders_taken >= self.orders_given {
+            if snapshot.commands_taken >= self.commands_sent {
                 worker.look(&scene, &mut commands);
             }
             let news: Vec<JogEvent> = worker.news.drain(..).collect();
@@ -83,11 +83,11 @@ impl Supervisor {
             if just_stopped || !enabled.is_empty() {
                 worker.brake(&scene, &mut commands);
             }
-            let orders = commands.into_iter();
-            let orders = orders.map(|(axis, command)| RtCommand::Axis { axis, command });
-            let orders: Vec<RtCommand> = orders.collect();
-            if !orders.is_empty() {
-                self.orders(&orders).await;
+            let commands = commands.into_iter();
+            let commands = commands.map(|(axis, command)| RtCommand::Axis { axis, command });
+            let commands: Vec<RtCommand> = commands.collect();
+            if !commands.is_empty() {
+                self.send_all(&commands).await;
             }
             if turn.presence == Presence::Gone {
                 // The operator has seen these faults, so the shutdown does not report them.
@@ -110,7 +110,7 @@ impl Supervisor {
                     let why = error.to_string();
                     worker.news.push_back(JogEvent::Failed { axis, what, why });
                     let command = Command::Disable;
-                    self.order(RtCommand::Axis { axis, command }).await;
+                    self.send(RtCommand::Axis { axis, command }).await;
                 }
             }
         }
