@@ -18,7 +18,7 @@ use crate::datagram::DatagramClient;
 use crate::mailbox::MailboxTransport;
 use crate::report::{Cause, Error};
 use crate::rt::image::ImagePlan;
-use crate::rt::phase::ClockPlan;
+use crate::rt::phase::{ClockPlan, extend};
 use ecaxis_ecat::registers;
 
 const STEP: &str = "starting SYNC0";
@@ -37,6 +37,11 @@ const MAX_START_DELAY: Nanos = 2_000_000_000;
 const START_MARGIN: Nanos = 10_000_000;
 /// SYNC0 cycles without relation to the bus cycle have no finer pattern than this.
 const SHORTEST_PATTERN: i64 = 1_000;
+/// A margin between frames and SYNC0 below this, or below this part of the cycle, is a warning.
+const SHORT_MARGIN: u64 = 10_000;
+const SHORT_MARGIN_DIVISOR: u64 = 20;
+/// How often a device that does not count the distributed time is asked again.
+const FOLLOWER_ATTEMPTS: u32 = 3;
 /// Lost datagrams can use up the delay; then the start is repeated with a longer one.
 const MAX_ATTEMPTS: u32 = 4;
 
@@ -49,7 +54,8 @@ pub(super) async fn configure(
     progress: &dyn Fn(Step),
 ) -> Result<Option<ClockPlan>, Error> {
     let reference = reference(devices);
-    if let Some(reference) = &reference {
+    let used = machine.devices.iter().any(|d| d.selection.dc.is_some());
+    if let Some(reference) = reference.as_ref().filter(|_| used) {
         find_followers(wire, devices, reference).await?;
     }
     let wanting: Vec<_> = machine
@@ -71,10 +77,13 @@ pub(super) async fn configure(
     let cycle = machine.bus.cycle_ns;
     let mut ahead = START_DELAY
         + START_DELAY_PER_DEVICE * u64::try_from(wanting.len()).unwrap_or(u64::MAX / 1_000_000_000);
+    let shifts = wanting.iter().map(|(dc, _)| i64::from(dc.sync0_shift_ns));
+    let (earliest, latest) = (shifts.clone().min().unwrap_or(0), shifts.max().unwrap_or(0));
+    let longest_shift = latest.max(0).unsigned_abs();
     for _ in 0..MAX_ATTEMPTS {
         let now = system_time(wire, &reference).await?;
         let release_at = clock::now();
-        ahead = ahead.min(MAX_START_DELAY);
+        ahead = ahead.min(MAX_START_DELAY.saturating_sub(longest_shift));
         let start = now.wrapping_add(ahead);
         let starts = wanting.iter().map(async |(dc, device)| {
             let own = system_time(wire, &device.at).await?;
@@ -95,8 +104,7 @@ pub(super) async fn configure(
         });
         try_join_all(starts).await?;
         // A device with a start time in the past never generates a pulse.
-        let shifts = wanting.iter().map(|(dc, _)| i64::from(dc.sync0_shift_ns));
-        let first = start.wrapping_add_signed(shifts.min().unwrap_or(0));
+        let first = start.wrapping_add_signed(earliest);
         let reported = system_time(wire, &reference).await?;
         tracing::debug!(start, reported, "SYNC0 started");
         if extend(first, reported) > reported.wrapping_add(START_MARGIN) {
@@ -112,12 +120,17 @@ pub(super) async fn configure(
                 cycle: u64::from(dc.sync0_cycle_ns),
                 delay: behind(device) - first_delay,
             });
-            let after = release_time(cycle, image.wire_ns(), pulses);
+            let release = release_time(cycle, image.wire_ns(), pulses);
+            let nearest = release.nearest.map(|device| &wanting[device].1.at);
+            if let Some(text) = short_margin(cycle, image.wire_ns(), release.margin, nearest) {
+                progress(Step::Warning(text));
+            }
             return Ok(Some(ClockPlan {
                 reference: reference.station,
                 cycle_ns: cycle,
-                release: start.wrapping_add(after) as u32,
-                release_at: release_at + ahead + after,
+                release: start.wrapping_add(release.after) as u32,
+                release_at: release_at + ahead + release.after,
+                window_ns: machine.bus.clock_window_ns,
             }));
         }
         ahead *= 2;
@@ -283,19 +296,28 @@ async fn find_followers(
     reference: &DeviceRef,
 ) -> Result<(), Error> {
     let failed = |at: &DeviceRef, error| Cause::Datagram(error).with_device(at).with_action(STEP);
-    let counted = wire.distribute_time(reference.station).await;
-    let counted = counted.map_err(|error| failed(reference, error))?;
-    let all = devices.iter().filter(|device| device.dc).count() <= usize::from(counted);
-    for device in devices {
-        device.follows = device.dc && (all || device.at == *reference);
-        if device.dc && !device.follows {
-            let time = system_time(wire, &device.at).await?.to_le_bytes();
+    for device in &mut *devices {
+        device.follows = device.at == *reference;
+    }
+    // Repeated: a frame that loses its end in a device counts too little.
+    for _ in 0..FOLLOWER_ATTEMPTS {
+        let counted = wire.distribute_time(reference.station).await;
+        let counted = counted.map_err(|error| failed(reference, error))?;
+        let all = devices.iter().filter(|device| device.dc).count() <= usize::from(counted);
+        for device in devices
+            .iter_mut()
+            .filter(|device| device.dc && !device.follows)
+        {
             let at = &device.at;
-            let written = wire
-                .write(at.station, registers::DC_SYSTEM_TIME, &time)
-                .await;
-            device.follows = written.map_err(|error| failed(at, error))? > 0;
+            device.follows = all || {
+                let time = system_time(wire, at).await?.to_le_bytes();
+                let written = wire.write(at.station, registers::DC_SYSTEM_TIME, &time);
+                written.await.map_err(|error| failed(at, error))? > 0
+            };
             tracing::debug!(device = %at, follows = device.follows, "system time written");
+        }
+        if devices.iter().all(|device| device.follows || !device.dc) {
+            break;
         }
     }
     Ok(())
@@ -304,13 +326,6 @@ async fn find_followers(
 async fn system_time(wire: &impl MailboxTransport, at: &DeviceRef) -> Result<u64, Error> {
     let time = read(wire, at, STEP, registers::DC_SYSTEM_TIME).await?;
     Ok(u64::from_le_bytes(time))
-}
-
-/// Returns the time next to `near` with the low 32 bits of `time`. All clocks have these bits in
-/// common. Some clocks have no others, so the higher ones of two clocks may differ.
-fn extend(time: u64, near: u64) -> u64 {
-    let ahead = (time as u32).wrapping_sub(near as u32).cast_signed();
-    near.wrapping_add_signed(i64::from(ahead))
 }
 
 /// The SYNC0 pulses of a device.
@@ -323,12 +338,43 @@ struct Pulses {
     delay: i64,
 }
 
-/// Returns when a cycle's frames should begin to pass the reference clock, in ns after the common
-/// start of SYNC0 and less than a cycle.
+/// When the frames of a cycle should pass the reference clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Release {
+    /// In ns after the common start of SYNC0, less than a cycle.
+    after: u64,
+    /// The time in ns from a pulse to the first bit, and from the last bit to the next pulse.
+    margin: i64,
+    /// The device with the pulse before the frames.
+    nearest: Option<usize>,
+}
+
+/// Returns a warning if the frames come close to the pulses of a device.
+fn short_margin(
+    cycle: u64,
+    frames: u64,
+    margin: i64,
+    nearest: Option<&DeviceRef>,
+) -> Option<String> {
+    let least = SHORT_MARGIN.min(cycle / SHORT_MARGIN_DIVISOR);
+    if u64::try_from(margin).is_ok_and(|margin| margin >= least) {
+        return None;
+    }
+    let name = &nearest?.name;
+    let us = |ns: f64| ns / 1000.0;
+    Some(format!(
+        "between the SYNC0 pulses of `{name}` and the frames of {:.1} µs, only {:.1} µs remain: \
+         outputs can reach it a cycle late. Use a longer cycle or fewer process data",
+        us(frames as f64),
+        us(margin as f64).max(0.0),
+    ))
+}
+
+/// Returns when a cycle's frames should begin to pass the reference clock.
 ///
 /// Every device has the same distance from a pulse to the first bit of the frames as from their last
 /// bit to the next pulse, or a larger one. `frames` is the time from the first bit to the last one.
-fn release_time(cycle: u64, frames: u64, devices: impl Iterator<Item = Pulses>) -> u64 {
+fn release_time(cycle: u64, frames: u64, devices: impl Iterator<Item = Pulses>) -> Release {
     let period = i64::try_from(cycle).unwrap_or(i64::MAX).max(1);
     let frames = i64::try_from(frames).unwrap_or(i64::MAX);
     // Pulses of other cycles than the bus cycle repeat in this pattern.
@@ -339,27 +385,30 @@ fn release_time(cycle: u64, frames: u64, devices: impl Iterator<Item = Pulses>) 
     let devices: Vec<_> = devices.map(|device| (step(&device), device)).collect();
     let longest = devices.iter().map(|(step, _)| *step).max();
     let mut pulses = Vec::new();
-    for (step, device) in devices {
+    for (index, (step, device)) in devices.into_iter().enumerate() {
         // No frame fits between the pulses of this device: it must not move those of the others.
         if step <= frames && Some(step) != longest {
             continue;
         }
         let first = device.shift - device.delay;
         let repeated = (0..).map(|n| n * step).take_while(|&after| after < period);
-        pulses.extend(repeated.map(|after| (first + after).rem_euclid(period)));
+        pulses.extend(repeated.map(|after| ((first + after).rem_euclid(period), index)));
     }
     pulses.sort_unstable();
-    let following = pulses.iter().skip(1).copied();
-    let wrapped = pulses.first().map(|first| first + period);
-    let (gap, start) = pulses
+    let following = pulses.iter().skip(1).map(|(pulse, _)| *pulse);
+    let wrapped = pulses.first().map(|(first, _)| first + period);
+    let (gap, start, nearest) = pulses
         .iter()
         .zip(following.chain(wrapped))
-        .map(|(&pulse, next)| (next - pulse, pulse))
-        .max_by_key(|&(gap, start)| (gap, -start))
-        .unwrap_or((period, 0));
-    (start + gap / 2 - frames / 2)
-        .rem_euclid(period)
-        .unsigned_abs()
+        .map(|(&(pulse, device), next)| (next - pulse, pulse, Some(device)))
+        .max_by_key(|&(gap, start, _)| (gap, -start))
+        .unwrap_or((period, 0, None));
+    let after = (start + gap / 2 - frames / 2).rem_euclid(period);
+    Release {
+        after: after.unsigned_abs(),
+        margin: (gap - frames) / 2,
+        nearest,
+    }
 }
 
 fn greatest_common_divisor(a: u64, b: u64) -> u64 {
@@ -379,7 +428,28 @@ mod tests {
             cycle,
             delay,
         });
-        release_time(cycle, frames, pulses)
+        release_time(cycle, frames, pulses).after
+    }
+
+    /// 60 µs of frames between two pulses, 200 µs and 66 µs apart.
+    #[test]
+    fn margin_is_the_time_between_frames_and_pulses() {
+        for (cycle, margin, warned) in [(200_000, 70_000, false), (66_000, 3_000, true)] {
+            let pulses = Pulses {
+                shift: 0,
+                cycle,
+                delay: 0,
+            };
+            let release = release_time(cycle, 60_000, [pulses].into_iter());
+            assert_eq!((release.margin, release.nearest), (margin, Some(0)));
+            let at = DeviceRef {
+                name: "drive".to_owned(),
+                position: 0,
+                station: 0x1000,
+            };
+            let text = short_margin(cycle, 60_000, release.margin, Some(&at));
+            assert_eq!(text.is_some(), warned, "{text:?}");
+        }
     }
 
     #[test]
@@ -443,18 +513,5 @@ mod tests {
         let before = start;
         let after = cycle as i64 - (start + 99_000 + frames as i64);
         assert_eq!(before - after, 0, "{before} {after}");
-    }
-
-    #[test]
-    fn extend_finds_the_nearest_time_across_a_wrap() {
-        const WRAP: u64 = 1 << 32;
-        for (time, near, expected) in [
-            (5, WRAP - 5, WRAP + 5),
-            (WRAP - 5, 5 * WRAP + 5, 5 * WRAP - 5),
-            (7 * WRAP + 9, 3, 9),
-            (1 << 30, 9 * WRAP, 9 * WRAP + (1 << 30)),
-        ] {
-            assert_eq!(extend(time, near), expected, "{time} {near}");
-        }
     }
 }

@@ -407,16 +407,22 @@ async fn without_lrw(
         device::read(wire, &device.at, step, registers::FEATURES)
     });
     let features = try_join_all(features).await?;
-    let mut process_data = machine.rt_config().devices;
+    let mut config = machine.rt_config();
     let mut more = false;
-    for (features, data) in features.into_iter().zip(&mut process_data) {
+    for (features, data) in features.into_iter().zip(&mut config.devices) {
         if data.lrw && u16::from_le_bytes(features) & NO_LRW != 0 {
             data.lrw = false;
             more = true;
         }
     }
-    // Each device removed from an LRW fits into a frame of its own.
-    Ok(more.then(|| image::plan(&process_data).ok()).flatten())
+    if !more {
+        return Ok(None);
+    }
+    let image = image::of(&config).map_err(|error| {
+        let at = &devices[error.device.0].at;
+        Cause::TooLarge(error).with_device(at)
+    })?;
+    Ok(Some(image))
 }
 
 fn scan_error(step: &'static str, error: &ethercrab::error::Error) -> Error {

@@ -132,6 +132,7 @@ pub struct Snapshot {
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PhaseStatus {
+    pub reference: Option<DeviceIndex>,
     pub locked: bool,
     pub error_ns: i64,
     pub drift_ppm: f64,

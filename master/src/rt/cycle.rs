@@ -345,6 +345,7 @@ impl Engine {
         snapshot.time = woke;
         snapshot.counters = self.stats.counters;
         snapshot.phase = self.phase.as_ref().map(|phase| PhaseStatus {
+            reference: self.exchange.reference(),
             locked: phase.locked(),
             error_ns: self.phase_error,
             drift_ppm: phase.drift_ppm(),

@@ -22,7 +22,7 @@ pub use super::config::ExchangeMode;
 use super::image::plan::frames as frames_of;
 use super::image::{Access, BitCopy, ImagePlan};
 use super::phase::ClockPlan;
-use crate::clock::Nanos;
+use crate::clock::{self, Nanos};
 use crate::link::pdu_loop::ETHERCAT;
 use crate::link::{Link, LinkError};
 
@@ -31,6 +31,7 @@ mod diagnostics;
 mod frame;
 mod frame_set;
 mod poll_schedule;
+mod reference;
 mod result;
 mod slots;
 
@@ -43,14 +44,13 @@ use frame::{
 use frame_set::FrameSet;
 pub use poll_schedule::MAX_POLL_DATAGRAM;
 use poll_schedule::{PollSchedule, PollTarget};
+use reference::ReferenceClock;
 pub use result::{CycleResult, DeviceAnswer, ExchangeDevice, GroupResult, Received};
 use slots::DatagramSlots;
 
 /// After a wrong working counter each device has its own datagram, until this many cycles in a row
 /// were right.
 const SEPARATE_CYCLES: u16 = 100;
-/// The cycles in a row without a time of the reference clock after which another clock replaces it.
-const REFERENCE_CYCLES: u8 = 10;
 
 /// The exchange of process data.
 #[derive(Debug)]
@@ -71,16 +71,9 @@ pub struct Exchange {
     device_answers: IndexVec<DeviceIndex, DeviceAnswer>,
     /// For each device, true if a late answer has arrived since the last cycle.
     late: IndexVec<DeviceIndex, bool>,
-    /// The devices that can be the reference clock, in the order in which frames pass them, and the
-    /// one that is.
-    clocks: Vec<(u16, DeviceIndex)>,
-    reference: usize,
-    /// The cycles in a row in which the reference clock did not answer.
-    reference_missing: u8,
-    /// The value that the other clocks receive if the reference does not answer: almost their own
-    /// time.
-    expected_time: u64,
-    cycle_ns: u64,
+    reference: ReferenceClock,
+    /// The largest difference to the reference clock with which a clock may replace it.
+    clock_window_ns: u64,
     bus_status: Arc<BusStatus>,
     group_results: IndexVec<GroupIndex, GroupResult>,
     diagnoses: IndexVec<DeviceIndex, SubDeviceDiagnostics>,
@@ -138,16 +131,6 @@ impl Exchange {
         for datagram in &layouts[0].process_data {
             group_results[datagram.group].wkc.1 += datagram.expected_wkc;
         }
-        let candidates = (0..).map(DeviceIndex).zip(members);
-        let mut clocks: Vec<_> = candidates
-            .filter(|(_, member)| member.clock)
-            .map(|(device, member)| (member.station, device))
-            .collect();
-        clocks.sort_unstable();
-        let reference = clock.and_then(|clock| {
-            let mut stations = clocks.iter().map(|(station, _)| *station);
-            stations.position(|station| station == clock.reference)
-        });
         let mut exchange = Self {
             frame_sets,
             staged: 0,
@@ -158,11 +141,8 @@ impl Exchange {
             order,
             device_answers: vec![DeviceAnswer::Unknown; members.len()].into(),
             late: vec![false; members.len()].into(),
-            clocks,
-            reference: reference.unwrap_or(0),
-            reference_missing: 0,
-            expected_time: 0,
-            cycle_ns: clock.map_or(0, |clock| clock.cycle_ns),
+            reference: ReferenceClock::new(members, clock),
+            clock_window_ns: clock.map_or(0, |clock| clock.window_ns),
             bus_status: Arc::new(BusStatus::new(members.len())),
             group_results,
             diagnoses: vec![SubDeviceDiagnostics::default(); members.len()].into(),
@@ -288,7 +268,7 @@ impl Exchange {
     /// Returns the reference clock; `None` without distributed clocks.
     #[must_use]
     pub fn reference(&self) -> Option<DeviceIndex> {
-        Some(self.clocks.get(self.reference)?.1)
+        self.reference.device()
     }
 
     /// Returns the index of the oldest frame set, which is evaluated in this cycle.
@@ -309,9 +289,6 @@ impl Exchange {
             frame_set.layout = layout;
         }
         self.refresh_outputs();
-        // Another value every cycle, so that no clock shows it by chance several times in a row.
-        let time = self.expected_time ^ u64::from(self.cycle.wrapping_mul(0x9e37_79b1) >> 26);
-        let reference = self.clocks.get(self.reference);
         let (Some(frame_set), Some(slots)) = (
             self.frame_sets.get_mut(self.staged),
             self.layouts.get(layout),
@@ -335,16 +312,14 @@ impl Exchange {
                 poll.len,
             );
         }
-        if let (Some(slot), Some((station, _))) = (slots.clock, reference) {
-            write_station(first, slot, *station);
-            first[slot.data()].copy_from_slice(&time.to_le_bytes());
+        if let (Some(slot), Some(station)) = (slots.clock, self.reference.station()) {
+            write_station(first, slot, station);
             clear_wkc(first, slot);
         }
         first[slots.al_status.data()].fill(0);
         clear_wkc(first, slots.al_status);
         frame_set.poll = poll;
         frame_set.stage(self.cycle);
-        self.expected_time = self.expected_time.wrapping_add(self.cycle_ns);
     }
 
     /// Copies outputs that have changed since [`Exchange::stage`] into the frames. Call before
@@ -384,10 +359,19 @@ impl Exchange {
     /// Sends all frames of the cycle back to back, `late` after their planned release. RT: blocks
     /// on the wire only.
     pub fn send(&mut self, link: &mut dyn Link, late: Nanos) -> Result<(), LinkError> {
-        match self.frame_sets.get_mut(self.staged) {
-            Some(frame_set) => frame_set.send(link, late),
-            None => Ok(()),
+        let Some(frame_set) = self.frame_sets.get_mut(self.staged) else {
+            return Ok(());
+        };
+        let now = clock::now();
+        let slots = self.layouts.get(frame_set.layout);
+        if let Some(slot) = slots.and_then(|slots| slots.clock) {
+            // Other low bits every cycle, so that no clock shows the value by chance several times
+            // in a row.
+            let varied = u64::from(self.cycle.wrapping_mul(0x9e37_79b1) >> 26);
+            let time = self.reference.expected(now) ^ varied;
+            frame_set.frames_mut()[0].bytes[slot.data()].copy_from_slice(&time.to_le_bytes());
         }
+        frame_set.send(link, now, late)
     }
 
     /// Stores an answer until its frame set is evaluated. RT: O(frame).
@@ -569,19 +553,21 @@ impl Exchange {
         let Some(clock) = slots.clock else {
             return answer;
         };
-        answer.system_time = frame_set.changed(clock);
+        let sent_at = frame_set.sent_at;
+        answer.system_time = frame_set
+            .changed(clock)
+            .and_then(|time| self.reference.take(time, sent_at));
         if let Some(time) = answer.system_time {
-            self.bus_status.set_clock(frame_set.sent_at, time);
-            // The time of the frame set that is staged next; those in flight lie between.
-            let ahead = self.cycle_ns.saturating_mul(self.frame_sets.len() as u64);
-            self.expected_time = time.wrapping_add(ahead);
-            self.reference_missing = 0;
+            self.bus_status.set_clock(sent_at, time);
         } else {
-            self.reference_missing += 1;
-        }
-        if self.reference_missing >= REFERENCE_CYCLES {
-            self.reference_missing = 0;
-            self.reference = (self.reference + 1) % self.clocks.len().max(1);
+            let (answers, diagnoses) = (&self.device_answers, &self.diagnoses);
+            let window = self.clock_window_ns;
+            self.reference.miss(|device| {
+                answers.get(device) != Some(&DeviceAnswer::Missing)
+                    && diagnoses
+                        .get(device)
+                        .is_some_and(|d| d.clock_within(window))
+            });
         }
         answer
     }

@@ -55,6 +55,16 @@ pub struct ClockPlan {
     pub release: u32,
     /// The session clock's time at that system time, to a second.
     pub release_at: Nanos,
+    /// The largest difference to the reference clock with which a clock may replace it.
+    pub window_ns: u64,
+}
+
+/// Returns the time next to `near` with the low 32 bits of `time`. All clocks have these bits in
+/// common. Some clocks have no others, so the higher ones of two clocks may differ.
+#[must_use]
+pub fn extend(time: u64, near: u64) -> u64 {
+    let ahead = (time as u32).wrapping_sub(near as u32).cast_signed();
+    near.wrapping_add_signed(i64::from(ahead))
 }
 
 /// The phase controller of one segment.
@@ -205,6 +215,20 @@ mod tests {
             cycle_ns,
             release,
             release_at: u64::from(release),
+            window_ns: 10_000,
+        }
+    }
+
+    #[test]
+    fn extend_finds_the_nearest_time_across_a_wrap() {
+        const WRAP: u64 = 1 << 32;
+        for (time, near, expected) in [
+            (5, WRAP - 5, WRAP + 5),
+            (WRAP - 5, 5 * WRAP + 5, 5 * WRAP - 5),
+            (7 * WRAP + 9, 3, 9),
+            (1 << 30, 9 * WRAP, 9 * WRAP + (1 << 30)),
+        ] {
+            assert_eq!(extend(time, near), expected, "{time} {near}");
         }
     }
 

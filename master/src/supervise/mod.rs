@@ -267,11 +267,11 @@ impl Supervisor {
         snapshot: &'a Snapshot,
     ) -> impl Iterator<Item = (&'a BusDevice, &'a SubDeviceDiagnostics)> {
         // The reference clock has no difference to itself.
-        let reference = self.bus.dc.map(|plan| plan.reference);
+        let reference = snapshot.phase.and_then(|phase| phase.reference);
         let devices = self.machine.devices.iter().zip(&self.bus.devices);
-        let devices = devices.zip(&snapshot.diagnoses);
-        devices.filter_map(move |((config, device), found)| {
-            let uses = config.selection.dc.is_some() && Some(device.at.station) != reference;
+        let devices = (0..).map(DeviceIndex).zip(devices.zip(&snapshot.diagnoses));
+        devices.filter_map(move |(index, ((config, device), found))| {
+            let uses = config.selection.dc.is_some() && Some(index) != reference;
             uses.then_some((device, found))
         })
     }

@@ -542,10 +542,12 @@ impl SimDevice {
         }
     }
 
-    /// Delays the first SYNC0 by `late` ns, from the next start on.
-    pub(crate) fn delay_sync(&mut self, late: Nanos) {
+    /// Delays the first SYNC0 by `late` ns, from the next start on. If `ignored`, the clock takes no
+    /// system time.
+    pub(crate) fn disturb_clock(&mut self, late: Nanos, ignored: bool) {
         if let Some(dc) = &mut self.esc.dc {
             dc.sync.late = late;
+            dc.ignores_time = ignored;
         }
     }
 

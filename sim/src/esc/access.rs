@@ -267,7 +267,9 @@ impl Esc {
 
     /// Passes four bytes to the control loop. Bytes that were not written come from the local copy.
     fn write_system_time(&mut self, data: &[u8]) -> bool {
-        let Some(dc) = &self.dc else { return false };
+        let Some(dc) = self.dc.as_ref().filter(|dc| !dc.ignores_time) else {
+            return false;
+        };
         let mut received = (dc.local_copy(self.frame.stamp) as u32).to_le_bytes();
         for (to, from) in received.iter_mut().zip(data) {
             *to = *from;

@@ -19,6 +19,7 @@ const KINDS: &[(&str, &[&str])] = &[
     ("mailbox-silent", &["device"]),
     ("watchdog", &["device"]),
     ("sync-late", &["device", "delay"]),
+    ("clock-ignored", &["device"]),
     ("other-main-device", &["count", "probability", "state"]),
     ("refuse-state", &["device", "state", "code"]),
     ("stuck", &["device", "state"]),
@@ -124,6 +125,7 @@ fn kind(name: &str, raw: &RawFault) -> Result<FaultKind, String> {
         "sync-late" => FaultKind::SyncLate {
             delay: duration(raw.delay.as_deref().ok_or("`delay` is missing")?)?,
         },
+        "clock-ignored" => FaultKind::ClockIgnored,
         "other-main-device" => FaultKind::OtherMainDevice {
             hits: hits(raw)?,
             state: raw.state.as_deref().map(al_state).transpose()?,

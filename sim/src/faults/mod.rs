@@ -37,6 +37,8 @@
 //! * `mailbox-silent` (`device`): requests stay in the mailbox without an answer
 //! * `watchdog` (`device`): the process data watchdog expires once, despite outputs
 //! * `sync-late` (`device`, `delay`): SYNC0 starts this much after its start time
+//! * `clock-ignored` (`device`): the device does not take the distributed system time (0x0910), and
+//!   does not count it
 //! * `other-main-device` (`count` or `probability`; `state`): a frame of another MainDevice follows
 //!   ours: it reads AL status, or requests the state from all devices
 //! * `drive-fault` (`device`, `code`): the drive detects this error
@@ -194,7 +196,7 @@ impl Faults {
             device.forced_aborts.clear();
             device.ignored_writes.clear();
             let mut held = None;
-            let (mut silent, mut late) = (false, 0);
+            let (mut silent, mut late, mut ignored) = (false, 0, false);
             for fault in self.active().filter(|fault| fault.device == n) {
                 match fault.kind {
                     FaultKind::RefuseState { state, code } => device.refusals.push((state, code)),
@@ -206,13 +208,14 @@ impl Faults {
                     }
                     FaultKind::MailboxSilent => silent = true,
                     FaultKind::SyncLate { delay } => late = delay,
+                    FaultKind::ClockIgnored => ignored = true,
                     FaultKind::Stuck { state } => held = Some(state),
                     _ => {}
                 }
             }
             device.hold_drive_in(held);
             device.silence_mailbox(silent);
-            device.delay_sync(late);
+            device.disturb_clock(late, ignored);
         }
         let concerns_frames = self.active().any(|fault| fault.kind.hits().is_some());
         self.concerns_frames = concerns_frames;

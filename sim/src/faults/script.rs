@@ -105,6 +105,8 @@ pub(crate) enum FaultKind {
     SyncLate {
         delay: Nanos,
     },
+    /// The clock takes no system time.
+    ClockIgnored,
     /// A frame of another MainDevice follows ours. It reads AL status, or requests a state from all
     /// devices.
     OtherMainDevice {

@@ -79,6 +79,8 @@ fn script_with_every_kind_parses() {
         kind = "sync-late"
         delay = "20s"
         [[fault]]
+        kind = "clock-ignored"
+        [[fault]]
         kind = "other-main-device"
         count = 1
         state = "init"
@@ -148,6 +150,7 @@ fn script_with_every_kind_parses() {
         FaultKind::SyncLate {
             delay: 20_000_000_000,
         },
+        FaultKind::ClockIgnored,
         FaultKind::OtherMainDevice {
             hits: one,
             state: Some(AlState::Init),

@@ -173,6 +173,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
         // The middle between two SYNC0 pulses, which are at whole cycles of the monotonic clock.
         release: (cycle_ns / 2) as u32,
         release_at: cycle_ns / 2,
+        window_ns: config::Bus::default().clock_window_ns,
     };
     let signals = Signals::default();
     let (end, outer) = channel(&first_snapshot(&slots, 1, &signals, members.len()));

@@ -127,7 +127,8 @@ impl Engine {
     /// Returns the correction to the next cycle in ns.
     pub(super) fn follow_clock(&mut self) -> i64 {
         let reference = self.exchange.reference();
-        if let Some(device) = reference.filter(|_| reference != self.reference) {
+        let delivers = self.answer.system_time.is_some();
+        if let Some(device) = reference.filter(|_| delivers && reference != self.reference) {
             let cycle = self.stats.counters.cycles;
             self.reference = reference;
             self.report(Event::ReferenceReplaced { cycle, device });

@@ -186,6 +186,14 @@ impl SubDeviceDiagnostics {
         self.errors.since(&self.start)
     }
 
+    /// True if the device answers and its clock is as close to the reference clock.
+    #[must_use]
+    pub fn clock_within(&self, window_ns: u64) -> bool {
+        self.answers
+            && self.has_read(DiagnosticRegister::ClockDifference)
+            && u64::from(self.clock_difference.unsigned_abs()) <= window_ns
+    }
+
     /// True once this register block was read, so that its values are not defaults.
     #[must_use]
     pub fn has_read(&self, block: DiagnosticRegister) -> bool {

@@ -4,7 +4,7 @@ use super::frame::{
     DatagramSlot, FIRST_DATAGRAM, Frame, frame_number, frame_tag, number, same_headers,
 };
 use super::poll_schedule::PollDatagram;
-use crate::clock::{self, Nanos};
+use crate::clock::Nanos;
 use crate::link::{Link, LinkError};
 
 #[derive(Debug)]
@@ -61,9 +61,10 @@ impl FrameSet {
         }
     }
 
-    pub fn send(&mut self, link: &mut dyn Link, late: Nanos) -> Result<(), LinkError> {
+    /// Sends the frames now, `late` after their planned release.
+    pub fn send(&mut self, link: &mut dyn Link, now: Nanos, late: Nanos) -> Result<(), LinkError> {
         self.sent_late = Some(late);
-        self.sent_at = clock::now();
+        self.sent_at = now;
         for frame in self.frames() {
             link.send(&frame.bytes)?;
         }

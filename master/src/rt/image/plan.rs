@@ -141,10 +141,10 @@ impl ImagePlan {
         frames(&self.datagrams)
     }
 
-    /// Returns the time of a cycle's frames on the wire in ns.
+    /// Returns the longest time of a cycle's frames on the wire in ns.
     #[must_use]
     pub fn wire_ns(&self) -> u64 {
-        wire_ns(&self.datagrams)
+        wire_ns(&self.datagrams).max(wire_ns(&self.separate))
     }
 
     /// Returns the place of a copy in the image; `None` if a device has no process data there.

@@ -70,6 +70,8 @@ pub struct Dc {
     /// System time − local time.
     offset: u64,
     pub delay: u32,
+    /// True if the clock takes no system time.
+    pub ignores_time: bool,
     pub sync: SyncUnit,
     pub latches: [Latch; 2],
     control: Control,
@@ -113,6 +115,7 @@ impl Dc {
             width,
             offset: 0,
             delay: 0,
+            ignores_time: false,
             sync: SyncUnit::new(width, pulse_length),
             latches: [Latch::default(); 2],
             control: Control::default(),

@@ -1,0 +1,207 @@
+//! Clocks on the whole bus that a bring-up or a run cannot take for granted.
+
+use std::fmt::Write as _;
+use std::sync::{Arc, Mutex};
+
+use ecaxis_master::cancel::CancelToken;
+use ecaxis_master::clock::{self, Nanos};
+use ecaxis_master::config::Machine;
+use ecaxis_master::link::sim::SimLink;
+use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
+use ecaxis_master::session::{self, Options, Outcome, simulated_bus};
+use ecaxis_test_support::bench::Bench;
+use ecaxis_test_support::recordings::{LRW, datagrams};
+use ecaxis_test_support::{Heard, faults, machine, recorded, run_badly, run_well, virtual_time};
+
+const MS: Nanos = 1_000_000;
+const LIMITS: &str = "limits = { position = [-1000.0, 1000.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 1.0 }";
+
+fn drive(name: &str, position: usize, keys: &str, sim: &str) -> String {
+    format!(
+        "[[device]]\nname = \"{name}\"\nesi = \"esi/EPOS4.xml\"\nposition = {position}\nmode = \"csp\"\n{keys}\n\
+         [device.axis]\nunit = \"turn\"\nper_turn = 1.0\nencoder = 2000\n{LIMITS}\n[device.sim]\n{sim}\n"
+    )
+}
+
+/// Two drives that move; `keys` are those of the second one.
+fn pair(bus: &str, keys: &str, sim: &str) -> Machine {
+    let mut text = format!("[bus]\ncycle = \"1ms\"\n{bus}\n");
+    text += &drive("x", 0, "", "");
+    text += &drive("y", 1, keys, sim);
+    machine(&(text + "[[step]]\nmove = { x = 1.0, y = 1.0 }\n"))
+}
+
+/// ETG.1000.4, 6.4.2: a device that takes the distributed time counts the write. Without it, SYNC0
+/// would drift away from the frames.
+#[test]
+fn a_device_that_does_not_take_the_time_runs_without_sync0_only() {
+    const IGNORED: &str = "[[fault]]\nkind = \"clock-ignored\"\ndevice = 1\n";
+    let (error, _) = run_badly(pair("", "", ""), faults(IGNORED));
+    for part in ["`y`", "does not take the time", "0x0910"] {
+        assert!(error.contains(part), "{part}: {error}");
+    }
+    let summary = run_well(pair("", "dc = \"off\"", ""), faults(IGNORED));
+    assert!(
+        summary
+            .axes
+            .iter()
+            .all(|axis| axis.final_error_counts == Some(0))
+    );
+}
+
+/// Clock readings with an error of up to 20 µs are never within 100 ns at five drives at once.
+#[test]
+fn sync_window_and_time_out_are_those_of_the_machine_file() {
+    let six = |bus: &str, keys: &str| {
+        let mut text = format!("[bus]\ncycle = \"1ms\"\n{bus}\n") + &drive("d0", 0, "", "");
+        for n in 1..6 {
+            text += &drive(&format!("d{n}"), n, keys, "jitter = \"20us\"");
+        }
+        machine(&(text + "[[step]]\nmove = { d0 = 1.0 }\n"))
+    };
+    run_well(six("sync_window = \"100us\"", ""), virtual_time());
+    // Devices without SYNC0 do not matter.
+    run_well(
+        six("sync_window = \"100ns\"", "dc = \"off\""),
+        virtual_time(),
+    );
+    let waits = [200, 1_500].map(|timeout| {
+        let bus = format!("sync_window = \"100ns\"\nsync_timeout = \"{timeout}ms\"");
+        let folder = tempfile::tempdir().expect("a folder");
+        let (options, path) = recorded(virtual_time(), folder.path());
+        let (error, _) = run_badly(six(&bus, ""), options);
+        assert!(error.contains("does not settle"), "{error}");
+        let sent = datagrams(&path).into_iter().filter(|d| d.sent);
+        sent.filter(|d| d.command == LRW).count()
+    });
+    assert!((1_290..1_310).contains(&(waits[1] - waits[0])), "{waits:?}");
+}
+
+/// The time from SYNC0 to the arrival of outputs at the drives, after every cyclic frame.
+#[derive(Debug)]
+struct Watched {
+    bus: SimLink,
+    drives: std::ops::Range<usize>,
+    arrivals: Arc<Mutex<Vec<(Nanos, usize, Nanos)>>>,
+}
+
+impl Link for Watched {
+    fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
+        self.bus.send(frame)?;
+        if frame.get(11) == Some(&0x20) {
+            let segment = self.bus.segment();
+            let mut arrivals = self.arrivals.lock().expect("one thread");
+            arrivals.extend(self.drives.clone().filter_map(|drive| {
+                let device = segment.device(drive)?;
+                let pulse = device.sync0_log().last()?;
+                let after = device.outputs_log().last()?.checked_sub(pulse)?;
+                Some((clock::now(), drive, after))
+            }));
+        }
+        Ok(())
+    }
+
+    fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+        self.bus.recv(buf)
+    }
+
+    fn next_arrival(&self) -> Option<Nanos> {
+        self.bus.next_arrival()
+    }
+}
+
+/// Runs a machine and returns the arrivals at these drives.
+fn watch(
+    machine: Machine,
+    options: Options,
+    drives: std::ops::Range<usize>,
+) -> (Outcome, Heard, Vec<(Nanos, usize, Nanos)>) {
+    options.clock.enter();
+    let bus = simulated_bus(&machine, 1, options.faults.as_ref(), None).expect("a bus");
+    let arrivals = Arc::default();
+    let link = Box::new(Watched {
+        bus: SimLink::new(bus),
+        drives,
+        arrivals: Arc::clone(&arrivals),
+    });
+    let mut heard = Heard::default();
+    let stop = Arc::<CancelToken>::default();
+    let outcome = session::run_on(link, machine, options, stop, &mut heard);
+    let arrivals = arrivals.lock().expect("one thread").clone();
+    (outcome, heard, arrivals)
+}
+
+/// A device without a clock, the reference clock alone at one port, two drives at the other.
+fn branches() -> Machine {
+    let bench = Bench::new();
+    bench.write("hub.xml", &bench.read("esi/IO8.xml"));
+    bench.change("hub.xml", |esi| esi.replace("\"YY\"", "\"YYY\""));
+    let mut text = String::from("[bus]\ncycle = \"1ms\"\n");
+    text += "[[device]]\nname = \"hub\"\nesi = \"hub.xml\"\nposition = 0\n";
+    text += &drive("ref", 1, "", "after = \"hub\"\nport = 1\ndrift_ppm = 50.0");
+    text += &drive("a", 2, "", "after = \"hub\"\nport = 2\ndrift_ppm = -80.0");
+    text += &drive("b", 3, "", "drift_ppm = 120.0");
+    text += "[[stop.group]]\nname = \"first\"\naxes = [\"ref\"]\noutside = \"continue\"\n";
+    for to in [30.0, -30.0, 0.0] {
+        let _ = write!(text, "[[step]]\nmove = {{ a = {to:?}, b = {to:?} }}\n");
+    }
+    bench.machine(&text)
+}
+
+/// ETG.1000.4: all clocks hold the system time. The drives that remain keep moving, and their outputs
+/// keep arriving in the middle between two pulses of SYNC0.
+#[test]
+fn drives_keep_moving_in_phase_when_the_reference_clock_loses_its_power() {
+    let off = "[[fault]]\nkind = \"power-off\"\ndevice = 1\nat = \"1s\"\n";
+    let (outcome, heard, arrivals) = watch(branches(), faults(off), 2..4);
+    let warnings = heard.warnings();
+    outcome
+        .result
+        .unwrap_or_else(|error| panic!("{error}; {warnings:?}"));
+    let replaced: Vec<_> = warnings
+        .iter()
+        .filter(|w| w.contains("replaces it"))
+        .collect();
+    assert_eq!(replaced.len(), 1, "{warnings:?}");
+    assert!(replaced[0].contains("`a`"), "{replaced:?}");
+    let summary = outcome.summary.expect("a summary");
+    for axis in &summary.axes[1..] {
+        assert!(
+            axis.final_error_counts.is_some_and(|e| e.abs() <= 1),
+            "{axis:?}"
+        );
+    }
+    let during: Vec<_> = arrivals
+        .iter()
+        .filter(|(at, ..)| *at > 1_000 * MS)
+        .collect();
+    assert!(during.len() > 2_000, "{}", during.len());
+    for (at, drive, after) in during {
+        assert!(
+            (450_000..550_000).contains(after),
+            "{drive} at {at}: {after} ns"
+        );
+    }
+}
+
+/// A SYNC0 cycle of half the bus cycle (ETG.2000, `CycleTimeSync0` with factor -2): frames arrive in
+/// the middle between two of its pulses.
+#[test]
+fn frames_arrive_between_the_pulses_of_a_faster_sync0() {
+    let bench = Bench::new();
+    bench.write("fast.xml", &bench.read("esi/EPOS4.xml"));
+    bench.change("fast.xml", |esi| {
+        let cycle = "<CycleTimeSync0 Factor=\"1\">0</CycleTimeSync0>";
+        assert!(esi.contains(cycle), "the ESI has {cycle}");
+        esi.replace(cycle, "<CycleTimeSync0 Factor=\"-2\">0</CycleTimeSync0>")
+    });
+    let mut text = String::from("[bus]\ncycle = \"1ms\"\n");
+    text += &drive("x", 0, "", "").replace("esi/EPOS4.xml", "fast.xml");
+    text += "[[step]]\nmove = { x = 30.0 }\n";
+    let (outcome, _, arrivals) = watch(bench.machine(&text), virtual_time(), 0..1);
+    outcome.result.expect("runs");
+    assert!(arrivals.len() > 500);
+    for (at, _, after) in &arrivals[arrivals.len() / 2..] {
+        assert!((200_000..300_000).contains(after), "at {at}: {after} ns");
+    }
+}
