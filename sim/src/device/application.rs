@@ -14,7 +14,8 @@ use crate::gateway::{self, Gateway, GatewayOptions};
 
 #[derive(Debug, Clone)]
 pub(super) enum Application {
-    Drive(Box<Drive>),
+    /// The axes of a drive, at least one.
+    Drives(Box<[Drive]>),
     Gateway(Box<Gateway>),
     Io(Io),
 }
@@ -55,14 +56,14 @@ impl Application {
         )?))
     }
 
-    pub(super) fn drive(store: &mut ObjectStore, plant: PlantParams) -> Self {
-        Self::Drive(Box::new(Drive::new(store, plant)))
+    pub(super) fn new_drives(store: &mut ObjectStore, plant: PlantParams) -> Self {
+        Self::Drives(Drive::of_axes(store, plant))
     }
 
     /// Returns the period of the application in ns; `None` if it only reacts to frames.
     pub(super) fn period(&self) -> Option<Nanos> {
         match self {
-            Self::Drive(_) => Some(CONTROL_PERIOD_NS),
+            Self::Drives(_) => Some(CONTROL_PERIOD_NS),
             Self::Gateway(_) => Some(gateway::FORWARD_NS),
             Self::Io(_) => None,
         }
@@ -80,9 +81,11 @@ impl Application {
     /// Applies a new layout of the process data.
     pub(super) fn laid_out(&mut self, process: &[ProcessData]) {
         match self {
-            Self::Drive(drive) => {
+            Self::Drives(drives) => {
                 let mapped: Vec<EntryHandle> = of(process, Direction::Rx).map(|m| m.slot).collect();
-                drive.set_mapped(&mapped);
+                drives
+                    .iter_mut()
+                    .for_each(|drive| drive.set_mapped(&mapped));
             }
             Self::Gateway(_) => {}
             Self::Io(io) => {
@@ -101,14 +104,14 @@ impl Application {
     /// Processes outputs after their transfer into the objects.
     pub(super) fn sync(&mut self, store: &mut ObjectStore) {
         match self {
-            Self::Drive(drive) => drive.sync(store),
+            Self::Drives(drives) => drives.iter_mut().for_each(|drive| drive.sync(store)),
             // The gateway fetches its outputs when it forwards.
             Self::Gateway(_) => {}
             Self::Io(io) => io.mirror(store),
         }
     }
 
-    /// Ends the period of the application; the motor of a drive has turned. `now` returns the true
+    /// Ends the period of the application; the motor of the first drive has turned. `now` returns the true
     /// time and is called only when needed.
     pub(super) fn act(
         &mut self,
@@ -117,7 +120,12 @@ impl Application {
         now: impl FnOnce() -> Nanos,
     ) {
         match self {
-            Self::Drive(drive) => drive.end_control(store, in_op),
+            Self::Drives(drives) => {
+                drives.iter_mut().skip(1).for_each(Drive::turn_alone);
+                for drive in drives {
+                    drive.end_control(store, in_op);
+                }
+            }
             Self::Gateway(gateway) => gateway.forward(store, in_op, now()),
             Self::Io(_) => {}
         }
@@ -137,8 +145,23 @@ impl Application {
 
     /// Reports an error of the communication side to the application.
     pub(super) fn error(&mut self, error: DeviceError) {
-        if let Self::Drive(drive) = self {
+        for drive in self.drives_mut() {
             drive.error(error);
+        }
+    }
+
+    /// Returns the drives; none for an application of another kind.
+    pub(super) fn drives(&self) -> &[Drive] {
+        match self {
+            Self::Drives(drives) => drives,
+            _ => &[],
+        }
+    }
+
+    pub(super) fn drives_mut(&mut self) -> &mut [Drive] {
+        match self {
+            Self::Drives(drives) => drives,
+            _ => &mut [],
         }
     }
 
@@ -168,22 +191,27 @@ fn of(process: &[ProcessData], direction: Direction) -> impl Iterator<Item = &Ma
 }
 
 impl SimDevice {
-    /// Returns the drive; `None` for a device of another kind.
+    /// Returns the drive, or the first axis of it; `None` for a device of another kind.
     #[must_use]
     pub fn drive(&self) -> Option<&Drive> {
-        match &self.application {
-            Application::Drive(drive) => Some(drive),
-            _ => None,
-        }
+        self.axes().first()
+    }
+
+    /// Returns the axes of a drive; none for a device of another kind.
+    #[must_use]
+    pub fn axes(&self) -> &[Drive] {
+        self.application.drives()
     }
 
     /// Returns the drive to change it; `None` for a device of another kind.
     pub fn drive_mut(&mut self) -> Option<&mut Drive> {
+        self.axes_mut().first_mut()
+    }
+
+    /// Returns the axes of a drive to change them; none for a device of another kind.
+    pub fn axes_mut(&mut self) -> &mut [Drive] {
         self.show();
-        match &mut self.application {
-            Application::Drive(drive) => Some(drive),
-            _ => None,
-        }
+        self.application.drives_mut()
     }
 
     /// Returns the CANopen gateway; `None` for a device of another kind.
@@ -205,7 +233,7 @@ impl SimDevice {
 
     /// Updates the objects with the state of the drive.
     pub(super) fn show(&mut self) {
-        if let Application::Drive(drive) = &mut self.application {
+        for drive in self.application.drives_mut() {
             drive.show(&mut self.store);
         }
     }

@@ -207,7 +207,7 @@ impl SimDevice {
                 gateway.bind(&objects.store);
                 Application::Gateway(Box::new(gateway))
             }
-            None if is_drive => Application::drive(&mut objects.store, options.plant),
+            None if is_drive => Application::new_drives(&mut objects.store, options.plant),
             None => Application::Io(Io::default()),
         };
         let Objects {

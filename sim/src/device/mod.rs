@@ -29,7 +29,7 @@ use ecaxis_esi::model::Access;
 use crate::Nanos;
 use crate::coe::object_dictionary::ObjectStore;
 use crate::coe::pdo::PdoRules;
-use crate::drive::{Emergency, State};
+use crate::drive::{Drive, Emergency, State};
 use crate::esc::Esc;
 use crate::esc::al::AlState;
 use crate::esc::dc::sync::Edges;
@@ -226,11 +226,13 @@ impl SimDevice {
     #[must_use]
     pub fn object(&self, index: u16, sub: u8) -> Option<Vec<u8>> {
         let slot = self.store.slot(index, sub)?;
-        let Some(drive) = self.drive() else {
+        if self.axes().is_empty() {
             return Some(crate::coe::read_item(&self.store, slot));
-        };
+        }
         let mut store = self.store.clone();
-        drive.show_in(&mut store);
+        for drive in self.axes() {
+            drive.show_in(&mut store);
+        }
         Some(crate::coe::read_item(&store, slot))
     }
 
@@ -331,13 +333,16 @@ impl SimDevice {
         let local = self.esc.clock.local(now);
         while self.tick <= local {
             self.start_ticking(self.tick);
-            let Some(drive) = self.drive_mut() else {
+            for drive in self.axes_mut() {
+                drive.coast();
+            }
+            if self.axes().is_empty() {
                 return false;
-            };
-            drive.coast();
+            }
         }
-        self.drive_mut()
-            .is_some_and(|drive| drive.velocity_rev_s() != 0.0)
+        self.axes()
+            .iter()
+            .any(|drive| drive.velocity_rev_s() != 0.0)
     }
 
     /// Switches the power on. Volatile data are lost and objects return to their defaults.
@@ -406,9 +411,11 @@ impl SimDevice {
     }
 
     fn send_emergencies(&mut self) {
-        while let Application::Drive(drive) = &mut self.application
-            && let Some(emergency) = drive.take_emergency()
-        {
+        loop {
+            let mut drives = self.application.drives_mut().iter_mut();
+            let Some(emergency) = drives.find_map(Drive::take_emergency) else {
+                break;
+            };
             self.queue_emergency(&emergency);
         }
     }
@@ -552,7 +559,7 @@ impl SimDevice {
     }
 
     pub(crate) fn hold_drive_in(&mut self, state: Option<State>) {
-        if let Some(drive) = self.drive_mut() {
+        for drive in self.axes_mut() {
             drive.hold_in(state);
         }
     }

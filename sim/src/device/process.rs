@@ -3,7 +3,7 @@
 
 use ecaxis_esi::model::Direction;
 
-use super::{Application, SimDevice};
+use super::SimDevice;
 use crate::Nanos;
 use crate::bits;
 use crate::coe::pdo::Mapped;
@@ -125,7 +125,7 @@ impl SimDevice {
     pub fn set_digital_input(&mut self, now: Nanos, bit: u8, on: bool) -> bool {
         self.advance(now);
         let left = self.tick.saturating_sub(self.esc.clock.local(now));
-        let Application::Drive(drive) = &mut self.application else {
+        let Some(drive) = self.application.drives_mut().first_mut() else {
             return false;
         };
         drive.set_input(bit, on, 1.0 - share(left, CONTROL_PERIOD_NS));

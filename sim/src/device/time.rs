@@ -2,7 +2,6 @@
 //! skipped.
 
 use super::SimDevice;
-use super::application::Application;
 use super::mailbox::Mailbox;
 use crate::Nanos;
 use crate::drive::Drive;
@@ -64,10 +63,8 @@ impl SimDevice {
                     break;
                 }
                 let mut drives = devices.iter_mut().zip(controls).map(|(device, controls)| {
-                    match &mut device.application {
-                        Application::Drive(drive) if controls => Some(&mut **drive),
-                        _ => None,
-                    }
+                    let drives = device.application.drives_mut();
+                    drives.first_mut().filter(|_| controls)
                 });
                 Drive::turn(std::array::from_fn(|_| drives.next().flatten()));
                 for (device, _) in devices.iter_mut().zip(controls).filter(|(_, c)| *c) {
@@ -116,11 +113,15 @@ impl SimDevice {
                 let edges = self.esc.fire_sync(due);
                 self.synchronized(edges);
             } else if due == tick {
-                if let Application::Drive(drive) = &mut self.application {
-                    drive.begin_control(&self.store);
+                let drives = self.application.drives_mut();
+                if drives.is_empty() {
+                    self.tick();
+                } else {
+                    for drive in drives {
+                        drive.begin_control(&self.store);
+                    }
                     return Run::Control;
                 }
-                self.tick();
             } else if due == watchdog {
                 self.watchdog_expired();
             } else if due == eeprom {

@@ -53,7 +53,7 @@ use control::{Bounds, Controller, Demand, Tuning};
 use fault::Faults;
 use io::Inputs as DigitalInputs;
 use modes::{Cycle, Mode, Motion, PositionFrame, SetPoints};
-use objects::{HomingParameters, Objects, Parameters};
+use objects::{AXIS_STRIDE, HomingParameters, Objects, Parameters};
 use plant::Plant;
 use state::{Inputs, Power, Request, Stop};
 use touch_probe::TouchProbes;
@@ -65,6 +65,10 @@ use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 pub(crate) const CONTROL_PERIOD_NS: Nanos = 400_000;
 /// [`CONTROL_PERIOD_NS`] in seconds.
 const CONTROL_STEP: f64 = 400e-6;
+
+/// The axes of a device (CiA 402-1).
+const MAX_AXES: u16 = 8;
+const CONTROLWORD: u16 = 0x6040;
 
 /// Control cycles between two reads of the parameters. A real drive's background task also reads
 /// them late.
@@ -118,7 +122,21 @@ pub struct Drive {
 
 impl Drive {
     pub(crate) fn new(store: &mut ObjectStore, plant: PlantParams) -> Self {
-        let objects = Objects::bind(store, &plant);
+        Self::of_axis(store, 0, plant)
+    }
+
+    /// Creates a drive for each axis of a device: each Controlword of the dictionary.
+    pub(crate) fn of_axes(store: &mut ObjectStore, plant: PlantParams) -> Box<[Self]> {
+        let own = |axis: &u16| *axis == 0 || store.has_object(CONTROLWORD + axis * AXIS_STRIDE);
+        let axes: Vec<u16> = (0..MAX_AXES).filter(own).collect();
+        let drives = axes.into_iter();
+        drives
+            .map(|axis| Self::of_axis(store, axis, plant))
+            .collect()
+    }
+
+    fn of_axis(store: &mut ObjectStore, axis: u16, plant: PlantParams) -> Self {
+        let objects = Objects::bind(store, axis, &plant);
         let parameters = objects.parameters(store, &plant);
         let tuning = objects.tuning(store);
         let motor = Plant::new(&plant);
@@ -210,7 +228,7 @@ impl Drive {
     /// Op.
     pub(crate) fn control(&mut self, store: &mut ObjectStore, in_op: bool) {
         self.begin_control(store);
-        self.controller.turn(&mut self.plant);
+        self.turn_alone();
         self.end_control(store, in_op);
         self.show(store);
     }
@@ -222,6 +240,11 @@ impl Drive {
         if self.parameters_age >= PARAMETER_CYCLES || self.start {
             self.read_parameters(store);
         }
+    }
+
+    /// Runs the second part for a motor alone.
+    pub(crate) fn turn_alone(&mut self) {
+        self.controller.turn(&mut self.plant);
     }
 
     /// Runs the second part: the motors. A batch is faster than one motor after the other.
@@ -237,10 +260,7 @@ impl Drive {
                 for pair in [[a, b], [c, d]] {
                     match pair {
                         [Some(a), Some(b)] => Controller::turn_together([a, b].map(parts)),
-                        alone => alone
-                            .into_iter()
-                            .flatten()
-                            .for_each(|drive| drive.controller.turn(&mut drive.plant)),
+                        alone => alone.into_iter().flatten().for_each(Self::turn_alone),
                     }
                 }
             }

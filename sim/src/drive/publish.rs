@@ -41,7 +41,14 @@ impl Drive {
         let current = self.controller.current();
         store.show(o.statusword, i64::from(self.statusword(limited)));
         store.show(o.error_code, i64::from(self.faults.code()));
-        store.show(o.error_register, i64::from(self.faults.register()));
+        // All axes of a device share 0x1001; the first one begins.
+        let others = if o.is_first {
+            0
+        } else {
+            store.get(o.error_register)
+        };
+        let register = others | i64::from(self.faults.register());
+        store.show(o.error_register, register);
         store.show(o.mode_display, self.mode.map_or(0, Mode::code));
         store.show(o.position, self.frame.turned(self.frame.show(counts)));
         store.show(

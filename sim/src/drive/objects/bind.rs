@@ -13,16 +13,43 @@ pub(super) const RO: Access = Access {
     write: Writable::Never,
 };
 
-/// Finds the drive's objects in a dictionary or adds them. Sets the values that commissioning would
-/// have set.
-pub(super) struct Binder<'a>(pub &'a mut ObjectStore);
+/// The objects of a drive in the profile area of the first axis; those of the next axis are as many
+/// indices later (CiA 402-1, multiple axes).
+const PROFILE_AREA: std::ops::Range<u16> = 0x6000..0x6800;
+pub(in crate::drive) const AXIS_STRIDE: u16 = 0x800;
 
-impl Binder<'_> {
+/// Finds the objects of an axis in a dictionary or adds them. Sets the values that commissioning
+/// would have set.
+pub(super) struct Binder<'a> {
+    pub store: &'a mut ObjectStore,
+    /// The number of the axis in its device, from 0.
+    axis: u16,
+}
+
+impl<'a> Binder<'a> {
+    pub(super) fn new(store: &'a mut ObjectStore, axis: u16) -> Self {
+        Self { store, axis }
+    }
+
+    /// Returns the index of an object of this axis.
+    fn own_index(&self, index: u16) -> u16 {
+        if PROFILE_AREA.contains(&index) {
+            index + self.axis * AXIS_STRIDE
+        } else {
+            index
+        }
+    }
+
+    /// Returns an object of this axis if the dictionary has it.
+    pub(super) fn slot(&self, index: u16, sub: u8) -> Option<EntryHandle> {
+        self.store.slot(self.own_index(index), sub)
+    }
+
     /// True if the dictionary is that of a maxon drive. One without a vendor counts as maxon's.
     pub(super) fn is_maxon(&self) -> bool {
         const MAXON: i64 = 0xfb;
-        let vendor = self.0.slot(0x1018, 1).map(|slot| self.0.get(slot));
-        self.0.slot(0x30b0, 0).is_some() || vendor.is_none_or(|vendor| vendor == MAXON)
+        let vendor = self.store.slot(0x1018, 1).map(|slot| self.store.get(slot));
+        self.store.slot(0x30b0, 0).is_some() || vendor.is_none_or(|vendor| vendor == MAXON)
     }
 
     pub(super) fn bind(
@@ -33,7 +60,8 @@ impl Binder<'_> {
         bits: u32,
         access: Access,
     ) -> EntryHandle {
-        self.0.ensure(index, sub, name, bits, access, &[])
+        let index = self.own_index(index);
+        self.store.ensure(index, sub, name, bits, access, &[])
     }
 
     /// Binds a parameter. An ESI without a default leaves zero there, unlike a real drive at
@@ -52,24 +80,27 @@ impl Binder<'_> {
     }
 
     pub(super) fn fill(&mut self, slot: EntryHandle, default: i64) {
-        if self.0.get(slot) == 0 {
-            self.0.set(slot, default);
+        if self.store.get(slot) == 0 {
+            self.store.set(slot, default);
         }
     }
 
     /// Restricts an object to the values that a client may write. A default outside the list
     /// disables the check, because that drive supports more values.
     pub(super) fn choose(&mut self, slot: EntryHandle, choices: &'static [i64]) {
-        if choices.contains(&self.0.get_signed(slot)) {
-            self.0.set_choices(slot, choices);
+        if choices.contains(&self.store.get_signed(slot)) {
+            self.store.set_choices(slot, choices);
         }
     }
 
     /// Binds a vendor-specific object. Another vendor may use the same index for something else, so
-    /// the name must match.
+    /// the name must match. Only the first axis has such objects.
     pub(super) fn own(&self, index: u16, sub: u8, name: &str) -> Option<EntryHandle> {
-        let slot = self.0.slot(index, sub)?;
-        (self.0.item(slot)?.name == name).then_some(slot)
+        if self.axis > 0 {
+            return None;
+        }
+        let slot = self.store.slot(index, sub)?;
+        (self.store.item(slot)?.name == name).then_some(slot)
     }
 
     /// Adds a vendor-specific record to a dictionary without such objects.
@@ -82,23 +113,23 @@ impl Binder<'_> {
         let count = self.bind(index, 0, name, 8, RO);
         for (sub, name, bits) in rows {
             self.bind(index, sub, name, bits, RW);
-            self.0.set(count, i64::from(sub));
+            self.store.set(count, i64::from(sub));
         }
     }
 
     /// Binds motor data. Commissioning has set it, so the ESI's factory value is replaced.
     pub(super) fn motor_data(&mut self, slot: EntryHandle, value: i64) -> EntryHandle {
-        self.0.set(slot, value);
+        self.store.set(slot, value);
         slot
     }
 
     /// Widens software limits that exclude the present position. Such factory values do not fit the
     /// machine.
     pub(super) fn drop_limits_without(&mut self, [min, max]: [EntryHandle; 2], position: i64) {
-        let (low, high) = (self.0.get_signed(min), self.0.get_signed(max));
+        let (low, high) = (self.store.get_signed(min), self.store.get_signed(max));
         if low < high && !(low..=high).contains(&position) {
-            self.0.set(min, i64::from(i32::MIN));
-            self.0.set(max, i64::from(i32::MAX));
+            self.store.set(min, i64::from(i32::MIN));
+            self.store.set(max, i64::from(i32::MAX));
         }
     }
 

@@ -234,7 +234,7 @@ impl TuningSlots {
             control_structure: b.own_motor_data(0x3000, 2, "Control structure", FILTERED),
             commissioned,
         };
-        let units = slots.units(b.0);
+        let units = slots.units(b.store);
         for (((slot, row), value), unit) in slots.gains.iter_mut().zip(&ROWS).zip(table).zip(units)
         {
             let value = whole((value / unit).min(LARGEST));
@@ -311,7 +311,7 @@ mod tests {
 
     fn drive(plant: &PlantParams) -> (ObjectStore, TuningSlots) {
         let mut store = ObjectStore::default();
-        let mut b = Binder(&mut store);
+        let mut b = Binder::new(&mut store, 0);
         super::super::motor::add(&mut b);
         TuningSlots::add(&mut b);
         super::super::motor::fill(&mut b, plant);
@@ -406,7 +406,7 @@ mod tests {
         let access = super::super::bind::RW;
         let slot = store.ensure(0x30a0, 1, "Brake delay", 32, access, &[7]);
         let plant = PlantParams::default();
-        let slots = TuningSlots::bind(&mut Binder(&mut store), &plant);
+        let slots = TuningSlots::bind(&mut Binder::new(&mut store, 0), &plant);
         assert_eq!(store.get(slot), 7);
         let tuned = Gains::tuned(&plant).current;
         assert_eq!(slots.read(&store).gains.current, tuned);

@@ -39,7 +39,7 @@ pub(in crate::drive) struct HomingParameters {
 fn list_methods(b: &mut Binder<'_>) {
     let listed = METHODS.iter().filter(|&&code| code != 35);
     for (sub, code) in (1..).zip(listed) {
-        if let Some(slot) = b.0.slot(0x60e3, sub) {
+        if let Some(slot) = b.slot(0x60e3, sub) {
             b.fill(slot, *code);
         }
     }
@@ -88,7 +88,7 @@ impl HomingSlots {
                 32,
                 units(1000.0 * per_rpm_s),
             ),
-            home_position: b.own(0x30b0, 0, "Home position").or(b.0.slot(0x607c, 0)),
+            home_position: b.own(0x30b0, 0, "Home position").or(b.slot(0x607c, 0)),
             distance: b.own(DISTANCE.0, 0, DISTANCE.1),
             current_threshold: b
                 .own(THRESHOLD.0, 0, THRESHOLD.1)

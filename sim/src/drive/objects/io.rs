@@ -40,7 +40,7 @@ impl IoSlots {
         Self {
             inputs: b.bind(0x60fd, 0, "Digital inputs", 32, RO),
             outputs: b.bind(0x60fe, 1, "Physical outputs", 32, RW),
-            output_mask: b.0.slot(0x60fe, 2),
+            output_mask: b.slot(0x60fe, 2),
             polarity: b.own(0x3141, 2, "Digital inputs polarity"),
             configuration,
             logic: b.own(0x3141, 1, "Digital inputs logic state"),

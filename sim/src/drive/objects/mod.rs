@@ -39,6 +39,7 @@ use io::IoSlots;
 use parameters::ParameterSlots;
 use units::COUNTS;
 
+pub(super) use bind::AXIS_STRIDE;
 pub(super) use homing::HomingParameters;
 pub(super) use parameters::Parameters;
 pub(super) use probe::ProbeSlots;
@@ -46,10 +47,10 @@ pub(super) use torque::CurrentLimits;
 
 /// Returns the mode at power-on. A dictionary with a Controlword and without a writable 0x6060 is
 /// that of a drive with one mode, which its target shows.
-fn power_on_mode(store: &ObjectStore) -> i64 {
+fn power_on_mode(b: &Binder<'_>) -> i64 {
     const PROFILE_POSITION: i64 = 1;
-    let has = |index| store.has_object(index);
-    let mode = store.slot(0x6060, 0).and_then(|slot| store.item(slot));
+    let has = |index| b.slot(index, 0).is_some();
+    let mode = b.slot(0x6060, 0).and_then(|slot| b.store.item(slot));
     let is_writable = mode.is_some_and(|item| item.access.write != Writable::Never);
     if is_writable || !has(0x6040) {
         return PROFILE_POSITION;
@@ -70,6 +71,8 @@ const MANUFACTURER_SPECIFIC: RangeInclusive<u16> = 0x2000..=0x5fff;
 pub(super) struct Objects {
     /// A maxon drive: torque in µNm, Statusword bit 4 as the state of the power stage.
     pub is_maxon: bool,
+    /// True for the first axis of the device.
+    pub is_first: bool,
     pub error_register: EntryHandle,
     pub error_code: EntryHandle,
     /// 0x1003:0 and its entries, if the ESI has them.
@@ -133,10 +136,10 @@ pub(super) fn float(value: i64) -> f64 {
 }
 
 impl Objects {
-    pub(super) fn bind(store: &mut ObjectStore, plant: &PlantParams) -> Self {
-        let mut b = Binder(store);
-        let history = [0, 1, 2, 3, 4, 5].map(|sub| b.0.slot(0x1003, sub));
-        if !b.0.has_any(MANUFACTURER_SPECIFIC) {
+    pub(super) fn bind(store: &mut ObjectStore, axis: u16, plant: &PlantParams) -> Self {
+        let mut b = Binder::new(store, axis);
+        let history = [0, 1, 2, 3, 4, 5].map(|sub| b.slot(0x1003, sub));
+        if axis == 0 && !b.store.has_any(MANUFACTURER_SPECIFIC) {
             motor::add(&mut b);
             TuningSlots::add(&mut b);
             homing::add(&mut b);
@@ -146,9 +149,10 @@ impl Objects {
         b.with_default(0x6502, 0, "Supported drive modes", 32, SUPPORTED_MODES);
         b.with_default(0x60a8, 0, "SI unit position", 32, COUNTS);
         let parameters = ParameterSlots::bind(&mut b, plant);
-        let power_on_mode = power_on_mode(b.0);
+        let power_on_mode = power_on_mode(&b);
         Self {
             is_maxon: b.is_maxon(),
+            is_first: axis == 0,
             error_register: b.bind(0x1001, 0, "Error register", 8, RO),
             error_code: b.bind(0x603f, 0, "Error code", 16, RO),
             history,

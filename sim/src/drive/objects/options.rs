@@ -21,7 +21,7 @@ impl OptionSlots {
             quick_stop: b.with_default(0x605a, 0, "Quick stop option code", 16, 6),
             shutdown: b.bind(0x605b, 0, "Shutdown option code", 16, RW),
             disable: b.with_default(0x605c, 0, "Disable operation option code", 16, 1),
-            halt: b.0.slot(0x605d, 0),
+            halt: b.slot(0x605d, 0),
             fault: b.with_default(0x605e, 0, "Fault reaction option code", 16, 2),
             abort: b.with_default(0x6007, 0, "Abort connection option code", 16, 3),
         };

@@ -83,12 +83,12 @@ impl ParameterSlots {
     pub(super) fn bind(b: &mut Binder<'_>, plant: &PlantParams) -> Self {
         let max_motor_speed = b.bind(0x6080, 0, "Max motor speed", 32, RW);
         b.motor_data(max_motor_speed, i64::from(plant.max_motor_speed));
-        let (unit_velocity, unit_acceleration) = (b.0.slot(0x60a9, 0), b.0.slot(0x60aa, 0));
+        let (unit_velocity, unit_acceleration) = (b.slot(0x60a9, 0), b.slot(0x60aa, 0));
         let counts_per_turn = f64::from(plant.counts_per_turn.max(1));
         let mut unit = |slot: Option<EntryHandle>, default, of: fn(i64, f64) -> f64| {
             slot.map_or(1.0, |slot| {
                 b.fill(slot, default);
-                of(b.0.get(slot), counts_per_turn)
+                of(b.store.get(slot), counts_per_turn)
             })
         };
         let per_unit_velocity = unit(unit_velocity, RPM, velocity_unit);
@@ -161,7 +161,7 @@ impl ParameterSlots {
             homing: HomingSlots::bind(b, per_rpm, per_rpm_s),
             unit_velocity,
             unit_acceleration,
-            polarity: b.0.slot(0x607e, 0),
+            polarity: b.slot(0x607e, 0),
             period_value: b.bind(0x60c2, 1, "Interpolation time period value", 8, RW),
             period_index: b.with_default(0x60c2, 2, "Interpolation time index", 8, -3),
             speed_is_mapped: false,

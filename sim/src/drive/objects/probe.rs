@@ -19,14 +19,14 @@ impl ProbeSlots {
     pub(super) fn find(b: &Binder<'_>) -> Option<Self> {
         let four = |first: u16| {
             [[first, first + 1], [first + 2, first + 3]]
-                .map(|edges| edges.map(|index| b.0.slot(index, 0)))
+                .map(|edges| edges.map(|index| b.slot(index, 0)))
         };
         Some(Self {
-            function: b.0.slot(0x60b8, 0)?,
-            status: b.0.slot(0x60b9, 0)?,
+            function: b.slot(0x60b8, 0)?,
+            status: b.slot(0x60b9, 0)?,
             positions: four(0x60ba),
             counters: four(0x60d5),
-            sources: [1, 2].map(|sub| b.0.slot(0x60d0, sub)),
+            sources: [1, 2].map(|sub| b.slot(0x60d0, sub)),
         })
     }
 

@@ -51,7 +51,7 @@ impl Limit {
 /// mNm otherwise.
 fn counts_per_newton_metre(b: &Binder<'_>, rated_torque: EntryHandle) -> f64 {
     const NEWTON_METRE: u32 = 0x56;
-    let unit = b.0.item(rated_torque).map_or(0, |item| item.unit);
+    let unit = b.store.item(rated_torque).map_or(0, |item| item.unit);
     if unit & 0x00ff_ffff == NEWTON_METRE << 16 {
         let [.., power] = unit.to_le_bytes();
         return 10f64.powi(-i32::from(i8::from_le_bytes([power])));
@@ -65,14 +65,14 @@ impl TorqueSlots {
         let counts_per_newton_metre = counts_per_newton_metre(b, rated_torque);
         let rated = whole(plant.rated_torque() * counts_per_newton_metre);
         b.motor_data(rated_torque, rated);
-        if let Some(rated_current) = b.0.slot(0x6075, 0) {
+        if let Some(rated_current) = b.slot(0x6075, 0) {
             b.motor_data(rated_current, whole(plant.nominal_current * 1e3));
         }
         // Without a factory value in the ESI: the torque at the current limit, in thousandths of
         // the rated torque. Zero would leave a drive without torque as soon as it is mapped.
         let peak = whole(1000.0 * plant.current_limit / plant.nominal_current.max(1e-9));
         let mut limit = |index| {
-            let slot = b.0.slot(index, 0)?;
+            let slot = b.slot(index, 0)?;
             b.fill(slot, peak);
             Some(Limit {
                 slot,

@@ -27,11 +27,11 @@ pub(in crate::drive) struct VelocityWindows {
 impl VelocitySlots {
     pub(super) fn find(b: &Binder<'_>) -> Self {
         Self {
-            window: b.0.slot(0x606d, 0),
-            window_time: b.0.slot(0x606e, 0),
-            threshold: b.0.slot(0x606f, 0),
-            threshold_time: b.0.slot(0x6070, 0),
-            max_slippage: b.0.slot(0x60f8, 0),
+            window: b.slot(0x606d, 0),
+            window_time: b.slot(0x606e, 0),
+            threshold: b.slot(0x606f, 0),
+            threshold_time: b.slot(0x6070, 0),
+            max_slippage: b.slot(0x60f8, 0),
         }
     }
 
