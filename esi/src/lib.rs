@@ -14,6 +14,7 @@
 #![deny(missing_docs)]
 #![forbid(unsafe_code)]
 
+pub mod axis;
 mod error;
 pub mod layout;
 pub mod lint;

@@ -1,7 +1,8 @@
 //! User-defined PDO contents, checked against the device's capabilities.
 
-use super::pdo::{PdoSelector, conflict, contains, direction_name};
+use super::pdo::{PdoSelector, STATUSWORD, conflict, contains, direction_name};
 use super::{EntryRef, SelectError};
+use crate::axis;
 use crate::mode::Mode;
 use crate::model::{Direction, Entry, Pdo, PdoMapping, Position, SlotDependence};
 
@@ -46,13 +47,11 @@ impl PdoSelector<'_> {
             .collect::<Result<_, _>>()?;
         if let Some(mode) = mode {
             // The user may omit the actual value. The command and status words are mandatory.
-            let needed = self.needed(mode);
-            let strict = if self.direction == Direction::Rx {
-                needed.len()
-            } else {
-                1
+            let strict = |index: &u16| {
+                self.direction == Direction::Rx
+                    || axis::of(*index).is_some_and(|(_, same)| same == STATUSWORD)
             };
-            for index in needed.into_iter().take(strict) {
+            for index in self.needed(mode).into_iter().filter(strict) {
                 if !contains(std::slice::from_ref(&pdo), index) {
                     return Err(SelectError::MissingEntry {
                         list: label,

@@ -67,6 +67,8 @@ pub struct UserSdo {
 pub struct SelectOptions<'a> {
     /// The mode of operation; `None`: no requirement.
     pub mode: Option<Mode>,
+    /// The axes in use, counted from 0; empty: the first one.
+    pub axes: &'a [u16],
     /// User-defined contents of the output PDO.
     pub rx: Option<&'a [EntryRef]>,
     /// User-defined contents of the input PDO.
@@ -96,6 +98,8 @@ pub struct Selection {
     pub modules: Vec<SelectedModule>,
     /// The mode of operation.
     pub mode: Option<Mode>,
+    /// The axes in use, counted from 0.
+    pub axes: Vec<u16>,
     /// The named assignment that applies, from the user or from the DC mode.
     pub assignment: Option<String>,
     /// The PDOs on the wire in assignment order. `sm` is always set.
@@ -160,7 +164,12 @@ pub fn select(
             device: device.name.clone(),
         });
     }
-    let placed = module::choose(&file.modules, device, choice.mode, choice.modules)?;
+    let axes = match choice.axes {
+        [] => &[0],
+        axes => axes,
+    };
+    let mode = choice.mode.map(|mode| (mode, axes));
+    let placed = module::choose(&file.modules, device, mode, choice.modules)?;
     let paths = placed.iter().map(|placed| &placed.module.path);
     let paths = std::iter::once(&device.path).chain(paths);
     let mut notes: Vec<_> = paths.flat_map(|path| left_out(file, path)).collect();
@@ -190,6 +199,7 @@ pub fn select(
         dictionary: &dictionary,
         direction,
         assignment,
+        axes,
     };
     let rx = chooser(Direction::Rx).choose(choice.mode, choice.rx, &mut notes)?;
     let tx = chooser(Direction::Tx).choose(choice.mode, choice.tx, &mut notes)?;
@@ -225,6 +235,7 @@ pub fn select(
         device_name: device.name.clone(),
         modules,
         mode: choice.mode,
+        axes: axes.to_vec(),
         assignment: assignment.map(|assignment| assignment.name.to_owned()),
         rx,
         tx,
@@ -296,7 +307,7 @@ pub fn offered_modes(file: &EsiFile, device: &Device) -> Vec<Mode> {
         .into_iter()
         .filter(|&mode| {
             if has_slots {
-                return module::choose(&file.modules, device, Some(mode), &[]).is_ok_and(
+                return module::choose(&file.modules, device, Some((mode, &[0])), &[]).is_ok_and(
                     |placed| placed.iter().any(|p| module::mode_of(&p.module).is_some()),
                 );
             }
@@ -324,6 +335,7 @@ pub(crate) fn default_pdos(device: &Device, modules: &[Module], direction: Direc
         dictionary: &device.dictionary,
         direction,
         assignment: None,
+        axes: &[0],
     }
     .available()
 }

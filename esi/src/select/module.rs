@@ -40,12 +40,12 @@ struct Instance<'a> {
 /// stay empty.
 ///
 /// `wanted` names modules place by place (type, name or identity; `-` for none). A mode fills each
-/// required place that `wanted` does not name. Without required places, the mode fills the first
-/// place.
+/// required place that `wanted` does not name. Without required places, the mode fills the
+/// places of the axes.
 pub(super) fn choose<'m>(
     modules: &'m [Module],
     device: &'m Device,
-    mode: Option<Mode>,
+    mode: Option<(Mode, &[u16])>,
     wanted: &[&str],
 ) -> Result<Vec<PluggedModule<'m>>, SelectError> {
     let Some(slots) = device.slots.as_ref() else {
@@ -70,10 +70,13 @@ pub(super) fn choose<'m>(
     let (mut chosen, mut size) = (Vec::new(), 0usize);
     for (number, place) in places.iter().enumerate() {
         let by_name = wanted.get(number).map(|name| name.trim());
-        let takes_mode = place.required || (!any_required && number == 0);
+        let takes_mode = |axes: &[u16]| {
+            let is_used = || axes.iter().any(|&axis| usize::from(axis) == number);
+            place.required || (!any_required && is_used())
+        };
         let module = match (by_name, mode) {
             (Some(name), _) => named(device, place, name)?,
-            (None, Some(mode)) if takes_mode => for_mode(device, place, mode)?,
+            (None, Some((mode, axes))) if takes_mode(axes) => for_mode(device, place, mode)?,
             _ => default_module(place),
         };
         let Some(module) = module else {

@@ -4,10 +4,11 @@ use std::collections::HashMap;
 
 use super::module::PluggedModule;
 use super::{EntryRef, SelectError, oversampling};
+use crate::axis;
 use crate::mode::Mode;
 use crate::model::{Coe, Device, Dictionary, Direction, Pdo, SmUse};
 
-const STATUSWORD: u16 = 0x6041;
+pub(super) const STATUSWORD: u16 = 0x6041;
 const POSITION: u16 = 0x6064;
 
 /// A named list of PDOs by SyncManager: an `AlternativeSmMapping`, or the assignment of a DC mode.
@@ -63,6 +64,8 @@ pub(super) struct PdoSelector<'a> {
     pub dictionary: &'a Dictionary,
     pub direction: Direction,
     pub assignment: Option<Assignment<'a>>,
+    /// The axes in use.
+    pub axes: &'a [u16],
 }
 
 impl PdoSelector<'_> {
@@ -237,7 +240,7 @@ impl PdoSelector<'_> {
             return Ok(match self.direction {
                 _ if !self.coe().is_some_and(|coe| coe.pdo_assign) => set,
                 Direction::Rx => drop_repeated_objects(set, &needed, notes),
-                Direction::Tx => self.with_position(available, &default, set, &needed),
+                Direction::Tx => self.with_positions(available, &default, set, &needed),
             });
         }
         if let Some(pdo) = self.filled(available, &default, &needed) {
@@ -305,45 +308,62 @@ impl PdoSelector<'_> {
         };
         match self.direction {
             Direction::Rx => with(needed),
-            Direction::Tx if needed.contains(&POSITION) => with(needed),
-            Direction::Tx => with(&[needed, &[POSITION]].concat()).or_else(|| with(needed)),
+            Direction::Tx => {
+                let positions = self.positions().filter(|index| !needed.contains(index));
+                let all: Vec<u16> = needed.iter().copied().chain(positions).collect();
+                with(&all).or_else(|| with(needed))
+            }
         }
     }
 
-    /// Adds the actual position (0x6064) to inputs without it, if a PDO contains it. The axis
+    /// Returns the actual position of each axis in use.
+    fn positions(&self) -> impl Iterator<Item = u16> {
+        self.axes.iter().map(|&axis| axis::object(POSITION, axis))
+    }
+
+    /// Adds the actual positions (0x6064) to inputs without them, if a PDO contains them. An axis
     /// supervises its position in every mode.
-    fn with_position(
+    fn with_positions(
         &self,
         available: &[Pdo],
         default: &[Pdo],
         mut set: Vec<Pdo>,
         needed: &[u16],
     ) -> Vec<Pdo> {
-        if needed.contains(&POSITION) || contains(&set, POSITION) {
-            return set;
+        for position in self.positions() {
+            if contains(&set, position) {
+                continue;
+            }
+            let with_position = available.iter().filter(|pdo| {
+                let room = self.capacity(pdo) > set.len();
+                let free = set.iter().all(|other| !conflict(other, pdo));
+                room && free && contains(std::slice::from_ref(*pdo), position)
+            });
+            if let Some(pdo) = with_position.min_by_key(|pdo| pdo.bit_len()) {
+                set.push(pdo.clone());
+                continue;
+            }
+            let objects = [needed, &[position]].concat();
+            let one = available.iter().find(|pdo| contains_all(pdo, &objects));
+            if let Some(pdo) = one {
+                set = self.alongside(pdo.clone(), default);
+            }
         }
-        let with_position = available.iter().filter(|pdo| {
-            let room = self.capacity(pdo) > set.len();
-            let free = set.iter().all(|other| !conflict(other, pdo));
-            room && free && contains(std::slice::from_ref(*pdo), POSITION)
-        });
-        if let Some(pdo) = with_position.min_by_key(|pdo| pdo.bit_len()) {
-            set.push(pdo.clone());
-            return set;
-        }
-        let objects = [needed, &[POSITION]].concat();
-        let one = available.iter().find(|pdo| contains_all(pdo, &objects));
-        one.map_or(set, |pdo| self.alongside(pdo.clone(), default))
+        set
     }
 
+    /// Returns the objects that a mode needs, axis by axis.
     pub(super) fn needed(&self, mode: Mode) -> Vec<u16> {
-        match self.direction {
-            Direction::Rx => [Some(0x6040), mode.target_object()]
-                .into_iter()
-                .flatten()
-                .collect(),
-            Direction::Tx => vec![STATUSWORD, mode.actual_object()],
-        }
+        let of_first = match self.direction {
+            Direction::Rx => [Some(0x6040), mode.target_object()],
+            Direction::Tx => [Some(STATUSWORD), Some(mode.actual_object())],
+        };
+        let axes = self.axes.iter();
+        axes.flat_map(|&axis| {
+            let objects = of_first.into_iter().flatten();
+            objects.map(move |index| axis::object(index, axis))
+        })
+        .collect()
     }
 
     /// Returns `pdo`, followed by the default PDOs that `pdo` does not exclude, up to the capacity.

@@ -21,6 +21,7 @@ mod pdo;
 
 use std::collections::HashMap;
 
+use crate::axis;
 use crate::layout::Layout;
 use crate::model::{Device, InitCmd, Object, ObjectItem, Writable};
 use crate::select::{SelectError, SelectOptions, SelectedModule, Selection};
@@ -74,7 +75,9 @@ pub(crate) fn list(
     let mut list = List::new(&objects);
     module_list(device, selection, &mut list);
     pdo::configure(device, coe, selection, choice, &mut list)?;
-    interpolation_time(selection, choice, &mut list)?;
+    for axis in selection.axes.clone() {
+        interpolation_time(selection, axis, choice, &mut list)?;
+    }
     // A module's command replaces a device's command for the same object, if that one is
     // replaceable.
     let replaced = |cmd: &InitCmd| {
@@ -92,7 +95,9 @@ pub(crate) fn list(
         let origin = format!("module {:?}", module.type_name);
         init_cmds(&module.init_cmds, &origin, selection, &mut list);
     }
-    mode(selection, &mut list);
+    for axis in selection.axes.clone() {
+        mode(selection, axis, &mut list);
+    }
     user(choice, selection, &mut list)?;
     // The stable sort by transition keeps the order above within a transition.
     list.sdos.sort_by_key(|sdo| {
@@ -162,8 +167,8 @@ impl<'d> Objects<'d> {
 struct List<'d> {
     objects: &'d Objects<'d>,
     sdos: Vec<StartupSdo>,
-    /// True once the list contains 0x60C2, derived from cycle and mode.
-    knows_period: bool,
+    /// The objects 0x60C2 that the list contains, derived from cycle and mode.
+    periods: Vec<u16>,
 }
 
 impl<'d> List<'d> {
@@ -171,7 +176,7 @@ impl<'d> List<'d> {
         Self {
             objects,
             sdos: Vec::new(),
-            knows_period: false,
+            periods: Vec::new(),
         }
     }
 
@@ -264,6 +269,7 @@ fn module_list(device: &Device, selection: &Selection, list: &mut List<'_>) {
 /// stored time does not remain. Zero is written only if the dictionary permits zero.
 fn interpolation_time(
     selection: &mut Selection,
+    axis: u16,
     choice: &SelectOptions<'_>,
     list: &mut List<'_>,
 ) -> Result<(), SelectError> {
@@ -271,8 +277,9 @@ fn interpolation_time(
         return Ok(());
     };
     let objects = list.objects;
-    let item = objects.item(INTERPOLATION_TIME, 1);
-    let interpolates = mode != Mode::Cst || can_leave_cst(&selection.layout);
+    let index = axis::object(INTERPOLATION_TIME, axis);
+    let item = objects.item(index, 1);
+    let interpolates = mode != Mode::Cst || can_leave_cst(&selection.layout.of_axis(axis));
     let writable = match item {
         Some(item) => item.access.write != Writable::Never,
         None => objects.is_empty() && interpolates,
@@ -280,7 +287,7 @@ fn interpolation_time(
     if !writable {
         if interpolates {
             selection.notes.push(format!(
-                "the dictionary has no writable 0x60C2; the drive does not receive the cycle of {} µs",
+                "the dictionary has no writable 0x{index:04X}; the drive does not receive the cycle of {} µs",
                 choice.cycle_ns / 1000
             ));
         }
@@ -295,20 +302,16 @@ fn interpolation_time(
                 })
         });
         if zero_allowed {
-            list.push_optional(INTERPOLATION_TIME, 1, vec![0], "mode cst");
-            list.knows_period = true;
+            list.push_optional(index, 1, vec![0], "mode cst");
+            list.periods.push(index);
         }
         return Ok(());
     }
-    let (value, exponent) = interpolation::interpolation_time(objects.dictionary, choice.cycle_ns)?;
-    list.push_optional(INTERPOLATION_TIME, 1, vec![value], "bus.cycle");
-    list.push_optional(
-        INTERPOLATION_TIME,
-        2,
-        exponent.to_le_bytes().to_vec(),
-        "bus.cycle",
-    );
-    list.knows_period = true;
+    let (value, exponent) =
+        interpolation::interpolation_time(&objects.dictionary.of_axis(axis), choice.cycle_ns)?;
+    list.push_optional(index, 1, vec![value], "bus.cycle");
+    list.push_optional(index, 2, exponent.to_le_bytes().to_vec(), "bus.cycle");
+    list.periods.push(index);
     Ok(())
 }
 
@@ -336,8 +339,9 @@ fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list
             .find(|t| cmd.transitions.iter().any(|own| own == t));
         let Some(transition) = upwards else { continue };
         let sets = cmd.data.first().map(|&byte| i8::from_le_bytes([byte]));
-        if cmd.index == MODES_OF_OPERATION
-            && selection.mode.is_some_and(|mode| sets != Some(mode.code()))
+        if axis::of(cmd.index).is_some_and(|(axis, same)| {
+            same == MODES_OF_OPERATION && selection.axes.contains(&axis)
+        }) && selection.mode.is_some_and(|mode| sets != Some(mode.code()))
         {
             selection.notes.push(format!(
                 "InitCmd of {origin} (line {}) sets another mode of operation and is left out",
@@ -354,7 +358,7 @@ fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list
             ));
             continue;
         }
-        if cmd.index == INTERPOLATION_TIME && list.knows_period {
+        if list.periods.contains(&cmd.index) {
             selection.notes.push(format!(
                 "InitCmd of {origin} (line {}) writes {}, which follows from cycle and mode; it is left out",
                 cmd.position.line,
@@ -375,34 +379,32 @@ fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list
     }
 }
 
-fn mode(selection: &mut Selection, list: &mut List<'_>) {
+fn mode(selection: &mut Selection, axis: u16, list: &mut List<'_>) {
     let Some(mode) = selection.mode else { return };
+    let index = axis::object(MODES_OF_OPERATION, axis);
     if list
         .sdos
         .iter()
-        .any(|sdo| sdo.index == MODES_OF_OPERATION && sdo.transition == "PS")
+        .any(|sdo| sdo.index == index && sdo.transition == "PS")
     {
         return;
     }
     let objects = list.objects;
-    if !objects.is_empty() && objects.object(MODES_OF_OPERATION).is_none() {
-        selection
-            .notes
-            .push("the dictionary has no 0x6060; the mode of operation is not written".to_owned());
-        return;
-    }
-    let read_only = objects
-        .item(MODES_OF_OPERATION, 0)
-        .is_some_and(|item| item.access.write == Writable::Never);
-    if read_only {
-        selection.notes.push(
-            "0x6060 is read-only in the dictionary; the mode of operation is not written"
-                .to_owned(),
-        );
+    let item = objects.item(index, 0);
+    let why = if !objects.is_empty() && objects.object(index).is_none() {
+        Some(format!("the dictionary has no 0x{index:04x}"))
+    } else if item.is_some_and(|item| item.access.write == Writable::Never) {
+        Some(format!("0x{index:04x} is read-only in the dictionary"))
+    } else {
+        None
+    };
+    if let Some(why) = why {
+        let note = format!("{why}; the mode of operation is not written");
+        selection.notes.push(note);
         return;
     }
     list.push(
-        MODES_OF_OPERATION,
+        index,
         0,
         mode.code().to_le_bytes().to_vec(),
         &format!("mode {mode}"),
