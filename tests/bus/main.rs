@@ -20,6 +20,7 @@ mod probe;
 mod program;
 mod repeats;
 mod samples;
+mod several_axes;
 mod states;
 mod units;
 mod vendor_esi;

@@ -1,6 +1,6 @@
 //! Drives with units other than those of the machine file: adopted values, rejections and warnings.
 
-use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_ecat::index::AxisIndex;
 use ecaxis_master::bringup::Step;
 use ecaxis_master::config::Machine;
 use ecaxis_master::session::Progress;
@@ -167,10 +167,7 @@ fn torques_in_newton_metres_use_the_motor_data_of_the_drive() {
             .replace("encoder =", "torque_unit = \"Nm\"\nencoder =")
             .replace("following_error = 0.5", "torque = 0.05");
     let machine = machine(&text);
-    let setup = machine.devices[DeviceIndex(0)]
-        .axis
-        .as_ref()
-        .expect("an axis");
+    let setup = &machine.axes[AxisIndex(0)];
     assert_eq!(setup.torque.rated, Some(0.1), "as the ESI says");
     assert!((setup.config.limits.torque - 50.0).abs() < 1e-9);
     let (taken, warnings) = messages(machine);

@@ -39,6 +39,16 @@ pub enum SelectError {
         /// The choices in the ESI as text.
         offered: String,
     },
+    /// No PDO of the device carries the Controlword of an axis.
+    #[error("{device} has no axis {number}: no RxPdo of the ESI has its Controlword 0x{index:04X}")]
+    NoSuchAxis {
+        /// The type name of the device.
+        device: String,
+        /// The number of the axis, from 1.
+        number: u16,
+        /// The index of the Controlword.
+        index: u16,
+    },
     /// A slot needs a module, and none is the default.
     #[error(
         "{device}, slot {slot:?} needs a module and the ESI marks none as default; it offers {offered}"

@@ -8,6 +8,7 @@ use crate::axis;
 use crate::mode::Mode;
 use crate::model::{Coe, Device, Dictionary, Direction, Pdo, SmUse};
 
+const CONTROLWORD: u16 = 0x6040;
 pub(super) const STATUSWORD: u16 = 0x6041;
 const POSITION: u16 = 0x6064;
 
@@ -251,11 +252,7 @@ impl PdoSelector<'_> {
             return Ok(self.alongside(pdo, &default));
         }
         match self.direction {
-            Direction::Rx => Err(SelectError::ModeNotOffered {
-                device: self.device.name.clone(),
-                mode,
-                offered: offered_by_pdos(available),
-            }),
+            Direction::Rx => Err(self.not_offered(available, mode)),
             Direction::Tx => {
                 for index in needed {
                     if !contains(&default, index) {
@@ -266,6 +263,26 @@ impl PdoSelector<'_> {
                 }
                 Ok(default)
             }
+        }
+    }
+
+    fn not_offered(&self, available: &[Pdo], mode: Mode) -> SelectError {
+        let device = self.device.name.clone();
+        let missing = self.axes.iter().find_map(|&axis| {
+            let index = axis::object(CONTROLWORD, axis);
+            (axis > 0 && !contains(available, index)).then_some((axis, index))
+        });
+        match missing {
+            Some((axis, index)) => SelectError::NoSuchAxis {
+                device,
+                number: axis.saturating_add(1),
+                index,
+            },
+            None => SelectError::ModeNotOffered {
+                device,
+                mode,
+                offered: offered_by_pdos(available),
+            },
         }
     }
 
@@ -355,7 +372,7 @@ impl PdoSelector<'_> {
     /// Returns the objects that a mode needs, axis by axis.
     pub(super) fn needed(&self, mode: Mode) -> Vec<u16> {
         let of_first = match self.direction {
-            Direction::Rx => [Some(0x6040), mode.target_object()],
+            Direction::Rx => [Some(CONTROLWORD), mode.target_object()],
             Direction::Tx => [Some(STATUSWORD), Some(mode.actual_object())],
         };
         let axes = self.axes.iter();

@@ -2,9 +2,10 @@
 //! They are read after the start-up SDOs and before the first target is sent.
 
 use ecaxis_axis::scale::DriveUnits;
+use ecaxis_ecat::index::AxisIndex;
 
 use super::{BusDevice, Step, device};
-use crate::config::{DeviceConfig, TorqueUnit, is_maxon};
+use crate::config::{AxisSetup, DeviceConfig, TorqueUnit, is_maxon};
 use crate::mailbox::{CoeClient, MailboxTransport, SdoError};
 use crate::report::{Cause, Error};
 
@@ -13,20 +14,23 @@ use crate::report::{Cause, Error};
 pub(super) async fn compare(
     wire: &impl MailboxTransport,
     config: &DeviceConfig,
+    (index, axis): (AxisIndex, &AxisSetup),
     device: &mut BusDevice,
     progress: &dyn Fn(Step),
 ) -> Result<(), Error> {
-    let (Some(axis), Some(coe)) = (&config.axis, device.coe.as_mut()) else {
+    let Some(coe) = device.coe.as_mut() else {
         return Ok(());
     };
     let torque = &axis.torque;
     let constant = torque.unit == TorqueUnit::Amperes || torque.constant.is_some();
     let constant = constant && is_maxon(&config.selection);
-    let offered = ask(wire, coe, constant).await.map_err(|source| {
-        Cause::Sdo(source)
-            .with_device(&device.at)
-            .with_action("reading the drive's units")
-    })?;
+    let offered = ask(wire, coe, axis.number, constant)
+        .await
+        .map_err(|source| {
+            Cause::Sdo(source)
+                .with_device(&device.at)
+                .with_action("reading the drive's units")
+        })?;
     tracing::debug!(device = %device.at, "{offered:?}");
     let adopted = axis.adopt(&offered);
     if !adopted.wrong.is_empty() {
@@ -37,7 +41,7 @@ pub(super) async fn compare(
     }
     for what in &adopted.taken {
         progress(Step::Adopted {
-            device: config.name.clone(),
+            device: axis.name.clone(),
             what: what.clone(),
         });
     }
@@ -51,30 +55,33 @@ pub(super) async fn compare(
     for sdo in adopted.changed(&config.selection.startup) {
         device::download(wire, &device.at, coe, &sdo).await?;
     }
-    device.adopted = Some(Box::new(adopted));
+    device.adopted.push((index, adopted));
     Ok(())
 }
 
-/// If `constant`, also reads the motor's torque constant.
+/// Reads the units of an axis of a drive, counted from 0. If `constant`, also reads the motor's
+/// torque constant.
 pub async fn ask(
     wire: &impl MailboxTransport,
     coe: &mut CoeClient,
+    axis: u16,
     constant: bool,
 ) -> Result<DriveUnits, SdoError> {
+    let object = |index| ecaxis_esi::axis::object(index, axis);
     Ok(DriveUnits {
-        encoder_resolution: ratio(wire, coe, 0x608f).await?,
-        gear_ratio: ratio(wire, coe, 0x6091).await?,
-        feed_constant: ratio(wire, coe, 0x6092).await?,
-        position_unit: coe.upload_integer(wire, 0x60a8, 0).await?,
-        velocity_unit: coe.upload_integer(wire, 0x60a9, 0).await?,
-        acceleration_unit: coe.upload_integer(wire, 0x60aa, 0).await?,
-        rated_torque: coe.upload_integer(wire, 0x6076, 0).await?,
+        encoder_resolution: ratio(wire, coe, object(0x608f)).await?,
+        gear_ratio: ratio(wire, coe, object(0x6091)).await?,
+        feed_constant: ratio(wire, coe, object(0x6092)).await?,
+        position_unit: coe.upload_integer(wire, object(0x60a8), 0).await?,
+        velocity_unit: coe.upload_integer(wire, object(0x60a9), 0).await?,
+        acceleration_unit: coe.upload_integer(wire, object(0x60aa), 0).await?,
+        rated_torque: coe.upload_integer(wire, object(0x6076), 0).await?,
         torque_constant: match constant {
             true => coe.upload_integer(wire, 0x3001, 5).await?,
             false => None,
         },
         polarity: coe
-            .upload_integer(wire, 0x607e, 0)
+            .upload_integer(wire, object(0x607e), 0)
             .await?
             .map(|n| n.to_le_bytes()[0]),
     })

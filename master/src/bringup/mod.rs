@@ -13,7 +13,7 @@
 
 use std::fmt;
 
-use ecaxis_ecat::index::{DeviceIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
@@ -69,9 +69,9 @@ pub struct BusDevice {
     /// Outputs that no axis drives and that must not be zero: index, subindex, value.
     pub held: Vec<(u16, u8, i64)>,
     /// For a drive: its axis in the drive's own units.
-    pub adopted: Option<Box<AdoptedUnits>>,
+    pub adopted: Vec<(AxisIndex, AdoptedUnits)>,
     /// For a drive: its own limits that the machine file exceeds.
-    pub limits: Vec<LimitConflict>,
+    pub limits: Vec<(AxisIndex, LimitConflict)>,
     /// Propagation delay from the reference clock in ns.
     pub propagation_delay: u32,
     /// DL status (0x0110) after the scan: which ports are in use.
@@ -273,7 +273,7 @@ async fn describe(
         timeouts: StateTimeouts::new(info),
         at,
         held: Vec::new(),
-        adopted: None,
+        adopted: Vec::new(),
         limits: Vec::new(),
         dc,
         follows: false,
@@ -309,7 +309,7 @@ async fn set_up(
         configure(
             wire,
             machine,
-            (config, device),
+            (index, config, device),
             (*region, status),
             progress,
             times,
@@ -353,7 +353,7 @@ async fn set_up(
 async fn configure(
     wire: &DatagramClient,
     machine: &Machine,
-    (config, device): (&DeviceConfig, &mut BusDevice),
+    (index, config, device): (DeviceIndex, &DeviceConfig, &mut BusDevice),
     (region, status): (Option<DeviceRegion>, Option<u32>),
     progress: &dyn Fn(Step),
     times: &StepTimes,
@@ -364,8 +364,10 @@ async fn configure(
     let step = mapping::compare(wire, config, device);
     times.measure("mapping read back", name, step).await?;
     let step = async {
-        drive_units::compare(wire, config, device, progress).await?;
-        limits::compare(wire, config, device, progress).await?;
+        for axis in machine.axes_of(index) {
+            drive_units::compare(wire, config, axis, device, progress).await?;
+            limits::compare(wire, config, axis, device, progress).await?;
+        }
         output_defaults::read(wire, config, device).await
     };
     times.measure("units and limits", name, step).await?;

@@ -4,11 +4,11 @@
 //! objects that limit a motion: a maximum torque or velocity of zero blocks the drive. Such objects
 //! keep the drive's own value, read before its process data becomes valid.
 
-use ecaxis_esi::address;
 use ecaxis_esi::layout::Field;
+use ecaxis_esi::{Selection, address, axis};
 
 use super::BusDevice;
-use crate::config::{DeviceConfig, further_axis};
+use crate::config::{DeviceConfig, unused_axis};
 use crate::mailbox::MailboxTransport;
 use crate::report::{Cause, Error};
 
@@ -17,14 +17,16 @@ const ZERO_IS_SAFE: [u16; 11] = [
     0x6040, 0x6060, 0x6071, 0x607a, 0x60b0, 0x60b1, 0x60b2, 0x60b8, 0x60fe, 0x60ff, 0x0000,
 ];
 
-/// True if the output limits a motion. Outputs of a drive's further axes do not: without a
+/// True if the output limits a motion. Outputs of axes that are not used do not: without a
 /// Controlword, these axes do not move.
-fn bounds(field: &Field, rx: &[Field]) -> bool {
-    let Some((axis, same)) = further_axis(field) else {
-        return !ZERO_IS_SAFE.contains(&field.index);
-    };
-    let has_controlword = rx.iter().any(|f| further_axis(f) == Some((axis, 0x6040)));
-    !has_controlword && !ZERO_IS_SAFE.contains(&same)
+fn bounds(field: &Field, selection: &Selection) -> bool {
+    let (axis, same) = axis::of(field.index).unwrap_or((0, field.index));
+    if ZERO_IS_SAFE.contains(&same) {
+        return false;
+    }
+    let controlword = Some((axis, 0x6040));
+    let mut rx = selection.layout.rx.iter();
+    !rx.any(|field| unused_axis(field, selection) == controlword)
 }
 
 /// Reads the values to keep into `device.held`.
@@ -33,11 +35,12 @@ pub(super) async fn read(
     config: &DeviceConfig,
     device: &mut BusDevice,
 ) -> Result<(), Error> {
-    if config.axis.is_none() {
+    let selection = &config.selection;
+    if selection.mode.is_none() {
         return Ok(());
     }
-    let rx = &config.selection.layout.rx;
-    for field in rx.iter().filter(|field| bounds(field, rx)) {
+    let rx = selection.layout.rx.iter();
+    for field in rx.filter(|field| bounds(field, selection)) {
         let Some(coe) = device.coe.as_mut() else {
             return Ok(());
         };

@@ -25,7 +25,7 @@ pub(super) async fn set(
     device: &BusDevice,
     progress: &dyn Fn(Step),
 ) -> Result<(), Error> {
-    let has_axis = config.axis.is_some();
+    let has_axis = config.selection.mode.is_some();
     let outputs = &config.selection.layout.outputs;
     let is_watched = outputs.iter().any(|sm| sm.control_byte & TRIGGER != 0);
     for (register, what, value) in [

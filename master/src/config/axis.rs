@@ -2,6 +2,7 @@
 
 use ecaxis_axis::cia402::QuickStopOption;
 use ecaxis_axis::{Axis, AxisConfig, ConfigError, LimitError, Limits, Mode, Modes};
+use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_esi as esi;
 use toml::Spanned;
 
@@ -62,6 +63,9 @@ pub(crate) fn setup(
         return None;
     }
     Some(AxisSetup {
+        name: String::new(),
+        device: DeviceIndex(0),
+        number: 0,
         config,
         unit: name?,
         mode,

@@ -3,19 +3,19 @@
 
 use std::path::Path;
 
-use ecaxis_ecat::index::{DeviceIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use toml::Spanned;
 
 use super::copy::{self, OutputWriter};
-use super::device::{self, EsiFiles};
+use super::device::{self, CheckedDevice, EsiFiles};
 use super::duration::show;
 use super::fields::KeyExt;
 use super::problem::{Problems, Span};
 use super::raw::{RawBus, RawDevice, RawMachine};
 use super::sim;
-use super::steps::{self, ResolvedDevice};
+use super::steps::{self, Resolved, ResolvedAxis, ResolvedDevice};
 
-use super::{Bus, DeviceConfig, Locator, MAX_SUBDEVICES, Machine, Nic, Signal, Spin, signal};
+use super::{AxisSetup, Bus, Locator, MAX_SUBDEVICES, Machine, Nic, Signal, Spin, signal};
 
 /// Returns `None` only if a problem has been reported.
 pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Option<Machine> {
@@ -31,51 +31,59 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
     let folder = path.parent().unwrap_or(Path::new(""));
     let cycle = bus.as_ref().map(|b| (b.cycle_ns, cycle_span));
     let mut files = EsiFiles::new(folder, &raw.devices, cycle);
-    let mut names = Vec::new();
-    let mut devices: Vec<Option<DeviceConfig>> = Vec::new();
+    let mut checked = Vec::new();
     let all: Vec<String> = raw
         .devices
         .iter()
         .filter_map(|d| Some(d.name.as_ref()?.get_ref().clone()))
         .collect();
     let connections = sim::Places::of(&raw.devices);
-    let mut brakes = Vec::new();
     for (raw, at) in raw.devices.into_iter().zip(places) {
-        if let (Some(name), Some(axis)) = (&raw.name, &raw.axis)
-            && let Some(output) = &axis.brake.output
-        {
-            brakes.push((name.get_ref().clone(), output.clone()));
-        }
-        names.push((
-            raw.name.as_ref().map(|n| n.get_ref().clone()),
-            raw.axis.is_some(),
-        ));
-        devices.push(device::check(raw, at, &mut files, &all, p));
+        checked.push(device::check(raw, at, &mut files, &all, p));
     }
     // Steps use the machine's device indices, so the order is determined first.
-    let position = |device: &Option<DeviceConfig>| match device.as_ref()?.at {
+    let position = |checked: &CheckedDevice| match checked.device.as_ref()?.at {
         Locator::Position(n) => Some(n),
         _ => None,
     };
-    if devices.iter().all(|device| position(device).is_some()) {
-        devices.sort_by_key(position);
+    if checked.iter().all(|device| position(device).is_some()) {
+        checked.sort_by_key(position);
     }
-    let known: IndexVec<DeviceIndex, ResolvedDevice<'_>> = devices
+    // Without a name, a device is invalid, and nothing refers to it.
+    let named: Vec<_> = checked
         .iter()
-        .zip(&names)
-        .filter_map(|(device, (name, has_axis))| match device {
-            Some(device) => Some(ResolvedDevice::from(device)),
-            None => name.as_deref().map(|name| ResolvedDevice {
-                name,
-                axis: Err(*has_axis),
-                device: None,
-            }),
+        .filter_map(|checked| Some((checked.name.as_deref()?, checked)))
+        .collect();
+    let devices: IndexVec<DeviceIndex, ResolvedDevice<'_>> = named
+        .iter()
+        .map(|(name, checked)| ResolvedDevice {
+            name,
+            device: checked.device.as_ref(),
         })
         .collect();
+    let each = (0..).map(DeviceIndex).zip(&named);
+    let each =
+        each.flat_map(|(device, (_, checked))| checked.axes.iter().map(move |axis| (device, axis)));
+    let brakes: Vec<_> = each
+        .clone()
+        .filter_map(|(_, axis)| Some((axis.name.clone(), axis.brake_output.clone()?)))
+        .collect();
+    let axes: IndexVec<AxisIndex, ResolvedAxis<'_>> = each
+        .map(|(device, axis)| ResolvedAxis {
+            name: &axis.name,
+            device,
+            setup: axis.setup.as_ref(),
+        })
+        .collect();
+    let known = &devices;
     let cycle_s = bus.as_ref().map_or(1e-3, |b| b.cycle_ns as f64 * 1e-9);
     let repeat = raw.repeat.value().unwrap_or(1);
-    let program = steps::check(raw.steps, raw.stop, &known, folder, cycle_s, repeat, p);
-    let brakes = brake_outputs(&brakes, &known, &program.outputs, p);
+    let resolved = Resolved {
+        devices: known,
+        axes: &axes,
+    };
+    let program = steps::check(raw.steps, raw.stop, resolved, folder, cycle_s, repeat, p);
+    let brakes = brake_outputs(&brakes, known, &program.outputs, p);
     let steps = program.outputs.iter().zip(&program.output_places);
     let steps = steps.map(|(output, place)| {
         let what = format!("set by the step in line {}", p.line(place));
@@ -87,19 +95,30 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         OutputWriter::new(&brake.output, what)
     });
     let writers: Vec<_> = steps.chain(opened).collect();
-    let copies = copy::check(&raw.copies, &known, &writers, p);
-    let mut devices: IndexVec<_, DeviceConfig> = devices.into_iter().collect::<Option<_>>()?;
+    let copies = copy::check(&raw.copies, known, &writers, p);
+    let mut devices = Vec::new();
+    let mut axes = Vec::new();
+    for (index, checked) in (0..).map(DeviceIndex).zip(checked) {
+        for axis in checked.axes {
+            axes.push(AxisSetup {
+                device: index,
+                ..axis.setup?
+            });
+        }
+        devices.push(checked.device?);
+    }
     for brake in brakes {
-        let device = devices.iter_mut().find(|d| d.name == brake.axis);
-        if let Some(axis) = device.and_then(|d| d.axis.as_mut()) {
+        if let Some(axis) = axes.iter_mut().find(|axis| axis.name == brake.axis) {
             axis.brake_output = Some(brake.output);
         }
     }
+    let devices: IndexVec<_, _> = devices.into();
     connections.check(&devices, p);
     Some(Machine {
         path: path.to_owned(),
         bus: bus?,
         devices,
+        axes: axes.into(),
         steps: program.steps,
         inputs: program.inputs,
         outputs: program.outputs,
@@ -113,7 +132,6 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
 
 /// The output that releases a brake.
 struct BrakeOutput {
-    /// The name of the axis's device.
     axis: String,
     output: Signal,
     place: Span,
@@ -270,15 +288,21 @@ fn nic(name: &Spanned<String>, p: &mut Problems<'_>) -> Option<Nic> {
 }
 
 fn unique_names(devices: &[RawDevice], p: &mut Problems<'_>) {
-    for (i, device) in devices.iter().enumerate() {
-        let Some(name) = &device.name else { continue };
+    // The only axis of a device may have its name.
+    let mut names: Vec<&Spanned<String>> = Vec::new();
+    for device in devices {
+        names.extend(&device.name);
+        let axes = device.axes.0.iter().filter_map(|axis| axis.name.as_ref());
+        let of_device = device.name.as_ref().filter(|_| device.axes.0.len() == 1);
+        names.extend(
+            axes.filter(|name| of_device.is_none_or(|device| device.get_ref() != name.get_ref())),
+        );
+    }
+    for (i, name) in names.iter().enumerate() {
         if name.get_ref().trim().is_empty() {
             p.add(name.span(), "a device needs a name");
         }
-        let twin = devices[..i]
-            .iter()
-            .filter_map(|d| d.name.as_ref())
-            .find(|n| n.get_ref() == name.get_ref());
+        let twin = names[..i].iter().find(|n| n.get_ref() == name.get_ref());
         if let Some(twin) = twin {
             let message = format!("the name \"{}\" is taken", name.get_ref());
             p.add_hint(

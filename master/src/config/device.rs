@@ -6,14 +6,19 @@ use std::sync::Arc;
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use ecaxis_esi as esi;
+use ecaxis_esi::Field;
 use toml::Spanned;
 
 use super::fields::{Key, KeyExt};
 use super::problem::{Problems, Span, suggestion, unreadable};
 use super::raw::{RawDevice, RawEntry};
-use super::{DeviceConfig, Locator, Startup, axis, drive_limits, sdo, sim};
+use super::{DeviceConfig, Locator, Startup, sdo, sim};
 use crate::esi_library::{self, Library, LoadError, RevisionMatch};
 use crate::rt::config::ProcessDataCopy;
+
+mod axes;
+
+pub(crate) use axes::CheckedAxis;
 
 /// Data shared by all devices: the ESI folder, the files read so far, and the cycle.
 pub(crate) struct EsiFiles<'f> {
@@ -186,13 +191,22 @@ fn neighbours(path: &Path) -> String {
     suggestion(&word, names.iter().map(String::as_str), &what)
 }
 
+/// A device and its axes, checked. Parts that are invalid have been reported.
+pub(crate) struct CheckedDevice {
+    pub name: Option<String>,
+    pub device: Option<DeviceConfig>,
+    pub axes: Vec<CheckedAxis>,
+}
+
 pub(crate) fn check(
     mut raw: RawDevice,
     at: Option<Locator>,
     files: &mut EsiFiles<'_>,
     names: &[String],
     p: &mut Problems<'_>,
-) -> Option<DeviceConfig> {
+) -> CheckedDevice {
+    let name = raw.name.as_ref().map(|name| name.get_ref().clone());
+    let numbers = axes::numbers(&raw, p);
     let mode = mode(&raw, p);
     let file = files.file(&raw, p);
     let device = file.as_ref().and_then(|(_, file)| find(&raw, file, p));
@@ -201,6 +215,7 @@ pub(crate) fn check(
             let wanted = DeviceQuery {
                 raw: &raw,
                 mode,
+                axes: &numbers,
                 cycle_ns: *cycle_ns,
                 cycle: cycle.clone(),
             };
@@ -208,55 +223,39 @@ pub(crate) fn check(
         }
         _ => None,
     };
-    // An axis can be checked without its ESI, but less thoroughly.
-    let axis = match (&raw.axis, mode) {
-        (Some(axis), Ok(Some(mode))) => Some(axis::setup(axis, &raw.sdo, mode, chosen.as_ref(), p)),
-        _ => None,
-    };
-    if let (Some(chosen), Some(Some(homing))) = (
-        chosen.as_mut(),
-        axis.as_ref()
-            .map(|a| a.as_ref().and_then(|a| a.homing.as_ref())),
-    ) {
-        homing.add_to(&mut chosen.startup);
-    }
-    if let (Some(chosen), Some(Some(axis))) = (chosen.as_mut(), &axis) {
-        drive_limits::check(axis, &raw.sdo, chosen, p);
-        further_axes(chosen);
-    }
+    let axes = axes::check(&raw, &numbers, mode.ok().flatten(), chosen.as_mut(), p);
     if let Some(chosen) = chosen.as_mut() {
+        further_axes(chosen);
         repeated_outputs(chosen);
     }
     let sim = raw.sim.take().map(|sim| {
-        let axis = match (&raw.axis, &axis) {
-            (None, _) => Err(()),
-            (Some(_), axis) => Ok(axis.as_ref().and_then(Option::as_ref)),
+        let axis = match axes.first() {
+            None => Err(()),
+            Some(axis) => Ok(axis.setup.as_ref()),
         };
         sim::check(sim, names, device, axis, p)
     });
     let startup = Startup::of(&raw);
     let device = device.map(|d| Arc::new(d.clone()));
     let identity = identity(raw.identity.as_ref(), p);
-    let (esi_path, file) = file?;
-    Some(DeviceConfig {
-        modules_named: raw.modules.is_some(),
-        name: raw.name?.into_inner(),
-        at: at?,
-        esi_path,
-        device: device?,
-        esi: file,
-        selection: chosen?,
-        startup,
-        identity: identity?,
-        serial: raw.serial.value(),
-        axis: match axis {
-            Some(axis) => Some(axis?),
-            None if raw.axis.is_some() => return None,
-            None => None,
-        },
-        sim: sim.unwrap_or_default(),
-        line: p.line(&raw.span),
-    })
+    let device = (|| {
+        let (esi_path, file) = file?;
+        Some(DeviceConfig {
+            modules_named: raw.modules.is_some(),
+            name: raw.name?.into_inner(),
+            at: at?,
+            esi_path,
+            device: device?,
+            esi: file,
+            selection: chosen?,
+            startup,
+            identity: identity?,
+            serial: raw.serial.value(),
+            sim: sim.unwrap_or_default(),
+            line: p.line(&raw.span),
+        })
+    })();
+    CheckedDevice { name, device, axes }
 }
 
 /// Returns the outputs that repeat an object of another PDO of their device.
@@ -289,25 +288,28 @@ fn repeated_outputs(selection: &mut esi::Selection) {
 
 /// Reports which axes of a drive stay without power.
 fn further_axes(selection: &mut esi::Selection) {
-    let axes = selection.layout.rx.iter().filter_map(further_axis);
+    if selection.mode.is_none() {
+        return;
+    }
+    let axes = selection.layout.rx.iter();
+    let axes = axes.filter_map(|field| unused_axis(field, selection));
     let controlwords = axes.filter(|(_, object)| *object == 0x6040);
     let notes: Vec<String> = controlwords
-        .map(|(n, _)| {
+        .map(|(n, object)| {
             format!(
                 "axis {} of the drive (Controlword 0x{:04x}) is not used: its outputs stay zero, it gets no power",
                 n + 1,
-                0x6040 + n * 0x800
+                esi::axis::object(object, n)
             )
         })
         .collect();
     selection.notes.extend(notes);
 }
 
-/// Returns the axis number of an object of a further axis, counted from 0, and the same object of
-/// the first axis (CiA 402: 0x800 apart, eight axes).
-pub(crate) fn further_axis(field: &esi::layout::Field) -> Option<(u16, u16)> {
-    let n = field.index.checked_sub(0x6000)? / 0x800;
-    (1..8).contains(&n).then_some((n, field.index - n * 0x800))
+/// Returns the axis of an object, counted from 0, and the same object of the first axis, if the
+/// machine does not use that axis.
+pub(crate) fn unused_axis(field: &Field, selection: &esi::Selection) -> Option<(u16, u16)> {
+    esi::axis::of(field.index).filter(|(axis, _)| !selection.axes.contains(axis))
 }
 
 /// Returns the rule for revisions; the default is the ESI's own revision.
@@ -334,7 +336,7 @@ fn mode(raw: &RawDevice, p: &mut Problems<'_>) -> Result<Option<esi::Mode>, ()> 
             .map(esi::Mode::name)
     };
     let Some(text) = &raw.mode else {
-        let Some(axis) = &raw.axis else {
+        let Some(axis) = raw.axes.0.first() else {
             return Ok(None);
         };
         let message = "an axis needs a `mode` in its [[device]]";
@@ -346,7 +348,7 @@ fn mode(raw: &RawDevice, p: &mut Problems<'_>) -> Result<Option<esi::Mode>, ()> 
         return Err(());
     };
     match text.get_ref().parse::<esi::Mode>() {
-        Ok(mode) if mode.is_cyclic() && raw.axis.is_some() => Ok(Some(mode)),
+        Ok(mode) if mode.is_cyclic() && !raw.axes.0.is_empty() => Ok(Some(mode)),
         Ok(mode) if mode.is_cyclic() => {
             let message = "a device with a `mode` is a drive and needs a [device.axis]";
             p.add_hint(
@@ -429,6 +431,7 @@ fn find<'e>(
 struct DeviceQuery<'r> {
     raw: &'r RawDevice,
     mode: Option<esi::Mode>,
+    axes: &'r [u16],
     cycle_ns: u64,
     cycle: Span,
 }
@@ -459,6 +462,7 @@ impl DeviceQuery<'_> {
             .collect();
         let mut choice = esi::SelectOptions {
             mode: self.mode,
+            axes: self.axes,
             rx: rx.as_deref(),
             tx: tx.as_deref(),
             modules: &modules,
@@ -520,6 +524,13 @@ impl DeviceQuery<'_> {
         };
         let at = match e {
             E::ModeNotOffered { .. } => of(raw.mode.place()),
+            E::NoSuchAxis { number, .. } => {
+                let numbers = (1..).zip(&raw.axes.0);
+                let mut numbered =
+                    numbers.map(|(n, axis)| (axis.number.value().unwrap_or(n), axis));
+                let axis = numbered.find(|(own, _)| own == number);
+                of(axis.map(|(_, axis)| axis.span.clone()))
+            }
             E::NoSuchDcMode { .. } => of(raw.dc.place()),
             E::NoSuchModule { .. } | E::TooManyModules { .. } => of(raw.modules.place()),
             E::NoSuchAssignment { .. } => of(raw.assignment.place()),

@@ -246,13 +246,14 @@ pub(crate) fn speed_unit(selection: &esi::Selection) -> Option<VelocityUnit> {
     VelocityUnit::from_si_code(item.unit)
 }
 
-/// Checks the limits that the file's `sdo` entries and the ESI set in the drive.
+/// Checks the limits that the file's `sdo` entries and the ESI set in the drive. Returns what need
+/// not be an error.
 pub(super) fn check(
     axis: &AxisSetup,
     sdos: &[RawSdo],
-    selection: &mut esi::Selection,
+    selection: &esi::Selection,
     p: &mut Problems<'_>,
-) {
+) -> Vec<String> {
     let written = |index: u16, sub: u8| {
         let mut all = selection.startup.iter().rev();
         all.find(|sdo| (sdo.index, sdo.sub) == (index, sub))
@@ -287,5 +288,5 @@ pub(super) fn check(
             p.add_hint(own.value.span(), message, "write 0, or leave it out");
         }
     }
-    selection.notes.extend(notes);
+    notes
 }

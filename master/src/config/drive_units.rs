@@ -4,7 +4,7 @@
 use ecaxis_axis::homing::ParameterError;
 use ecaxis_axis::scale::{DriveUnits, UnitMismatch, same_motor};
 use ecaxis_axis::{AccelerationUnit, Axis, ConfigError, Mode, Scale, VelocityUnit};
-use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_ecat::index::AxisIndex;
 use ecaxis_esi as esi;
 
 use super::{Action, AxisSetup, HomingSetup, Machine, Step, TorqueSetup, TorqueUnit, UnitSource};
@@ -72,7 +72,7 @@ impl AxisSetup {
         if let Some(homing) = &mut setup.homing {
             let config = &setup.config;
             match homing.homing.check(&config.scale, &config.limits) {
-                Ok(()) => homing.rescale(&config.scale),
+                Ok(()) => homing.rescale(&config.scale, setup.number),
                 Err(source) => adopted.wrong.push(UnitProblem::Homing { unit, source }),
             }
         }
@@ -242,11 +242,12 @@ impl AdoptedUnits {
 
 impl HomingSetup {
     /// Converts the SDOs' values to the drive's units.
-    fn rescale(&mut self, scale: &Scale) {
+    fn rescale(&mut self, scale: &Scale, axis: u16) {
         // An axis has only one of the two object sets.
         for maxon in [false, true] {
             for object in self.homing.objects(scale, maxon) {
-                let place = (object.index, object.subindex);
+                let index = esi::axis::object(object.index, axis);
+                let place = (index, object.subindex);
                 let bytes = object.value.to_le_bytes();
                 let same = self.startup.iter_mut().find(|s| (s.index, s.sub) == place);
                 if let Some(sdo) = same {
@@ -276,9 +277,13 @@ impl AdoptedUnits {
 
 impl Machine {
     /// Applies the drive's units to an axis and to its steps.
-    pub(crate) fn adopt(&mut self, device: DeviceIndex, adopted: &AdoptedUnits) {
-        scale_torques(&mut self.steps, device, adopted.torque_factor);
-        let Some(config) = self.devices.get_mut(device) else {
+    pub(crate) fn adopt(&mut self, axis: AxisIndex, adopted: &AdoptedUnits) {
+        scale_torques(&mut self.steps, axis, adopted.torque_factor);
+        let Some(setup) = self.axes.get_mut(axis) else {
+            return;
+        };
+        setup.clone_from(&adopted.setup);
+        let Some(config) = self.devices.get_mut(setup.device) else {
             return;
         };
         for sdo in adopted.changed(&config.selection.startup) {
@@ -287,21 +292,20 @@ impl Machine {
                 old.data.clone_from(&sdo.data);
             }
         }
-        config.axis = Some(adopted.setup.clone());
     }
 }
 
-fn scale_torques(steps: &mut [Step], device: DeviceIndex, factor: f64) {
+fn scale_torques(steps: &mut [Step], axis: AxisIndex, factor: f64) {
     for step in steps {
         match &mut step.action {
             Action::Torque { targets, .. } => {
-                for (axis, percent) in targets {
-                    if *axis == device {
+                for (target, percent) in targets {
+                    if *target == axis {
                         *percent *= factor;
                     }
                 }
             }
-            Action::Repeat { steps, .. } => scale_torques(steps, device, factor),
+            Action::Repeat { steps, .. } => scale_torques(steps, axis, factor),
             _ => {}
         }
     }

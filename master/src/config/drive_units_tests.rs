@@ -1,16 +1,13 @@
 use super::super::tests::{GOOD, with_esi};
 use super::*;
-use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 
 const MILLI_RPM: u32 = 0xfdb4_4700;
 const RPM: u32 = 0x00b4_4700;
 
 fn axis(keys: &str) -> AxisSetup {
     let text = GOOD.replace("unit = \"mm\"", keys);
-    with_esi(&text).unwrap().devices[DeviceIndex(0)]
-        .axis
-        .clone()
-        .unwrap()
+    with_esi(&text).unwrap().axes[AxisIndex(0)].clone()
 }
 
 fn offered() -> DriveUnits {
@@ -103,7 +100,7 @@ fn adopt_keeps_torques_in_nm() {
 fn adopt_rescales_program_and_homing() {
     let mut machine = with_esi(GOOD).unwrap();
     let torque = |targets: &[(usize, f64)]| Action::Torque {
-        targets: targets.iter().map(|&(n, x)| (DeviceIndex(n), x)).collect(),
+        targets: targets.iter().map(|&(n, x)| (AxisIndex(n), x)).collect(),
         ramp_ns: 0,
     };
     let step = |action| Step {
@@ -123,7 +120,7 @@ fn adopt_rescales_program_and_homing() {
         acceleration: Some(50.0),
         ..ecaxis_axis::Homing::by(37)
     };
-    let setup = machine.devices[DeviceIndex(0)].axis.as_mut().unwrap();
+    let setup = &mut machine.axes[AxisIndex(0)];
     let sdo = |(index, sub, value): (u16, u8, u32)| esi::StartupSdo {
         transition: "PS",
         index,
@@ -145,7 +142,7 @@ fn adopt_rescales_program_and_homing() {
         .selection
         .startup
         .extend(startup);
-    let setup = machine.devices[DeviceIndex(0)].axis.clone().unwrap();
+    let setup = machine.axes[AxisIndex(0)].clone();
     let mut adopted = setup.adopt(&DriveUnits {
         velocity_unit: Some(RPM),
         acceleration_unit: Some(0x00c0_0300),
@@ -158,7 +155,7 @@ fn adopt_rescales_program_and_homing() {
     let rpm = |n: u32| n.to_le_bytes().to_vec();
     assert_eq!(values, [(0x6099, rpm(60)), (0x609a, rpm(600))]);
     adopted.torque_factor = 0.25;
-    machine.adopt(DeviceIndex(0), &adopted);
+    machine.adopt(AxisIndex(0), &adopted);
     assert!(
         adopted
             .changed(&machine.devices[DeviceIndex(0)].selection.startup)

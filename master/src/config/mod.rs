@@ -56,7 +56,7 @@ mod units;
 
 pub(crate) use axis::is_maxon;
 pub use copy::{BitRange, CopySetup};
-pub(crate) use device::further_axis;
+pub(crate) use device::unused_axis;
 pub use drive_limits::LimitConflict;
 pub use drive_units::{AdoptedUnits, UnitProblem};
 pub use problem::{ConfigError, Problem, nearest};
@@ -64,7 +64,7 @@ pub use program::{Action, Step, StopGroup, StopSetup, TableFile};
 pub use signal::{NameError, Signal};
 pub use startup::{Startup, StartupOptions};
 
-use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 use ecaxis_esi as esi;
 
 use fields::Read;
@@ -89,6 +89,8 @@ pub struct Machine {
     pub bus: Bus,
     /// The devices, in bus order if every device is located by position, otherwise in file order.
     pub devices: IndexVec<DeviceIndex, DeviceConfig>,
+    /// The axes, device by device.
+    pub axes: IndexVec<AxisIndex, AxisSetup>,
     pub steps: Vec<Step>,
     /// The signals that the steps read; `outputs` are those they set.
     pub inputs: Vec<Signal>,
@@ -227,7 +229,6 @@ pub struct DeviceConfig {
     pub identity: RevisionMatch,
     /// The required serial number.
     pub serial: Option<u32>,
-    pub axis: Option<AxisSetup>,
     pub sim: sim::SimSetup,
     /// The line of its `[[device]]` in the machine file.
     pub line: u32,
@@ -263,6 +264,11 @@ impl fmt::Display for Locator {
 
 #[derive(Debug, Clone, PartialEq)]
 pub struct AxisSetup {
+    /// The name in the machine file.
+    pub name: String,
+    pub device: DeviceIndex,
+    /// The number of the axis in its drive, from 0.
+    pub number: u16,
     pub config: ecaxis_axis::AxisConfig,
     /// The user's name for the position unit, for example `mm`.
     pub unit: String,
@@ -369,6 +375,12 @@ impl Machine {
         named.map_or("", |group| &group.name)
     }
 
+    /// Returns the axes of a device.
+    pub fn axes_of(&self, device: DeviceIndex) -> impl Iterator<Item = (AxisIndex, &AxisSetup)> {
+        let all = self.axes.enumerate();
+        all.filter(move |(_, axis)| axis.device == device)
+    }
+
     /// Returns the group of a device. The first group has no name; the others are those of
     /// [`StopSetup::groups`].
     #[must_use]
@@ -376,6 +388,13 @@ impl Machine {
         let mut groups = self.stop.groups.iter();
         let named = groups.position(|group| group.devices.contains(&device));
         named.map_or(GroupIndex::MACHINE, |index| GroupIndex(index + 1))
+    }
+
+    /// Returns the group of an axis: that of its device.
+    #[must_use]
+    pub fn group_of_axis(&self, axis: AxisIndex) -> GroupIndex {
+        let axis = self.axes.get(axis);
+        axis.map_or(GroupIndex::MACHINE, |axis| self.group_of(axis.device))
     }
 
     /// Returns the time-out of the way to PreOp. ethercrab has one for all devices: the longest.

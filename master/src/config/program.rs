@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use ecaxis_axis::{Edge, StopMethod};
-use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 
 use super::{Condition, GroupStopScope, Machine, OutputRef, duration};
 use crate::text::rounded;
@@ -18,34 +18,34 @@ pub struct Step {
     pub action: Action,
 }
 
-/// The action of a step. An axis is named by its device. Targets are pairs of a device and a value
+/// The action of a step. Targets are pairs of an axis and a value
 /// in user units.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Action {
     Enable {
-        axes: Vec<DeviceIndex>,
+        axes: Vec<AxisIndex>,
     },
     /// Decelerate, then remove power.
     Disable {
-        axes: Vec<DeviceIndex>,
+        axes: Vec<AxisIndex>,
     },
     /// Acknowledge trips and reset drive faults.
     Reset {
-        axes: Vec<DeviceIndex>,
+        axes: Vec<AxisIndex>,
     },
     /// Homing by the drive.
     Home {
-        axes: Vec<DeviceIndex>,
+        axes: Vec<AxisIndex>,
     },
     /// Decelerate and hold position.
     Stop {
-        axes: Vec<DeviceIndex>,
+        axes: Vec<AxisIndex>,
     },
     /// Move and wait until every axis is in target.
     Move {
         /// `true` if targets are relative to the position at the start of the step.
         relative: bool,
-        targets: Vec<(DeviceIndex, f64)>,
+        targets: Vec<(AxisIndex, f64)>,
         /// The fraction of each axis's velocity limit.
         speed: f64,
         /// The fraction of each axis's acceleration limit.
@@ -55,7 +55,7 @@ pub enum Action {
     },
     /// Move until the touch probe's input has an edge. The step fails without an edge.
     Probe {
-        axis: DeviceIndex,
+        axis: AxisIndex,
         probe: ecaxis_axis::Probe,
         edge: Edge,
         /// `true` if the end of the move is relative to the present position.
@@ -68,7 +68,7 @@ pub enum Action {
     /// Move all axes along a straight line, jerk-limited; they arrive in the same cycle.
     Line {
         relative: bool,
-        targets: Vec<(DeviceIndex, f64)>,
+        targets: Vec<(AxisIndex, f64)>,
         /// The fraction of each axis's velocity limit.
         speed: f64,
         /// The fraction of each axis's acceleration and jerk limits.
@@ -76,12 +76,12 @@ pub enum Action {
     },
     /// Move in a wave around the present position.
     Wave {
-        axis: DeviceIndex,
+        axis: AxisIndex,
         wave: ecaxis_axis::setpoint::Wave,
     },
     /// Move to the table's first position, then play the table.
     Table {
-        axis: DeviceIndex,
+        axis: AxisIndex,
         /// The index into [`Machine::tables`].
         table: usize,
         /// The fractions for the move to the first position, as in [`Action::Move`].
@@ -90,8 +90,8 @@ pub enum Action {
     },
     /// Make one axis follow another until its next motion.
     Gear {
-        axis: DeviceIndex,
-        master: DeviceIndex,
+        axis: AxisIndex,
+        master: AxisIndex,
         /// `true` to follow the master's actual position instead of its set-point.
         actual: bool,
         /// The number of follower units per master unit.
@@ -102,19 +102,19 @@ pub enum Action {
     },
     /// Reach the velocities and keep moving.
     Velocity {
-        targets: Vec<(DeviceIndex, f64)>,
+        targets: Vec<(AxisIndex, f64)>,
         /// The fraction of each axis's acceleration limit.
         ramp: f64,
     },
     /// Apply torques in percent of rated torque.
     Torque {
-        targets: Vec<(DeviceIndex, f64)>,
+        targets: Vec<(AxisIndex, f64)>,
         /// The time of the ramp to the new torque.
         ramp_ns: u64,
     },
     /// Switch modes of operation, even in motion.
     Mode {
-        targets: Vec<(DeviceIndex, ecaxis_axis::Mode)>,
+        targets: Vec<(AxisIndex, ecaxis_axis::Mode)>,
     },
     Dwell {
         ns: u64,
@@ -277,7 +277,7 @@ impl Machine {
             ),
             Action::Mode { targets } => {
                 let each = targets.iter().filter_map(|(axis, mode)| {
-                    Some(format!("{} to {mode}", self.devices.get(*axis)?.name))
+                    Some(format!("{} to {mode}", self.axes.get(*axis)?.name))
                 });
                 format!("switch {}", each.collect::<Vec<_>>().join(", "))
             }
@@ -321,24 +321,23 @@ impl Machine {
         format!("{name} {}", bounds.collect::<Vec<_>>().join(" and "))
     }
 
-    fn names(&self, axes: &[DeviceIndex]) -> String {
-        let names = axes.iter().filter_map(|&axis| self.devices.get(axis));
+    fn names(&self, axes: &[AxisIndex]) -> String {
+        let names = axes.iter().filter_map(|&axis| self.axes.get(axis));
         names
-            .map(|d| d.name.as_str())
+            .map(|axis| axis.name.as_str())
             .collect::<Vec<_>>()
             .join(", ")
     }
 
-    fn targets(&self, targets: &[(DeviceIndex, f64)], arrow: &str, suffix: &str) -> String {
+    fn targets(&self, targets: &[(AxisIndex, f64)], arrow: &str, suffix: &str) -> String {
         let each = targets.iter().filter_map(|&(index, target)| {
-            let device = self.devices.get(index)?;
-            let axis = device.axis.as_ref()?;
+            let axis = self.axes.get(index)?;
             if suffix == TORQUE {
                 let (torque, unit) = (short(axis.torque.shown(target)), axis.torque.unit);
-                return Some(format!("{} {arrow} {torque} {unit}", device.name));
+                return Some(format!("{} {arrow} {torque} {unit}", axis.name));
             }
             let unit = &axis.unit;
-            Some(format!("{} {arrow} {target} {unit}{suffix}", device.name))
+            Some(format!("{} {arrow} {target} {unit}{suffix}", axis.name))
         });
         each.collect::<Vec<_>>().join(", ")
     }

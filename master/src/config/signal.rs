@@ -10,7 +10,7 @@ use super::copy::bits_of;
 use super::problem::{Problems, suggestion};
 use super::raw::RawSignal;
 use super::steps::ResolvedDevice;
-use super::{AxisRef, DeviceConfig, InputRef, Machine, OutputRef, further_axis};
+use super::{AxisRef, DeviceConfig, InputRef, Machine, OutputRef};
 use crate::rt::image::NumericFormat;
 
 /// Process data that the program reads or sets.
@@ -286,15 +286,17 @@ pub(super) fn field<'d>(
 
 /// Returns why only the axis of a device may write an output.
 pub(super) fn reserved_for_axis(field: &Field, device: &DeviceConfig) -> Option<&'static str> {
-    device.axis.as_ref()?;
-    match further_axis(field) {
-        Some((_, same)) if AXIS_OUTPUTS.contains(&same) || same == POSITION_OFFSET => {
-            Some("belongs to an axis of the drive that is not used")
-        }
-        Some(_) => None,
-        None if field.index == POSITION_OFFSET => Some("adds to the axis' target, past its limits"),
-        None if AXIS_OUTPUTS.contains(&field.index) => Some("is written by the axis itself"),
-        None => None,
+    device.selection.mode?;
+    let (axis, same) = esi::axis::of(field.index)?;
+    let is_used = device.selection.axes.contains(&axis);
+    if same != POSITION_OFFSET && !AXIS_OUTPUTS.contains(&same) {
+        None
+    } else if !is_used {
+        Some("belongs to an axis of the drive that is not used")
+    } else if same == POSITION_OFFSET {
+        Some("adds to the axis' target, past its limits")
+    } else {
+        Some("is written by the axis itself")
     }
 }
 
@@ -331,13 +333,12 @@ fn one(
 
 /// Names that a controller resolves before the machine runs.
 impl Machine {
-    /// Returns the axis of the device with this name.
+    /// Returns the axis with this name.
     ///
     /// # Errors
-    /// Fails if no device has the name, or if the device has no axis.
+    /// Fails if no axis has the name.
     pub fn axis(&self, name: &str) -> Result<AxisRef, NameError> {
-        let axes = self.devices.iter().filter(|d| d.axis.is_some());
-        let names = axes.map(|d| d.name.as_str());
+        let names = self.axes.iter().map(|axis| axis.name.as_str());
         let at = place(name, names.clone()).map_err(|error| NameError {
             message: format!("no axis is named `{name}`"),
             hint: suggestion(name, names, "axes"),
@@ -363,11 +364,8 @@ impl Machine {
     /// it releases a brake.
     pub fn output(&mut self, device: &str, name: &str) -> Result<OutputRef, NameError> {
         let signal = self.signal(device, name, SignalDirection::Out)?;
-        let brakes = |axis: &&DeviceConfig| {
-            let setup = axis.axis.as_ref();
-            setup.is_some_and(|setup| setup.brake_output.as_ref() == Some(&signal))
-        };
-        if let Some(axis) = self.devices.iter().find(brakes) {
+        let mut axes = self.axes.iter();
+        if let Some(axis) = axes.find(|axis| axis.brake_output.as_ref() == Some(&signal)) {
             return Err(NameError {
                 message: format!("`{}` opens the brake of `{}`", signal.name, axis.name),
                 hint: "the axis opens and closes its brake".to_owned(),

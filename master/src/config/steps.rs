@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use ecaxis_ecat::index::{DeviceIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use toml::Spanned;
 
 mod follow;
@@ -34,23 +34,26 @@ const WAIT_NS: u64 = 10_000_000_000;
 /// The maximum number of steps in a program, including those inside repetitions.
 const MOST_STEPS: usize = 10_000;
 
-/// What steps know about a device, which may be invalid itself.
+/// What steps know about a device; `None`: it is invalid and has been reported.
 #[derive(Clone, Copy)]
 pub(crate) struct ResolvedDevice<'c> {
     pub name: &'c str,
-    /// `Err(false)`: it has no axis; `Err(true)`: its axis is invalid and has been reported.
-    pub axis: Result<&'c AxisSetup, bool>,
     pub device: Option<&'c DeviceConfig>,
 }
 
-impl<'c> From<&'c DeviceConfig> for ResolvedDevice<'c> {
-    fn from(device: &'c DeviceConfig) -> Self {
-        Self {
-            name: &device.name,
-            axis: device.axis.as_ref().ok_or(false),
-            device: Some(device),
-        }
-    }
+/// What steps know about an axis; `None`: it is invalid and has been reported.
+#[derive(Clone, Copy)]
+pub(crate) struct ResolvedAxis<'c> {
+    pub name: &'c str,
+    pub device: DeviceIndex,
+    pub setup: Option<&'c AxisSetup>,
+}
+
+/// The devices and axes of the machine.
+#[derive(Clone, Copy)]
+pub(crate) struct Resolved<'c> {
+    pub devices: &'c IndexVec<DeviceIndex, ResolvedDevice<'c>>,
+    pub axes: &'c IndexVec<AxisIndex, ResolvedAxis<'c>>,
 }
 
 /// The steps with their signals.
@@ -69,7 +72,7 @@ pub(crate) struct Program {
 pub(crate) fn check(
     steps: Vec<RawStep>,
     stop: RawStop,
-    devices: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
+    known: Resolved<'_>,
     folder: &Path,
     cycle_s: f64,
     repeat: u32,
@@ -77,7 +80,8 @@ pub(crate) fn check(
 ) -> Program {
     let before = p.count();
     let mut checker = ProgramChecker {
-        devices,
+        devices: known.devices,
+        axes: known.axes,
         folder,
         cycle_s,
         tables: Vec::new(),
@@ -107,6 +111,7 @@ pub(crate) fn check(
 
 struct ProgramChecker<'c> {
     devices: &'c IndexVec<DeviceIndex, ResolvedDevice<'c>>,
+    axes: &'c IndexVec<AxisIndex, ResolvedAxis<'c>>,
     folder: &'c Path,
     cycle_s: f64,
     tables: Vec<TableFile>,
@@ -115,11 +120,11 @@ struct ProgramChecker<'c> {
     output_places: Vec<Span>,
     count: usize,
     /// The modes to which previous steps have switched.
-    switched: Vec<(DeviceIndex, Mode)>,
+    switched: Vec<(AxisIndex, Mode)>,
     /// The number of the step being checked.
     number: String,
     /// The places of steps, and of axes named in them.
-    places: RefCell<BTreeMap<(String, Option<DeviceIndex>), Span>>,
+    places: RefCell<BTreeMap<(String, Option<AxisIndex>), Span>>,
 }
 
 impl ProgramChecker<'_> {
@@ -226,7 +231,7 @@ impl ProgramChecker<'_> {
             },
             RawAction::Mode(named) => {
                 let count = named.len();
-                let mut targets: Vec<(DeviceIndex, Mode)> = named
+                let mut targets: Vec<(AxisIndex, Mode)> = named
                     .into_iter()
                     .filter_map(|(name, mode)| self.mode(&name, &mode, p))
                     .collect();
@@ -264,21 +269,20 @@ impl ProgramChecker<'_> {
     }
 
     /// Returns `true` if `so` holds in any mode that the axis has in the program.
-    fn any_mode(&self, index: DeviceIndex, so: impl Fn(Mode) -> bool) -> bool {
-        let own = self.devices[index].axis.ok().map(|axis| axis.config.mode);
+    fn any_mode(&self, index: AxisIndex, so: impl Fn(Mode) -> bool) -> bool {
+        let own = self.axes[index].setup.map(|axis| axis.config.mode);
         let switched = self.switched.iter().filter(|(axis, _)| *axis == index);
         switched.map(|(_, mode)| *mode).chain(own).any(so)
     }
 
     /// Returns the named axes of the machine; `None`: all.
-    fn axes(&self, names: RawAxes, p: &mut Problems<'_>) -> Option<Vec<DeviceIndex>> {
+    fn axes(&self, names: RawAxes, p: &mut Problems<'_>) -> Option<Vec<AxisIndex>> {
         let Some(names) = names else {
-            let axes = self.devices.enumerate();
-            return Some(
-                axes.filter(|(_, d)| d.axis.is_ok())
-                    .map(|(index, _)| index)
-                    .collect(),
-            );
+            let axes = self
+                .axes
+                .enumerate()
+                .filter(|(_, axis)| axis.setup.is_some());
+            return Some(axes.map(|(index, _)| index).collect());
         };
         let count = names.len();
         let axes: Vec<_> = names
@@ -297,26 +301,37 @@ impl ProgramChecker<'_> {
         &self,
         name: &Spanned<String>,
         p: &mut Problems<'_>,
-    ) -> Option<(DeviceIndex, &AxisSetup)> {
-        let Some(index) = self.device(name) else {
-            let axes = self.devices.iter().filter(|d| d.axis != Err(false));
-            let hint = suggestion(name.get_ref(), axes.map(|d| d.name), "axes");
-            let message = format!("no device is named `{}`", name.get_ref());
+    ) -> Option<(AxisIndex, &AxisSetup)> {
+        let Some(index) = self.axis_named(name) else {
+            let (message, hint) = self.no_axis(name.get_ref());
             p.add_hint(name.span(), message, hint);
             return None;
         };
         let place = (self.number.clone(), Some(index));
         self.places.borrow_mut().insert(place, name.span());
-        match self.devices[index].axis {
-            Ok(axis) => Some((index, axis)),
-            Err(true) => None,
-            Err(false) => {
-                let message = format!("`{}` has no axis to move", name.get_ref());
-                let hint = "give it a [device.axis], or leave it out here";
-                p.add_hint(name.span(), message, hint);
-                None
-            }
+        Some((index, self.axes[index].setup?))
+    }
+
+    fn axis_named(&self, name: &Spanned<String>) -> Option<AxisIndex> {
+        let mut all = self.axes.enumerate();
+        all.find_map(|(index, axis)| (axis.name == name.get_ref()).then_some(index))
+    }
+
+    /// Returns why a name is not that of an axis.
+    fn no_axis(&self, name: &str) -> (String, String) {
+        let device = self.devices.enumerate().find(|(_, d)| d.name == name);
+        let Some((device, _)) = device else {
+            let hint = suggestion(name, self.axes.iter().map(|axis| axis.name), "axes");
+            return (format!("no device is named `{name}`"), hint);
+        };
+        let own = self.axes.iter().filter(|axis| axis.device == device);
+        let own: Vec<_> = own.map(|axis| format!("`{}`", axis.name)).collect();
+        if own.is_empty() {
+            let hint = "give it a [device.axis], or leave it out here";
+            return (format!("`{name}` has no axis to move"), hint.to_owned());
         }
+        let message = format!("`{name}` has several axes");
+        (message, format!("name one of them: {}", own.join(", ")))
     }
 
     fn condition(&mut self, raw: &RawCondition, p: &mut Problems<'_>) -> Option<Condition> {

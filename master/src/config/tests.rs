@@ -2,7 +2,7 @@ mod mistakes;
 
 use std::path::PathBuf;
 
-use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 
 use super::*;
 
@@ -139,7 +139,7 @@ fn config_parses_a_good_file() {
         ("x", Locator::Position(0), 7)
     );
     assert!(Arc::ptr_eq(&x.esi, &machine.devices[DeviceIndex(1)].esi));
-    let axis = x.axis.as_ref().unwrap();
+    let axis = &machine.axes[AxisIndex(0)];
     assert_eq!((axis.unit.as_str(), axis.mode), ("mm", esi::Mode::Csp));
     assert_eq!(
         axis.config.scale.velocity_unit(),
@@ -151,29 +151,20 @@ fn config_parses_a_good_file() {
         (user.index, user.data.as_slice()),
         (0x6065, [0xc4, 9, 0, 0].as_slice())
     );
-    assert_eq!(
-        machine.devices[DeviceIndex(1)]
-            .axis
-            .as_ref()
-            .unwrap()
-            .config
-            .limits
-            .torque,
-        100.0
-    );
+    assert_eq!(machine.axes[AxisIndex(1)].config.limits.torque, 100.0);
     let steps: Vec<_> = machine.steps.iter().map(|s| s.action.clone()).collect();
     assert_eq!(
         steps,
         [
             Action::Move {
                 relative: false,
-                targets: vec![(DeviceIndex(0), 50.0)],
+                targets: vec![(AxisIndex(0), 50.0)],
                 speed: 0.5,
                 ramp: 0.3,
                 together: false,
             },
             Action::Velocity {
-                targets: vec![(DeviceIndex(1), 25.0)],
+                targets: vec![(AxisIndex(1), 25.0)],
                 ramp: 1.0
             },
             Action::Dwell { ns: 500_000_000 },
@@ -187,15 +178,9 @@ fn config_parses_a_good_file() {
 fn axis_accepts_custom_units_and_records_the_velocity_unit_source() {
     for (text, shown) in [("custom:slots", "slots"), ("μm", "µm"), ("°", "°")] {
         let machine = with_esi(&GOOD.replace("\"mm\"", &format!("\"{text}\""))).unwrap();
-        assert_eq!(
-            machine.devices[DeviceIndex(0)].axis.as_ref().unwrap().unit,
-            shown
-        );
+        assert_eq!(machine.axes[AxisIndex(0)].unit, shown);
     }
-    let from = |text: &str| {
-        let axis = with_esi(text).unwrap().devices[DeviceIndex(0)].axis.clone();
-        axis.unwrap().velocity_unit_from
-    };
+    let from = |text: &str| with_esi(text).unwrap().axes[AxisIndex(0)].velocity_unit_from;
     assert_eq!(from(GOOD), UnitSource::Esi);
     let said = GOOD.replace("unit = \"mm\"", "unit = \"mm\"\nvelocity_unit = \"rpm\"");
     assert_eq!(from(&said), UnitSource::File);
@@ -213,10 +198,7 @@ fn axis_scale_uses_gear_feed_and_modulo() {
             "[device.axis]\nencoder",
             &format!("[device.axis]\n{keys}\nencoder"),
         );
-        with_esi(&text).unwrap().devices[DeviceIndex(1)]
-            .axis
-            .clone()
-            .unwrap()
+        with_esi(&text).unwrap().axes[AxisIndex(1)].clone()
     };
     for (keys, per_turn) in [
         ("gear = [3, 1]", 1.0 / 3.0),
@@ -241,10 +223,7 @@ fn axis_converts_torques_in_nm_and_a() {
             &format!("{keys}\nsupervise = {{ torque = 0.05 }}"),
         );
         let text = text.replace("torque = 100.0", "torque = 0.1");
-        with_esi(&text).unwrap().devices[DeviceIndex(0)]
-            .axis
-            .clone()
-            .unwrap()
+        with_esi(&text).unwrap().axes[AxisIndex(0)].clone()
     };
     for (keys, limit, supervised, from) in [
         // This vendor's 0x6076 counts mNm.
@@ -300,7 +279,7 @@ fn devices_are_sorted_and_steps_keep_their_axes() {
         machine.steps[0].action,
         Action::Move {
             relative: false,
-            targets: vec![(DeviceIndex(1), 50.0)],
+            targets: vec![(AxisIndex(1), 50.0)],
             speed: 0.5,
             ramp: 0.3,
             together: false,

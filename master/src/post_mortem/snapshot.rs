@@ -164,19 +164,24 @@ pub async fn retry_absent(wire: &DatagramClient, stations: &[u16], looks: &mut [
 /// Reads objects of one drive.
 pub async fn read_objects(
     mailbox: &DeviceMailbox,
+    axis: u16,
     ask: ObjectSelection,
     look: &mut DeviceSnapshot,
 ) {
+    let object = |index| ecaxis_esi::axis::object(index, axis);
     if ask.error_code
         && let Some(Ok(bytes)) =
-            clock::timeout(MAILBOX_TIMEOUT, mailbox.upload(ERROR_CODE, 0)).await
+            clock::timeout(MAILBOX_TIMEOUT, mailbox.upload(object(ERROR_CODE), 0)).await
         && let [low, high] = *bytes
     {
         look.error_code = Some(u16::from_le_bytes([low, high]));
     }
     if ask.interpolation
-        && let Some(Ok(value)) =
-            clock::timeout(MAILBOX_TIMEOUT, mailbox.upload(INTERPOLATION_TIME, 1)).await
+        && let Some(Ok(value)) = clock::timeout(
+            MAILBOX_TIMEOUT,
+            mailbox.upload(object(INTERPOLATION_TIME), 1),
+        )
+        .await
         && let Some(Ok(index)) =
             clock::timeout(MAILBOX_TIMEOUT, mailbox.upload(INTERPOLATION_TIME, 2)).await
         && let (&[value], &[index]) = (&*value, &*index)

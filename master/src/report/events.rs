@@ -65,11 +65,8 @@ fn describe_note(note: &LogEntryKind, machine: &Machine) -> String {
 
 fn describe_event(event: Event, machine: &Machine) -> String {
     let axis = |axis: AxisIndex| {
-        let mut axes = machine
-            .devices
-            .iter()
-            .filter(|device| device.axis.is_some());
-        axes.nth(axis.0).map_or("?", |device| device.name.as_str())
+        let axis = machine.axes.get(axis);
+        axis.map_or("?", |axis| axis.name.as_str())
     };
     match event {
         Event::Refused {

@@ -4,7 +4,6 @@ use std::sync::Arc;
 
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{Mode, State};
-use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use serde::Serialize;
 
 use super::{EmergencyReport, Error};
@@ -146,20 +145,15 @@ pub struct AxisLine {
 
 impl Status {
     #[must_use]
-    pub fn new(
-        machine: &Machine,
-        axes: &IndexVec<AxisIndex, DeviceIndex>,
-        snapshot: &Snapshot,
-    ) -> Self {
-        let axes = axes
+    pub fn new(machine: &Machine, snapshot: &Snapshot) -> Self {
+        let axes = machine
+            .axes
             .iter()
             .zip(&snapshot.axes)
-            .filter_map(|(&device, status)| {
-                let device = machine.devices.get(device)?;
-                let setup = device.axis.as_ref()?;
+            .map(|(setup, status)| {
                 let place = setup.config.scale.place(UserUnits(status.position));
-                Some(AxisLine {
-                    name: device.name.clone(),
+                AxisLine {
+                    name: setup.name.clone(),
                     unit: setup.unit.clone(),
                     mode: status.mode,
                     state: status.state,
@@ -167,7 +161,7 @@ impl Status {
                     velocity: status.velocity,
                     torque: setup.torque.shown(status.torque),
                     torque_unit: setup.torque.unit,
-                })
+                }
             })
             .collect();
         Self {

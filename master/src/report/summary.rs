@@ -205,20 +205,17 @@ impl Summary {
         stats: &Stats,
         aside: SummaryInputs,
     ) -> Self {
-        let setups = machine
-            .devices
-            .iter()
-            .filter_map(|d| Some((d, d.axis.as_ref()?)));
+        let setups = machine.axes.iter();
         let axes = setups
             .zip(axes)
-            .map(|((device, setup), slot)| {
+            .map(|(setup, slot)| {
                 let now = slot.axis.status();
                 let last = slot.last_enabled.unwrap_or(now);
                 let scale = &setup.config.scale;
                 let turns = scale.modulo().is_some();
                 let place = |position| turns.then(|| scale.place(UserUnits(position)).0);
                 AxisSummary {
-                    name: device.name.clone(),
+                    name: setup.name.clone(),
                     unit: setup.unit.clone(),
                     mode: name_of(last.mode),
                     was_enabled: slot.last_enabled.is_some(),

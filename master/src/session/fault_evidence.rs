@@ -162,16 +162,13 @@ pub(super) fn of_run(
     let mut fault_report = build_report(machine, options, error, &evidence);
     fault_report.stop = Stop::of(&evidence, left.started);
     fault_report.events = left.events.to_vec();
-    let setups = machine
-        .devices
-        .iter()
-        .filter_map(|device| Some((device, device.axis.as_ref()?)));
+    let setups = machine.axes.iter();
     fault_report.axes = setups
         .zip(left.axes)
-        .map(|((device, setup), slot)| {
+        .map(|(setup, slot)| {
             let status = slot.axis.status();
             AxisSection {
-                name: device.name.clone(),
+                name: setup.name.clone(),
                 unit: setup.unit.clone(),
                 state: status.state.to_string(),
                 fault: status.fault.map(|fault| fault.to_string()),

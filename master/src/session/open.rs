@@ -7,8 +7,8 @@ use ecaxis_esi::sii::{self, SiiOptions};
 use ecaxis_esi::{Device, Slots};
 
 use ecaxis_sim::{
-    DeviceOptions, FaultScript, FirmwareOptions, SecondPort, Segment, SegmentOptions, SimDevice,
-    Topology,
+    DeviceOptions, FaultScript, FirmwareOptions, PlantParams, SecondPort, Segment, SegmentOptions,
+    SimDevice, Topology,
 };
 
 use super::{Cause, Error, Options};
@@ -102,7 +102,7 @@ pub fn simulated_bus(
     let topology = topology(machine, ring)?;
     let mut devices = Vec::with_capacity(machine.devices.len());
     for device in bus_order(&machine.devices) {
-        devices.push(sim_device(device, devices.len(), seed)?);
+        devices.push(sim_device(machine, device, devices.len(), seed)?);
     }
     let options = SegmentOptions {
         seed,
@@ -180,7 +180,12 @@ fn with_configured_modules(device: &DeviceConfig) -> Cow<'_, Device> {
     Cow::Owned(hardware)
 }
 
-fn sim_device(device: &DeviceConfig, position: usize, seed: u64) -> Result<SimDevice, Error> {
+fn sim_device(
+    machine: &Machine,
+    device: &DeviceConfig,
+    position: usize,
+    seed: u64,
+) -> Result<SimDevice, Error> {
     let place = u32::try_from(position).unwrap_or(0);
     let mut options = DeviceOptions {
         serial: device.serial.unwrap_or(1000 + place),
@@ -199,12 +204,22 @@ fn sim_device(device: &DeviceConfig, position: usize, seed: u64) -> Result<SimDe
         Locator::Position(_) => {}
         Locator::Alias(alias) | Locator::Id(alias) => options.alias = alias,
     }
-    if let Some(axis) = &device.axis {
+    let mut plants = vec![PlantParams::default()];
+    for axis in machine.axes.iter() {
+        if machine.devices[axis.device].name != device.name {
+            continue;
+        }
+        let number = usize::from(axis.number);
+        plants.resize(plants.len().max(number + 1), PlantParams::default());
         // The configuration check ensures a positive value that fits.
-        options.plant.counts_per_turn = axis.config.scale.counts_per_turn().round() as u32;
-        options.plant.initial_position = device.sim.track.start;
-        options.plant.track = device.sim.track.track;
+        plants[number].counts_per_turn = axis.config.scale.counts_per_turn().round() as u32;
+        if number == 0 {
+            plants[0].initial_position = device.sim.track.start;
+            plants[0].track = device.sim.track.track;
+        }
     }
+    options.plant = plants.remove(0);
+    options.further_plants = plants;
     let hardware = with_configured_modules(device);
     if let Cow::Owned(_) = hardware {
         // The EEPROM has its factory content, whatever modules are plugged in.

@@ -30,7 +30,7 @@ use crate::rt::channel::channel;
 use crate::rt::controller::Controller;
 use crate::rt::cycle::{EngineConfig, Signals, first_snapshot};
 use crate::rt::exchange::{Exchange, ExchangeDevice};
-use crate::rt::image::{self, AxisBits, BitField, ImagePlan, NotMapped, SignalBits};
+use crate::rt::image::{self, AxisBits, BitField, DeviceRegion, ImagePlan, NotMapped, SignalBits};
 use crate::rt::phase::Phase;
 use crate::supervise::Supervisor;
 
@@ -103,7 +103,7 @@ impl RunBuilder<'_> {
         match bring_up_catching_panics(machine, main_device, image, carried, &progress, &log) {
             Ok(mut bus) => {
                 let machine = &apply_drive_units(machine, &bus);
-                let (_, slots, axes, signals) = plan(machine)?;
+                let (_, slots, signals) = plan(machine)?;
                 let wire = DatagramClient::new(main_device);
                 let config = machine.rt_config();
                 let clock = options.clock;
@@ -157,8 +157,7 @@ impl RunBuilder<'_> {
                     controlled,
                     operator: None,
                     seen: Vec::new(),
-                    limited: vec![false; axes.len()].into(),
-                    axes,
+                    limited: vec![false; machine.axes.len()].into(),
                     commands_sent: 0,
                     refused: VecDeque::new(),
                     captures: Vec::new(),
@@ -220,20 +219,13 @@ fn mailbox_workers(
 /// Returns the machine with its axes in the drives' own units.
 fn apply_drive_units(machine: &Machine, bus: &Bus) -> Arc<Machine> {
     let mut machine = machine.clone();
-    for (device, found) in bus.devices.enumerate() {
-        if let Some(adopted) = &found.adopted {
-            machine.adopt(device, adopted);
-        }
+    for (axis, adopted) in bus.devices.iter().flat_map(|found| &found.adopted) {
+        machine.adopt(*axis, adopted);
     }
     Arc::new(machine)
 }
 
-type CyclePlan = (
-    ImagePlan,
-    IndexVec<AxisIndex, RtAxis>,
-    IndexVec<AxisIndex, DeviceIndex>,
-    Signals,
-);
+type CyclePlan = (ImagePlan, IndexVec<AxisIndex, RtAxis>, Signals);
 
 /// Returns the process image and the axes with their offsets in it.
 fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
@@ -243,20 +235,22 @@ fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
         Cause::TooLarge(error).with_name(name(device))
     })?;
     let mut slots = Vec::new();
-    let mut axes = Vec::new();
-    for ((index, device), region) in machine.devices.enumerate().zip(&image.regions) {
-        let (Some(setup), Some(region)) = (&device.axis, region) else {
-            continue;
-        };
-        let bits = AxisBits::new(&device.selection.layout, region)
-            .map_err(|error| Cause::NotMapped(error).with_name(name(index)))?;
+    for setup in &*machine.axes {
+        let index = setup.device;
+        let layout = machine.devices[index]
+            .selection
+            .layout
+            .of_axis(setup.number);
+        // Without process data, nothing is mapped there.
+        let region = image.regions[index].unwrap_or(DeviceRegion::EMPTY);
+        let bits = AxisBits::new(&layout, &region)
+            .map_err(|error| Cause::NotMapped(error).with_name(&setup.name))?;
         let mut config = setup.config;
         // A feedback value belongs to the set-point of an earlier cycle.
         config.answers_late = machine.bus.exchange.frame_sets() - 1;
         config.dead_time_s += f64::from(config.answers_late) * machine.bus.cycle_ns as f64 * 1e-9;
-        let axis = Axis::new(config).map_err(|error| Cause::Axis(error).with_name(name(index)))?;
+        let axis = Axis::new(config).map_err(|error| Cause::Axis(error).with_name(&setup.name))?;
         slots.push(RtAxis::new(axis, bits, index, image.groups[index]));
-        axes.push(index);
     }
     let bits = |signal: &Signal, output: bool| {
         let region = image.regions.get(signal.device)?.as_ref()?;
@@ -282,12 +276,10 @@ fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
         inputs: all(&machine.inputs, false)?,
         outputs: all(&machine.outputs, true)?,
     };
-    for (slot, &device) in slots.iter_mut().zip(&axes) {
-        let setup = machine.devices[device].axis.as_ref();
-        let brake = setup.and_then(|setup| setup.brake_output.clone());
-        slot.brake = all(brake.as_slice(), true)?.pop();
+    for (slot, setup) in slots.iter_mut().zip(&machine.axes) {
+        slot.brake = all(setup.brake_output.as_slice(), true)?.pop();
     }
-    Ok((image, slots.into(), axes.into(), signals))
+    Ok((image, slots.into(), signals))
 }
 
 /// Sets the outputs that no axis drives to the values that their drives hold.

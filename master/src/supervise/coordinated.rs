@@ -6,7 +6,7 @@ use ecaxis_axis::setpoint::{
     SetpointError, Wave,
 };
 use ecaxis_axis::{Command, Limits};
-use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
+use ecaxis_ecat::index::AxisIndex;
 
 use super::Supervisor;
 use super::program::{Settling, TargetKind};
@@ -24,21 +24,8 @@ const ENGAGE_TIMEOUT: Nanos = 30_000_000_000;
 const WHOLE: f64 = 1.0 - 1e-9;
 
 impl Supervisor {
-    /// Returns the limits of a device's axis.
-    pub(super) fn limits(&self, device: DeviceIndex) -> Limits {
-        let axis = self.machine.devices[device].axis.as_ref();
-        // The configuration check ensures that steps name only devices with an axis.
-        axis.map_or(
-            Limits {
-                position: None,
-                velocity: 0.0,
-                acceleration: 0.0,
-                jerk: None,
-                torque: 0.0,
-                following_error: None,
-            },
-            |axis| axis.config.limits,
-        )
+    pub(super) fn limits(&self, axis: AxisIndex) -> Limits {
+        self.machine.axes[axis].config.limits
     }
 
     /// Moves along a straight line. `part`: fraction of the velocity limits, and of the
@@ -48,15 +35,14 @@ impl Supervisor {
         step: &Step,
         start: Nanos,
         relative: bool,
-        targets: &[(DeviceIndex, f64)],
+        targets: &[(AxisIndex, f64)],
         part: [f64; 2],
     ) -> Result<(), Error> {
-        let places = self.targets(targets);
-        let axes: Vec<_> = places.iter().map(|&(axis, _)| axis).collect();
+        let axes: Vec<_> = targets.iter().map(|&(axis, _)| axis).collect();
         self.settle(&axes, start).await?;
         let snapshot = self.poll_and_query().await?;
         let mut line_axes = Vec::with_capacity(axes.len());
-        for (&(axis, target), &(device, _)) in places.iter().zip(targets) {
+        for &(axis, target) in targets {
             let from = commanded(&snapshot.axes[axis]);
             line_axes.push(LineAxis {
                 from,
@@ -65,8 +51,8 @@ impl Supervisor {
                 } else {
                     self.resolve_target(axis, from.position, target)
                 },
-                limits: self.part_of(device, part),
-                range: self.limits(device).position,
+                limits: self.part_of(axis, part),
+                range: self.limits(axis).position,
             });
         }
         let line = Line::plan(&line_axes)
@@ -86,25 +72,20 @@ impl Supervisor {
         step: &Step,
         start: Nanos,
         relative: bool,
-        targets: &[(DeviceIndex, f64)],
+        targets: &[(AxisIndex, f64)],
         part: [f64; 2],
     ) -> Result<(), Error> {
-        let axes = self.places(
-            &targets
-                .iter()
-                .map(|&(device, _)| device)
-                .collect::<Vec<_>>(),
-        );
+        let axes: Vec<_> = targets.iter().map(|&(axis, _)| axis).collect();
         self.settle(&axes, start).await?;
         let there = self.destinations(relative, targets).await?;
         let snapshot = self.poll_and_query().await?;
         let dt_s = self.machine.bus.cycle_ns as f64 * 1e-9;
         let mut moves = Vec::with_capacity(axes.len());
-        for (&(axis, target), &(device, _)) in there.iter().zip(targets) {
+        for &(axis, target) in &there {
             let from = commanded(&snapshot.axes[axis]);
             let order = Way {
-                range: self.limits(device).position,
-                ..Way::within(Goal::Position(target), self.part_of(device, part))
+                range: self.limits(axis).position,
+                ..Way::within(Goal::Position(target), self.part_of(axis, part))
             };
             let planned = if from.velocity == 0.0 {
                 JerkLimited::new(order, from, dt_s)
@@ -124,11 +105,11 @@ impl Supervisor {
             .await
     }
 
-    /// Returns fractions of the velocity limit, and of the acceleration and jerk limits of a
-    /// device's axis.
-    fn part_of(&self, device: DeviceIndex, part: [f64; 2]) -> MotionLimits {
+    /// Returns fractions of the velocity limit, and of the acceleration and jerk limits of an
+    /// axis.
+    fn part_of(&self, axis: AxisIndex, part: [f64; 2]) -> MotionLimits {
         let [speed, ramp] = part.map(|part| part * WHOLE);
-        let limits = self.limits(device);
+        let limits = self.limits(axis);
         MotionLimits {
             velocity: limits.velocity * speed,
             acceleration: limits.acceleration * ramp,
@@ -136,28 +117,21 @@ impl Supervisor {
         }
     }
 
-    /// Makes one axis follow another. `devices`: the follower and its master.
+    /// Makes an axis follow its master.
     pub(super) async fn gear(
         &mut self,
         step: &Step,
         start: Nanos,
-        devices: [DeviceIndex; 2],
+        [axis, master]: [AxisIndex; 2],
         actual: bool,
         config: GearConfig,
     ) -> Result<(), Error> {
-        let generator = match *self.places(&devices) {
-            [axis, master] => Some((
-                axis,
-                GeneratorRequest::Gear {
-                    master,
-                    actual,
-                    config,
-                },
-            )),
-            _ => None,
+        let generator = GeneratorRequest::Gear {
+            master,
+            actual,
+            config,
         };
-        let generators: Vec<_> = generator.into_iter().collect();
-        self.follow(step, start, &generators, GeneratorState::Engaged)
+        self.follow(step, start, &[(axis, generator)], GeneratorState::Engaged)
             .await
     }
 
@@ -165,22 +139,18 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        device: DeviceIndex,
+        axis: AxisIndex,
         wave: Wave,
     ) -> Result<(), Error> {
-        let axes = self.places(&[device]);
-        self.settle(&axes, start).await?;
+        self.settle(&[axis], start).await?;
         let snapshot = self.poll_and_query().await?;
-        let limits = self.limits(device);
+        let limits = self.limits(axis);
         let dt_s = self.machine.bus.cycle_ns as f64 * 1e-9;
-        let mut generators = Vec::new();
-        for axis in axes {
-            let at = commanded(&snapshot.axes[axis]);
-            let wave = PositionWave::new(wave, at, limits.motion(), limits.position, dt_s)
-                .map_err(|error| self.refusal(step, axis, &error))?;
-            generators.push((axis, GeneratorRequest::Wave(wave)));
-        }
-        self.follow(step, start, &generators, GeneratorState::Finished)
+        let at = commanded(&snapshot.axes[axis]);
+        let wave = PositionWave::new(wave, at, limits.motion(), limits.position, dt_s)
+            .map_err(|error| self.refusal(step, axis, &error))?;
+        let generator = (axis, GeneratorRequest::Wave(wave));
+        self.follow(step, start, &[generator], GeneratorState::Finished)
             .await
     }
 
@@ -189,13 +159,12 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        device: DeviceIndex,
+        axis: AxisIndex,
         table: usize,
         [speed, ramp]: [f64; 2],
     ) -> Result<(), Error> {
-        let axes = self.places(&[device]);
         let [first, _] = self.machine.tables[table].table.ends();
-        let there: Vec<_> = axes.iter().map(|&axis| (axis, first)).collect();
+        let there = [(axis, first)];
         self.move_and_wait(step, start, TargetKind::Position, &there, |position| {
             Command::MoveTo {
                 position,
@@ -208,15 +177,12 @@ impl Supervisor {
             return Ok(());
         }
         let snapshot = self.poll_and_query().await?;
-        let limits = self.limits(device).motion();
-        let mut generators = Vec::new();
-        for axis in axes {
-            let at = commanded(&snapshot.axes[axis]);
-            let playback = Playback::new(&self.machine.tables[table].table, at, limits, 0.0)
-                .map_err(|error| self.refusal(step, axis, &error))?;
-            generators.push((axis, GeneratorRequest::Table { table, playback }));
-        }
-        self.follow(step, start, &generators, GeneratorState::Finished)
+        let limits = self.limits(axis).motion();
+        let at = commanded(&snapshot.axes[axis]);
+        let playback = Playback::new(&self.machine.tables[table].table, at, limits, 0.0)
+            .map_err(|error| self.refusal(step, axis, &error))?;
+        let generator = (axis, GeneratorRequest::Table { table, playback });
+        self.follow(step, start, &[generator], GeneratorState::Finished)
             .await
     }
 

@@ -185,7 +185,9 @@ impl Supervisor {
 
     /// Reads an object of an axis's device. Returns `None` after a timeout.
     async fn upload(&mut self, axis: AxisIndex, index: u16) -> Option<Vec<u8>> {
-        let mailbox = self.mailboxes.urgent(*self.axes.get(axis)?)?;
+        let setup = self.setup(axis)?;
+        let index = ecaxis_esi::axis::object(index, setup.number);
+        let mailbox = self.mailboxes.urgent(setup.device)?;
         clock::timeout(ASK_TIMEOUT, mailbox.upload(index, 0))
             .await?
             .ok()
@@ -222,7 +224,8 @@ impl Supervisor {
         snapshot::read_registers(&self.wire, &self.stations(), &mut looks, depth).await;
         let snapshot = self.outer.snapshots.read().clone();
         let end = clock::now().saturating_add(snapshot::TIMEOUT);
-        for (&device, status) in self.axes.iter().zip(&snapshot.axes) {
+        for (setup, status) in self.machine.axes.iter().zip(&snapshot.axes) {
+            let device = setup.device;
             let following = matches!(status.trip, Some(Trip::FollowingError { .. }));
             let ask = snapshot::ObjectSelection {
                 error_code: status.fault.is_some(),
@@ -237,7 +240,7 @@ impl Supervisor {
                 continue;
             };
             if look.answers && ask != snapshot::ObjectSelection::default() && clock::now() < end {
-                snapshot::read_objects(&mailbox, ask, look).await;
+                snapshot::read_objects(&mailbox, setup.number, ask, look).await;
             }
         }
         looks
@@ -245,23 +248,26 @@ impl Supervisor {
 
     /// Returns the limits of an axis's drive that the machine file exceeds.
     fn exceeded_limits(&self, axis: AxisIndex) -> Vec<LimitConflict> {
-        let device = self.axes.get(axis).and_then(|&at| self.bus.devices.get(at));
-        device.map_or(Vec::new(), |device| device.limits.clone())
+        let device = self.setup(axis);
+        let device = device.and_then(|setup| self.bus.devices.get(setup.device));
+        let limits = device.into_iter().flat_map(|device| &device.limits);
+        let own = limits.filter(|(own, _)| *own == axis);
+        own.map(|(_, conflict)| conflict.clone()).collect()
     }
 
     /// Returns the failed device's own report. Best effort: the machine stops meanwhile.
     async fn drive_report(&mut self, axis: AxisIndex, since: Nanos) -> Box<DriveReport> {
         let mut history = Vec::new();
-        if let Some(&device) = self.axes.get(axis)
-            && let Some(mailbox) = self.mailboxes.urgent(device)
-            && let Some(config) = self.machine.devices.get(device)
+        let device = self.machine.axes[axis].device;
+        let config = &self.machine.devices[device];
+        if let Some(mailbox) = self.mailboxes.urgent(device)
             && let Some(Ok(messages)) =
                 clock::timeout(ASK_TIMEOUT, diagnosis_history::read(&mailbox, config)).await
         {
             history = messages;
         }
         Box::new(DriveReport {
-            emergencies: self.log.last_of(&self.axis_name(axis), since),
+            emergencies: self.log.last_of(&config.name, since),
             history,
             limits: self.exceeded_limits(axis),
         })
@@ -271,15 +277,11 @@ impl Supervisor {
     /// cycle checks it.
     pub(super) async fn confirm_modes(&mut self, axes: &[AxisIndex]) -> Result<(), Error> {
         for &axis in axes {
-            let device = &self.machine.devices[self.axes[axis]];
-            let Some(setup) = &device.axis else { continue };
+            let setup = &self.machine.axes[axis];
+            let device = &self.machine.devices[setup.device];
             let expected = setup.config.mode.code();
-            if device
-                .selection
-                .layout
-                .tx_field(MODES_OF_OPERATION_DISPLAY, 0)
-                .is_some()
-            {
+            let display = ecaxis_esi::axis::object(MODES_OF_OPERATION_DISPLAY, setup.number);
+            if device.selection.layout.tx_field(display, 0).is_some() {
                 continue;
             }
             if let Some(&[display]) = self

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex};
+use ecaxis_ecat::index::{AxisIndex, GroupIndex};
 
 use super::Supervisor;
 use crate::config::{Action, Step};
@@ -27,8 +27,7 @@ pub struct StoppedGroup {
 
 impl Supervisor {
     pub(super) fn group_of(&self, axis: AxisIndex) -> GroupIndex {
-        let device = self.axes.get(axis);
-        device.map_or(GroupIndex::MACHINE, |&device| self.machine.group_of(device))
+        self.machine.group_of_axis(axis)
     }
 
     pub(super) fn group_name(&self, group: GroupIndex) -> String {
@@ -124,18 +123,17 @@ impl Supervisor {
     }
 }
 
-/// Returns the devices of the axes that a step needs to run. Resetting and disabling work in a
+/// Returns the axes that a step needs to run. Resetting and disabling work in a
 /// stopped group.
-pub(super) fn needed(action: &Action) -> Vec<DeviceIndex> {
-    let targets =
-        |targets: &[(DeviceIndex, f64)]| targets.iter().map(|&(device, _)| device).collect();
+pub(super) fn needed(action: &Action) -> Vec<AxisIndex> {
+    let targets = |targets: &[(AxisIndex, f64)]| targets.iter().map(|&(axis, _)| axis).collect();
     match action {
         Action::Enable { axes } | Action::Home { axes } | Action::Stop { axes } => axes.clone(),
         Action::Move { targets: t, .. }
         | Action::Line { targets: t, .. }
         | Action::Velocity { targets: t, .. }
         | Action::Torque { targets: t, .. } => targets(t),
-        Action::Mode { targets } => targets.iter().map(|&(device, _)| device).collect(),
+        Action::Mode { targets } => targets.iter().map(|&(axis, _)| axis).collect(),
         Action::Wave { axis, .. } | Action::Table { axis, .. } | Action::Probe { axis, .. } => {
             vec![*axis]
         }

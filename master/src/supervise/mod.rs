@@ -73,8 +73,6 @@ pub struct Supervisor {
     pub operator: Option<Box<dyn jog::Operator>>,
     /// Axes whose faults and trips the operator has seen.
     pub seen: Vec<AxisIndex>,
-    /// The device of each axis of the cycle.
-    pub axes: IndexVec<AxisIndex, DeviceIndex>,
     /// The number of commands sent to the cycle so far.
     pub commands_sent: u64,
     /// Commands that axes refused, in order. If too many, the first ones and the last one.
@@ -168,7 +166,7 @@ impl Supervisor {
             return self.run_operator(operator.as_mut()).await;
         }
         if !enables(&self.machine.steps) {
-            let all: Vec<_> = self.axes.indices().collect();
+            let all: Vec<_> = self.machine.axes.indices().collect();
             self.enable_axes(None, &all).await?;
         }
         self.run_program(ended).await
@@ -333,8 +331,7 @@ impl Supervisor {
 
     /// Returns the longest time in ns that an axis needs to stop from full speed.
     fn longest_stop(&self) -> Nanos {
-        let axes = self.machine.devices.iter().filter_map(|d| d.axis.as_ref());
-        let times = axes.map(|axis| {
+        let times = self.machine.axes.iter().map(|axis| {
             let config = &axis.config;
             config.stop_time_s(config.mode, config.limits.velocity)
         });
@@ -344,11 +341,8 @@ impl Supervisor {
 
     /// Returns the longest brake release time in ns; the drive is enabled during this time.
     fn longest_release(&self, axes: &[AxisIndex]) -> Nanos {
-        let devices = axes.iter().filter_map(|&axis| self.axes.get(axis));
-        let brakes = devices.filter_map(|&device| {
-            let axis = self.machine.devices.get(device)?.axis.as_ref()?;
-            Some(axis.config.brake.release_s)
-        });
+        let axes = axes.iter().filter_map(|&axis| self.machine.axes.get(axis));
+        let brakes = axes.map(|axis| axis.config.brake.release_s);
         // Configured as whole nanoseconds; the cast saturates.
         (brakes.fold(0.0, f64::max) * 1e9) as Nanos
     }
@@ -373,11 +367,7 @@ impl Supervisor {
         self.report_limits(&snapshot);
         if clock::now().saturating_sub(self.last_status) >= STATUS_PERIOD {
             self.last_status = clock::now();
-            self.report(Progress::Status(Status::new(
-                &self.machine,
-                &self.axes,
-                &snapshot,
-            )));
+            self.report(Progress::Status(Status::new(&self.machine, &snapshot)));
         }
         if let Some(cause) = snapshot.stopping
             && cause != StopCause::Requested
@@ -560,22 +550,17 @@ impl Supervisor {
         let _ = self.progress.send(progress);
     }
 
+    /// Returns the device of an axis, under the name of the axis.
     fn device_of(&self, axis: AxisIndex) -> DeviceRef {
-        self.axes
-            .get(axis)
-            .and_then(|&device| self.bus.devices.get(device))
-            .map_or_else(
-                || DeviceRef {
-                    name: format!("axis {}", axis.0),
-                    position: 0,
-                    station: 0,
-                },
-                |device| device.at.clone(),
-            )
+        let setup = &self.machine.axes[axis];
+        DeviceRef {
+            name: setup.name.clone(),
+            ..self.bus.devices[setup.device].at.clone()
+        }
     }
 
     fn axis_name(&self, axis: AxisIndex) -> String {
-        self.device_of(axis).name
+        self.machine.axes[axis].name.clone()
     }
 }
 

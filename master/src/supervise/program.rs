@@ -14,7 +14,7 @@ use std::pin::Pin;
 use ecaxis_axis::setpoint::{GearConfig, GearInMode};
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Command};
-use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, GroupIndex, IndexVec};
 
 use super::groups::needed;
 use super::{ProgramOutcome, Supervisor};
@@ -94,7 +94,7 @@ impl Supervisor {
         ended: &mut ProgramOutcome,
     ) -> Result<(), Error> {
         let start = clock::now();
-        let all: Vec<_> = self.axes.indices().collect();
+        let all: Vec<_> = self.machine.axes.indices().collect();
         self.enable_axes(None, &all).await?;
         while !self.over(start) {
             if self.poll_and_query().await?.finished {
@@ -155,14 +155,10 @@ impl Supervisor {
     }
 
     async fn run_step(&mut self, step: &Step, run: u32, start: Nanos) -> Result<(), Error> {
-        self.ensure_not_stopped(Some(step), &self.places(&needed(&step.action)))?;
+        self.ensure_not_stopped(Some(step), &needed(&step.action))?;
         match &step.action {
-            Action::Enable { axes } => {
-                let axes = self.places(axes);
-                self.enable_axes(Some(step), &axes).await
-            }
+            Action::Enable { axes } => self.enable_axes(Some(step), axes).await,
             Action::Disable { axes } => {
-                let axes = self.places(axes);
                 self.command(axes.iter().map(|&axis| (axis, Command::Disable)))
                     .await;
                 // The state of an axis without process data is unknown.
@@ -172,10 +168,9 @@ impl Supervisor {
                     group.is_some_and(|group| group.stopped.is_some() && !group.fresh)
                 };
                 let done = |s: &Snapshot, axis: AxisIndex| !s.axes[axis].enabled || lost(s, axis);
-                self.until(step, start, done, &axes).await
+                self.until(step, start, done, axes).await
             }
             Action::Reset { axes } => {
-                let axes = self.places(axes);
                 self.command(axes.iter().map(|&axis| (axis, Command::ResetFault)))
                     .await;
                 let of = self.groups();
@@ -192,14 +187,13 @@ impl Supervisor {
                     let group = of[axis];
                     !s.axes[axis].resetting && !coming(s, group)
                 };
-                self.until(step, start, done, &axes).await
+                self.until(step, start, done, axes).await
             }
             Action::Home { axes } => self.home(step, start, axes).await,
             Action::Stop { axes } => {
-                let axes = self.places(axes);
                 self.command(axes.iter().map(|&axis| (axis, Command::Stop)))
                     .await;
-                self.until(step, start, |s, axis| !s.axes[axis].moving, &axes)
+                self.until(step, start, |s, axis| !s.axes[axis].moving, axes)
                     .await
             }
             Action::Move {
@@ -226,7 +220,7 @@ impl Supervisor {
                 ramp,
             } => {
                 let search = ProbeMove {
-                    device: *axis,
+                    axis: *axis,
                     probe: *probe,
                     edge: *edge,
                     relative: *relative,
@@ -271,8 +265,7 @@ impl Supervisor {
                     .await
             }
             Action::Velocity { targets, ramp } => {
-                let targets = self.targets(targets);
-                self.move_and_wait(step, start, TargetKind::Velocity, &targets, |velocity| {
+                self.move_and_wait(step, start, TargetKind::Velocity, targets, |velocity| {
                     Command::Velocity {
                         velocity,
                         ramp: *ramp,
@@ -281,8 +274,7 @@ impl Supervisor {
                 .await
             }
             Action::Torque { targets, ramp_ns } => {
-                let targets = self.targets(targets);
-                self.move_and_wait(step, start, TargetKind::Torque, &targets, |percent| {
+                self.move_and_wait(step, start, TargetKind::Torque, targets, |percent| {
                     Command::Torque {
                         percent,
                         ramp_s: *ramp_ns as f64 * 1e-9,
@@ -314,35 +306,15 @@ impl Supervisor {
         }
     }
 
-    /// Returns the axis indices of devices.
-    pub(super) fn places(&self, devices: &[DeviceIndex]) -> Vec<AxisIndex> {
-        let places = devices.iter().filter_map(|&device| self.axis_of(device));
-        places.collect()
-    }
-
-    /// Returns targets of devices as targets of their axes.
-    pub(super) fn targets<T: Copy>(&self, targets: &[(DeviceIndex, T)]) -> Vec<(AxisIndex, T)> {
-        let targets = targets.iter();
-        let targets = targets.filter_map(|&(device, target)| Some((self.axis_of(device)?, target)));
-        targets.collect()
-    }
-
-    fn axis_of(&self, device: DeviceIndex) -> Option<AxisIndex> {
-        let mut axes = self.axes.enumerate();
-        axes.find_map(|(axis, own)| (*own == device).then_some(axis))
-    }
-
     /// Returns the group of each axis.
     fn groups(&self) -> IndexVec<AxisIndex, GroupIndex> {
-        let devices = self.axes.iter();
-        devices
-            .map(|&device| self.machine.group_of(device))
+        let axes = self.machine.axes.iter();
+        axes.map(|axis| self.machine.group_of(axis.device))
             .collect()
     }
 
     pub(super) fn setup(&self, axis: AxisIndex) -> Option<&AxisSetup> {
-        let device = self.machine.devices.get(*self.axes.get(axis)?)?;
-        device.axis.as_ref()
+        self.machine.axes.get(axis)
     }
 
     /// Returns the position for a target; on a modulo axis the one that its direction leads to.
@@ -377,7 +349,7 @@ impl Supervisor {
         start: Nanos,
         mut look: impl FnMut(&Self, &Snapshot) -> Result<bool, Error>,
     ) -> Result<(), Error> {
-        let needed = self.places(&needed(&step.action));
+        let needed = needed(&step.action);
         loop {
             let snapshot = self.poll_and_query().await?;
             self.ensure_not_stopped(Some(step), &needed)?;

@@ -56,8 +56,8 @@ impl Application {
         )?))
     }
 
-    pub(super) fn new_drives(store: &mut ObjectStore, plant: PlantParams) -> Self {
-        Self::Drives(Drive::of_axes(store, plant))
+    pub(super) fn new_drives(store: &mut ObjectStore, plants: &[PlantParams]) -> Self {
+        Self::Drives(Drive::of_axes(store, plants))
     }
 
     /// Returns the period of the application in ns; `None` if it only reacts to frames.

@@ -44,6 +44,8 @@ pub struct DeviceOptions {
     pub jitter_seed: u64,
     /// Motor, load and travel of a drive.
     pub plant: PlantParams,
+    /// Likewise for the second axis of a drive and those after it; missing ones are the default.
+    pub further_plants: Vec<PlantParams>,
     /// The delay from one port to the next in ns. `None`: 500 for a port with a PHY, 150 for an
     /// E-bus port.
     pub forwarding_ns: Option<u64>,
@@ -79,6 +81,7 @@ impl Default for DeviceOptions {
             clock_jitter_ns: 0,
             jitter_seed: 0,
             plant: PlantParams::default(),
+            further_plants: Vec::new(),
             forwarding_ns: None,
             processing_ns: 0,
             sii: None,
@@ -207,7 +210,11 @@ impl SimDevice {
                 gateway.bind(&objects.store);
                 Application::Gateway(Box::new(gateway))
             }
-            None if is_drive => Application::new_drives(&mut objects.store, options.plant),
+            None if is_drive => {
+                let mut plants = vec![options.plant];
+                plants.extend(options.further_plants);
+                Application::new_drives(&mut objects.store, &plants)
+            }
             None => Application::Io(Io::default()),
         };
         let Objects {

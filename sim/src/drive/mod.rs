@@ -126,12 +126,13 @@ impl Drive {
     }
 
     /// Creates a drive for each axis of a device: each Controlword of the dictionary.
-    pub(crate) fn of_axes(store: &mut ObjectStore, plant: PlantParams) -> Box<[Self]> {
+    pub(crate) fn of_axes(store: &mut ObjectStore, plants: &[PlantParams]) -> Box<[Self]> {
         let own = |axis: &u16| *axis == 0 || store.has_object(CONTROLWORD + axis * AXIS_STRIDE);
         let axes: Vec<u16> = (0..MAX_AXES).filter(own).collect();
+        let plant = |axis: u16| plants.get(usize::from(axis)).copied().unwrap_or_default();
         let drives = axes.into_iter();
         drives
-            .map(|axis| Self::of_axis(store, axis, plant))
+            .map(|axis| Self::of_axis(store, axis, plant(axis)))
             .collect()
     }
 

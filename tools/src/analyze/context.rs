@@ -16,7 +16,8 @@ struct Expected {
     name: String,
     product: u32,
     layout: Arc<Layout>,
-    axis: Option<(Scale, String)>,
+    /// The axes: number in the drive, scale, unit.
+    axes: Vec<(u16, (Scale, String))>,
 }
 
 /// Names, layouts and units that a recording does not contain.
@@ -42,10 +43,12 @@ impl Context {
             name: device.name.clone(),
             product: device.device.identity.product,
             layout: Arc::new(device.selection.layout.clone()),
-            axis: device
-                .axis
-                .as_ref()
-                .map(|axis| (axis.config.scale, axis.unit.clone())),
+            axes: machine
+                .axes
+                .iter()
+                .filter(|axis| machine.devices[axis.device].name == device.name)
+                .map(|axis| (axis.number, (axis.config.scale, axis.unit.clone())))
+                .collect(),
         };
         self.expected = bus_order(&machine.devices).iter().map(of).collect();
         self
@@ -73,10 +76,17 @@ impl Context {
             .map(|expected| &*expected.name)
     }
 
-    /// Returns the units of the axis in the machine file.
+    /// Returns the units of an axis of a drive, counted from 0, in the machine file.
     #[must_use]
-    pub fn axis(&self, position: Option<u16>, product: Option<u32>) -> Option<&(Scale, String)> {
-        self.expected(position, product)?.axis.as_ref()
+    pub fn axis(
+        &self,
+        position: Option<u16>,
+        product: Option<u32>,
+        number: usize,
+    ) -> Option<&(Scale, String)> {
+        let axes = &self.expected(position, product)?.axes;
+        let own = axes.iter().find(|(own, _)| usize::from(*own) == number);
+        own.map(|(_, units)| units)
     }
 
     fn described(&mut self, vendor: u32, product: u32, revision: u32) -> Option<&Described> {

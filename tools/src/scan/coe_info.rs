@@ -88,7 +88,7 @@ async fn drive(
     // `as` keeps the bits: these values are signed.
     let software_limits = low.zip(high).map(|(low, high)| [low as i32, high as i32]);
     Ok(DriveInfo {
-        units: drive_units::ask(wire, coe, maxon).await?,
+        units: drive_units::ask(wire, coe, 0, maxon).await?,
         sensor_resolution: match maxon {
             true => coe.upload_integer(wire, 0x3000, 5).await?,
             false => None,

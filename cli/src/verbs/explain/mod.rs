@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_master::acyclic::StateTimeouts;
 use ecaxis_master::config::{
     self, Action, BitRange, Bus, DeviceConfig, ExchangeMode, Machine, Nic, Step, duration,
@@ -45,8 +46,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 fn explain(machine: &Machine) -> Document {
     let mut out = Document::new(machine.path.display().to_string());
     bus(machine, &mut out);
-    for device in &machine.devices {
-        self::device(device, &mut out);
+    for index in machine.devices.indices() {
+        device(machine, index, &mut out);
     }
     wire(machine, &mut out);
     copies(machine, &mut out);
@@ -161,7 +162,8 @@ fn bus(machine: &Machine, out: &mut Document) {
     out.section("bus", table);
 }
 
-fn device(device: &DeviceConfig, out: &mut Document) {
+fn device(machine: &Machine, index: DeviceIndex, out: &mut Document) {
+    let device = &machine.devices[index];
     let selection = &device.selection;
     let esi = device.esi_path.display();
     let (at, line) = (&device.at, device.line);
@@ -187,8 +189,13 @@ fn device(device: &DeviceConfig, out: &mut Document) {
     for note in &selection.notes {
         out.item("note: ", note);
     }
-    if let Some(axis) = &device.axis {
+    let (axes, several) = (machine.axes_of(index), machine.axes_of(index).count() > 1);
+    for (_, axis) in axes {
         out.gap();
+        if several || axis.name != device.name {
+            let (name, number) = (&axis.name, axis.number + 1);
+            out.line(format!("axis {number} of the drive: `{name}`"));
+        }
         out.table(axis::axis(axis));
     }
     process_data(&device.device, &selection.layout, out);
@@ -314,7 +321,7 @@ fn load(machine: &Machine, wire_ns: u64) -> (u64, &'static str) {
     const AXIS_NS: u64 = 200;
     /// A typical spin time of `"auto"` in ns. It never exceeds this fraction of the cycle:
     const SPIN_NS: u64 = 50_000;
-    let axes = machine.devices.iter().filter(|d| d.axis.is_some()).count();
+    let axes = machine.axes.len();
     let work = WORK_NS + AXIS_NS * u64::try_from(axes).unwrap_or(u64::MAX / AXIS_NS);
     let spin = match machine.bus.spin {
         Spin::Auto => SPIN_NS.min(match machine.bus.exchange {

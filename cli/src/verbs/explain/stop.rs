@@ -34,11 +34,17 @@ pub(super) fn stop(machine: &Machine, out: &mut Document) {
         return;
     }
     let mut table = Table::new("group|axes|devices|others|outside");
-    let names = |axes: bool, group: GroupIndex| {
+    let axes = |group: GroupIndex| {
+        let axes = machine.axes.iter();
+        let own = axes.filter(|axis| machine.group_of(axis.device) == group);
+        let names: Vec<_> = own.map(|axis| axis.name.as_str()).collect();
+        names.join(" ")
+    };
+    let devices = |group: GroupIndex| {
         let devices = machine.devices.enumerate();
         let own = devices.filter(|(device, _)| machine.group_of(*device) == group);
-        let kind = own.filter(|(_, device)| device.axis.is_some() == axes);
-        let names: Vec<_> = kind.map(|(_, device)| device.name.as_str()).collect();
+        let without = own.filter(|(_, device)| device.selection.mode.is_none());
+        let names: Vec<_> = without.map(|(_, device)| device.name.as_str()).collect();
         names.join(" ")
     };
     for (index, group) in (1..).map(GroupIndex).zip(&stop.groups) {
@@ -46,7 +52,7 @@ pub(super) fn stop(machine: &Machine, out: &mut Document) {
             GroupStopScope::Stop => "stops",
             GroupStopScope::Continue => "continues",
         };
-        let (axes, devices) = (names(true, index), names(false, index));
+        let (axes, devices) = (axes(index), devices(index));
         table.row(cells![
             group.name,
             axes,
@@ -55,11 +61,10 @@ pub(super) fn stop(machine: &Machine, out: &mut Document) {
             outside
         ]);
     }
-    let [axes, devices] = [true, false].map(|axes| names(axes, GroupIndex::MACHINE));
     table.row(cells![
         "(the rest)",
-        axes,
-        devices,
+        axes(GroupIndex::MACHINE),
+        devices(GroupIndex::MACHINE),
         way(stop.others),
         "stops"
     ]);

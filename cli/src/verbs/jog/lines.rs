@@ -313,9 +313,9 @@ fn parse(line: &str, view: &View<'_>, speed: f64) -> Result<Line, String> {
         return Ok(Line::Nothing);
     };
     let axis = |name: &str| {
-        let mut axes = view.axes.indices();
+        let mut axes = view.machine.axes.indices();
         axes.find(|&axis| view.name(axis) == name).ok_or_else(|| {
-            let all = view.axes.indices().map(|axis| view.name(axis));
+            let all = view.machine.axes.indices().map(|axis| view.name(axis));
             match nearest(name, all.clone()) {
                 Some(near) => format!("no axis is named `{name}`; did you mean `{near}`?"),
                 None => format!(
@@ -330,7 +330,7 @@ fn parse(line: &str, view: &View<'_>, speed: f64) -> Result<Line, String> {
         let named: Result<Vec<AxisIndex>, String> = rest.iter().map(|name| axis(name)).collect();
         let mut axes = named?;
         if axes.is_empty() {
-            axes = view.axes.indices().collect();
+            axes = view.machine.axes.indices().collect();
         }
         Ok(Line::For(axes.into_iter().map(request).collect()))
     };

@@ -109,7 +109,7 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let machine = run::load(&args.file, args.nic.as_deref(), args.sim)
         .map_err(|e| hints::config(&args.file, &e))?;
-    if !machine.devices.iter().any(|device| device.axis.is_some()) {
+    if machine.axes.is_empty() {
         let message = format!("{} has no axis", args.file.display());
         return Err(Failure::new(hints::WRONG, message).hint("add a [device.axis]"));
     }

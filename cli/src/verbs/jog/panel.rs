@@ -58,16 +58,14 @@ pub(super) struct Limits {
 impl Panel {
     pub fn new(view: &View<'_>, began: u64) -> Self {
         let snapshot = view.snapshot;
-        let axes = view.axes.enumerate();
-        let axes = axes.filter_map(|(axis, &index)| {
-            let device = view.machine.devices.get(index)?;
-            let setup = device.axis.as_ref()?;
+        let axes = view.machine.axes.enumerate();
+        let axes = axes.filter_map(|(axis, setup)| {
             let status = snapshot.axes.get(axis)?;
             let doing = view.hands.get(axis).map(|hand| hand.doing);
-            let group = snapshot.groups.get(view.machine.group_of(index));
+            let group = snapshot.groups.get(view.machine.group_of(setup.device));
             let stopped = group.is_some_and(|group| group.stopped.is_some());
             let doing = doing.unwrap_or_default();
-            Some(AxisPanel::new(&device.name, setup, status, doing, stopped))
+            Some(AxisPanel::new(&setup.name, setup, status, doing, stopped))
         });
         Self {
             time_s: view.now.saturating_sub(began) as f64 * 1e-9,

@@ -2,6 +2,7 @@
 
 use ecaxis_axis::scale::ModuloDirection;
 use ecaxis_axis::{StopMethod, VelocityUnit};
+use toml::de::DeValue;
 
 use super::super::TorqueUnit;
 use super::super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Written, array};
@@ -29,6 +30,9 @@ const TORQUE_UNITS: [(&str, TorqueUnit); 3] = [
 
 table! { "[device.axis]",
     table RawAxis {
+        name: Key<String>,
+        /// The number of the axis in its drive, from 1.
+        number: Key<u16> [1..=ecaxis_esi::axis::MAX_AXES],
         unit: Key<String>,
         per_turn: Key<f64>,
         /// Motor turns and the resulting turns of the output shaft.
@@ -58,6 +62,29 @@ table! { "[device.axis]",
         on_trip: Key<StopMethod> [STOP_METHODS],
         on_emergency: Key<StopMethod> [STOPS_BY_DRIVE],
         homing: Option<RawHoming>,
+    }
+}
+
+/// `[device.axis]`, or `[[device.axis]]` for each axis of a drive.
+#[derive(Debug, Default)]
+pub(crate) struct AxisTables(pub Vec<RawAxis>);
+
+impl Field for AxisTables {
+    type Value = Self;
+
+    fn of(value: Option<Self>) -> Option<Self> {
+        Some(value.unwrap_or_default())
+    }
+}
+
+impl Read for AxisTables {
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        let axes = match value.get_ref() {
+            DeValue::Array(axes) => axes.iter().collect(),
+            _ => vec![value],
+        };
+        let read = axes.into_iter().map(|axis| RawAxis::read(axis, key, p));
+        Some(Self(read.collect::<Option<_>>()?))
     }
 }
 

@@ -15,7 +15,7 @@ use super::{ExchangeMode, GroupStopScope, SocketKind, Spin};
 mod axis;
 mod step;
 
-pub(crate) use axis::{RawAxis, RawHoming, RawLimits};
+pub(crate) use axis::{AxisTables, RawAxis, RawHoming, RawLimits};
 pub(crate) use step::{
     Conditions, Named, RawAction, RawAxes, RawCondition, RawGear, RawProbe, RawSignal, RawStep,
     RawWave,
@@ -111,7 +111,7 @@ table! { "[[device]]",
         sdo: Vec<RawSdo>,
         /// The defaults for all start-up SDOs.
         startup: RawStartup,
-        axis: Option<RawAxis>,
+        axes: AxisTables as "axis",
         sim: Option<RawSim>,
     }
 }
@@ -171,6 +171,24 @@ table! { "`sdo`",
 }
 
 impl RawSdo {
+    /// Returns the SDO as a drive with this axis alone has it; `None`: it belongs to another axis.
+    pub fn of_axis(&self, axis: u16) -> Option<Self> {
+        let index = match ecaxis_esi::axis::of(self.index) {
+            Some((own, same)) => (own == axis).then_some(same)?,
+            None => self.index,
+        };
+        Some(Self {
+            index,
+            span: self.span.clone(),
+            written: Written::default(),
+            sub: self.sub,
+            value: self.value.clone(),
+            type_name: self.type_name.clone(),
+            verify: self.verify,
+            skip_equal: self.skip_equal,
+        })
+    }
+
     pub fn address(&self) -> (u16, u8) {
         (self.index, self.sub.unwrap_or(0))
     }

@@ -3,7 +3,7 @@
 use ecaxis_axis::setpoint::{
     Interpolation, Motion, PositionWave, SetpointError, Shape, Table, Wave,
 };
-use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_ecat::index::AxisIndex;
 use toml::Spanned;
 
 use super::ProgramChecker;
@@ -27,7 +27,7 @@ impl ProgramChecker<'_> {
         name: &Spanned<String>,
         verb: &str,
         p: &mut Problems<'_>,
-    ) -> Option<(DeviceIndex, &AxisSetup)> {
+    ) -> Option<(AxisIndex, &AxisSetup)> {
         let (index, axis) = self.axis(name, p)?;
         if self.any_mode(index, |mode| TargetKind::SetPoint.possible(mode, axis)) {
             return Some((index, axis));

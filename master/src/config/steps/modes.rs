@@ -1,7 +1,7 @@
 //! Steps that change how an axis handles targets: homing, modes of operation.
 
 use ecaxis_axis::Mode;
-use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_ecat::index::AxisIndex;
 use ecaxis_esi as esi;
 use toml::Spanned;
 
@@ -12,8 +12,8 @@ use crate::config::raw::RawAxes;
 
 impl ProgramChecker<'_> {
     pub(super) fn home(&self, names: RawAxes, at: &Span, p: &mut Problems<'_>) -> Option<Action> {
-        let homes = |index: &DeviceIndex| {
-            let axis = self.devices[*index].axis.ok();
+        let homes = |index: &AxisIndex| {
+            let axis = self.axes[*index].setup;
             axis.is_some_and(|axis| axis.homing.is_some())
         };
         let Some(named) = &names else {
@@ -28,8 +28,8 @@ impl ProgramChecker<'_> {
         };
         let mut ok = true;
         for name in named {
-            if let Some(index) = self.device(name)
-                && self.devices[index].axis.is_ok()
+            if let Some(index) = self.axis_named(name)
+                && self.axes[index].setup.is_some()
                 && !homes(&index)
             {
                 let message = format!("`{}` does not say how it finds home", name.get_ref());
@@ -47,7 +47,7 @@ impl ProgramChecker<'_> {
         name: &Spanned<String>,
         mode: &Spanned<String>,
         p: &mut Problems<'_>,
-    ) -> Option<(DeviceIndex, Mode)> {
+    ) -> Option<(AxisIndex, Mode)> {
         let (index, axis) = self.axis(name, p)?;
         let offered: Vec<esi::Mode> = esi::Mode::ALL
             .into_iter()

@@ -5,7 +5,7 @@
 //! after all steps before it.
 
 use ecaxis_axis::Mode;
-use ecaxis_ecat::index::{DeviceIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, IndexVec};
 
 use super::ProgramChecker;
 use super::target::TargetKind;
@@ -60,7 +60,7 @@ struct Precondition {
 
 struct ProgramState<'w, 'c, 'p, 's> {
     checker: &'w ProgramChecker<'c>,
-    axes: IndexVec<DeviceIndex, Option<State>>,
+    axes: IndexVec<AxisIndex, Option<State>>,
     visits: u32,
     /// `true` if a step is being repeated.
     again: bool,
@@ -70,8 +70,8 @@ struct ProgramState<'w, 'c, 'p, 's> {
 impl ProgramChecker<'_> {
     pub(super) fn flow(&self, steps: &[Step], repeat: u32, p: &mut Problems<'_>) {
         let power = !enables(steps);
-        let axes = self.devices.iter().map(|device| {
-            let axis = device.axis.ok()?;
+        let axes = self.axes.iter().map(|axis| {
+            let axis = axis.setup?;
             Some(State {
                 mode: axis.config.mode,
                 switched_by: None,
@@ -237,7 +237,7 @@ impl ProgramState<'_, '_, '_, '_> {
         }
     }
 
-    fn switch(&mut self, step: &Step, axis: DeviceIndex, mode: Mode) {
+    fn switch(&mut self, step: &Step, axis: AxisIndex, mode: Mode) {
         let powered = self.state(axis).is_some_and(|s| s.power);
         if powered {
             let need = Precondition {
@@ -267,7 +267,7 @@ impl ProgramState<'_, '_, '_, '_> {
         what: TargetKind,
         rest: bool,
         relative: bool,
-        targets: &[(DeviceIndex, f64)],
+        targets: &[(AxisIndex, f64)],
     ) {
         for &(axis, target) in targets {
             self.need(
@@ -310,7 +310,7 @@ impl ProgramState<'_, '_, '_, '_> {
     }
 
     /// Handles a step that sets every set-point of an axis. `back`: it ends where it began.
-    fn follow_setpoints(&mut self, step: &Step, verb: &'static str, axis: DeviceIndex, back: bool) {
+    fn follow_setpoints(&mut self, step: &Step, verb: &'static str, axis: AxisIndex, back: bool) {
         self.need(step, axis, Precondition::of(verb, TargetKind::SetPoint));
         self.each(&[axis], |state| {
             let position = state.position.filter(|_| back);
@@ -319,7 +319,7 @@ impl ProgramState<'_, '_, '_, '_> {
         });
     }
 
-    fn each(&mut self, axes: &[DeviceIndex], change: impl Fn(&mut State)) {
+    fn each(&mut self, axes: &[AxisIndex], change: impl Fn(&mut State)) {
         for &axis in axes {
             if let Some(Some(state)) = self.axes.get_mut(axis) {
                 change(state);
@@ -327,20 +327,20 @@ impl ProgramState<'_, '_, '_, '_> {
         }
     }
 
-    fn state(&self, axis: DeviceIndex) -> Option<&State> {
+    fn state(&self, axis: AxisIndex) -> Option<&State> {
         self.axes.get(axis)?.as_ref()
     }
 
-    fn axis(&self, axis: DeviceIndex) -> Option<&AxisSetup> {
-        self.checker.devices.get(axis)?.axis.ok()
+    fn axis(&self, axis: AxisIndex) -> Option<&AxisSetup> {
+        self.checker.axes.get(axis)?.setup
     }
 
-    fn limits(&self, axis: DeviceIndex) -> Option<[f64; 2]> {
+    fn limits(&self, axis: AxisIndex) -> Option<[f64; 2]> {
         self.axis(axis)?.config.limits.position
     }
 
-    fn name(&self, axis: DeviceIndex) -> &str {
-        self.checker.devices.get(axis).map_or("", |d| d.name)
+    fn name(&self, axis: AxisIndex) -> &str {
+        self.checker.axes.get(axis).map_or("", |axis| axis.name)
     }
 
     fn round(&self) -> &'static str {
@@ -352,7 +352,7 @@ impl ProgramState<'_, '_, '_, '_> {
     }
 
     /// Rejects the step if the axis cannot run it.
-    fn need(&mut self, step: &Step, axis: DeviceIndex, need: Precondition) {
+    fn need(&mut self, step: &Step, axis: AxisIndex, need: Precondition) {
         let (Some(state), Some(setup)) = (self.state(axis), self.axis(axis)) else {
             return;
         };
@@ -399,7 +399,7 @@ impl ProgramState<'_, '_, '_, '_> {
         self.refuse(step, axis, message, hint);
     }
 
-    fn refuse(&mut self, step: &Step, axis: DeviceIndex, message: String, hint: String) {
+    fn refuse(&mut self, step: &Step, axis: AxisIndex, message: String, hint: String) {
         let Some(Some(state)) = self.axes.get_mut(axis) else {
             return;
         };
@@ -432,7 +432,7 @@ impl State {
 
 impl ProgramChecker<'_> {
     /// Returns the place of the axis's name in a step, otherwise of the step.
-    fn place(&self, number: &str, axis: DeviceIndex) -> Span {
+    fn place(&self, number: &str, axis: AxisIndex) -> Span {
         let places = self.places.borrow();
         let of = |axis| places.get(&(number.to_owned(), axis)).cloned();
         of(Some(axis)).or_else(|| of(None)).unwrap_or_default()

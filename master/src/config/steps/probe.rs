@@ -5,12 +5,12 @@ use toml::Spanned;
 
 use super::ProgramChecker;
 use super::target::{TargetKind, within};
+use crate::config::Action;
 use crate::config::fields::KeyExt;
 use crate::config::problem::Problems;
 use crate::config::raw::RawProbe;
-use crate::config::{Action, DeviceConfig};
-use ecaxis_esi::address;
 use ecaxis_esi::layout::Field;
+use ecaxis_esi::{Selection, address};
 
 /// Touch probe function 0x60B8 and status 0x60B9.
 const FUNCTION: u16 = 0x60b8;
@@ -58,8 +58,8 @@ impl ProgramChecker<'_> {
         }
         let inside = within(value, what, axis, p);
         let (speed, ramp) = (speed?, ramp?);
-        if let Some(device) = self.devices[index].device {
-            mapped(device, name, probe, edge, p)?;
+        if let Some(device) = self.devices[self.axes[index].device].device {
+            mapped(&device.selection.of_axis(axis.number), name, probe, edge, p)?;
         }
         inside.then(|| Action::Probe {
             axis: index,
@@ -75,13 +75,13 @@ impl ProgramChecker<'_> {
 
 /// Reports probe objects missing from the process data or from the drive.
 fn mapped(
-    device: &DeviceConfig,
+    selection: &Selection,
     name: &Spanned<String>,
     probe: Probe,
     edge: Edge,
     p: &mut Problems<'_>,
 ) -> Option<()> {
-    let layout = &device.selection.layout;
+    let layout = &selection.layout;
     let inputs = [STATUS, position_object(probe, edge)];
     let no_output = layout.rx_field(FUNCTION, 0).is_none();
     let missing: Vec<u16> = inputs
@@ -94,7 +94,7 @@ fn mapped(
     let all = no_output.then_some(FUNCTION).into_iter();
     let all: Vec<u16> = all.chain(missing.iter().copied()).collect();
     // An ESI file without a dictionary does not list objects.
-    let dictionary = &device.selection.dictionary;
+    let dictionary = &selection.dictionary;
     let reported = dictionary.item(0x6041, 0).is_some();
     let has = |index: &u16| !reported || dictionary.item(*index, 0).is_some();
     if let Some(unknown) = all.iter().find(|index| !has(index)) {

@@ -75,10 +75,20 @@ impl ProgramChecker<'_> {
             others: raw.others.value().unwrap_or(others),
             outside: raw.outside.value().unwrap_or_default(),
         };
+        let mut axes = Vec::new();
         for name in raw.axes.iter().flat_map(|names| &names.0) {
-            if let Some((device, _)) = self.axis(name, p) {
+            let Some((axis, _)) = self.axis(name, p) else {
+                continue;
+            };
+            let device = self.axes[axis].device;
+            // All axes of a drive are in the same group.
+            let others = self.axes.enumerate().filter(|(index, other)| {
+                *index != axis && other.device == device && axes.contains(index)
+            });
+            if others.count() == 0 {
                 self.join(&mut group, name, device, groups, p);
             }
+            axes.push(axis);
         }
         for name in raw.devices.iter().flat_map(|names| &names.0) {
             let Some(device) = self.device(name) else {
@@ -94,7 +104,7 @@ impl ProgramChecker<'_> {
                 );
                 continue;
             };
-            if self.devices[device].axis == Err(false) {
+            if self.axes.iter().all(|axis| axis.device != device) {
                 self.join(&mut group, name, device, groups, p);
             } else {
                 let message = format!("`{}` has an axis", name.get_ref());

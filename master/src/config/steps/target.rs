@@ -1,6 +1,6 @@
 //! Checks that targets are within limits and possible in one of the axis's modes.
 
-use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_ecat::index::AxisIndex;
 use toml::Spanned;
 
 use super::ProgramChecker;
@@ -17,7 +17,7 @@ impl ProgramChecker<'_> {
         targets: Named<f64>,
         what: TargetKind,
         p: &mut Problems<'_>,
-    ) -> Option<Vec<(DeviceIndex, f64)>> {
+    ) -> Option<Vec<(AxisIndex, f64)>> {
         let count = targets.len();
         let mut resolved = Vec::with_capacity(count);
         for (name, value) in targets {
@@ -47,7 +47,7 @@ impl ProgramChecker<'_> {
     /// Reports an axis that would take more than one hour to reach its velocity.
     pub(super) fn check_ramp_time(
         &self,
-        targets: &[(DeviceIndex, f64)],
+        targets: &[(AxisIndex, f64)],
         ramp: f64,
         at: Option<Span>,
         p: &mut Problems<'_>,
@@ -55,10 +55,10 @@ impl ProgramChecker<'_> {
     ) {
         let Some(at) = at else { return };
         let slow = targets.iter().find_map(|&(index, target)| {
-            let device = self.devices.get(index)?;
-            let limits = &device.axis.ok()?.config.limits;
+            let axis = self.axes.get(index)?;
+            let limits = &axis.setup?.config.limits;
             let velocity = velocity(target, limits.velocity);
-            Some((device.name, too_long(velocity, limits.acceleration * ramp)?))
+            Some((axis.name, too_long(velocity, limits.acceleration * ramp)?))
         });
         if let Some((name, time)) = slow {
             let message =

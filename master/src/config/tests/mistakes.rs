@@ -199,10 +199,8 @@ fn brake_output_is_exclusive() {
     let first = "output = \"io.a.Output 1\", release = \"50ms\"";
     let machine = load(first, "output = \"io.a.Output 2\"", "").unwrap();
     let output = |axis: usize| {
-        let setup = machine.devices[DeviceIndex(axis)].axis.as_ref();
-        setup
-            .and_then(|setup| setup.brake_output.as_ref())
-            .map(|s| (s.device.0, s.name.as_str()))
+        let output = machine.axes[AxisIndex(axis)].brake_output.as_ref();
+        output.map(|s| (s.device.0, s.name.as_str()))
     };
     assert_eq!(
         (output(0), output(1)),

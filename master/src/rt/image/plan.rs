@@ -134,6 +134,17 @@ pub struct TooLarge {
     pub len: usize,
 }
 
+impl DeviceRegion {
+    /// The region of a device without process data.
+    pub const EMPTY: Self = Self {
+        logical: LOGICAL_BASE,
+        frame: 0,
+        offset: 0,
+        out_len: 0,
+        in_len: 0,
+    };
+}
+
 impl ImagePlan {
     /// Returns the number of frames per cycle; the first is always sent, even without process data.
     #[must_use]

@@ -4,7 +4,7 @@ use std::fmt;
 
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Command, CommandError, HomingStatus, Mode};
-use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, GroupIndex, IndexVec};
 
 use super::{HOLD_TO_RUN_TIMEOUT, JogEvent, MAX_MANUAL_SPEED, Pending, Presence, RAMP, Request};
 use crate::clock::Nanos;
@@ -88,20 +88,16 @@ pub(super) struct JogController {
 pub(super) struct JogContext<'s> {
     pub now: Nanos,
     pub machine: &'s Machine,
-    /// The device of each axis.
-    pub axes: &'s IndexVec<AxisIndex, DeviceIndex>,
     pub snapshot: &'s Snapshot,
 }
 
 impl JogContext<'_> {
     fn setup(&self, axis: AxisIndex) -> Option<&AxisSetup> {
-        let device = self.machine.devices.get(*self.axes.get(axis)?)?;
-        device.axis.as_ref()
+        self.machine.axes.get(axis)
     }
 
     fn group(&self, axis: AxisIndex) -> GroupIndex {
-        let device = self.axes.get(axis);
-        device.map_or(GroupIndex::MACHINE, |&device| self.machine.group_of(device))
+        self.machine.group_of_axis(axis)
     }
 
     fn enabled(&self, axis: AxisIndex) -> bool {

@@ -44,8 +44,6 @@ pub struct View<'v> {
     /// The time on the run's clock.
     pub now: Nanos,
     pub machine: &'v Machine,
-    /// The device of each axis.
-    pub axes: &'v IndexVec<AxisIndex, DeviceIndex>,
     pub snapshot: &'v Snapshot,
     /// The state of each axis in manual mode.
     pub hands: &'v IndexVec<AxisIndex, JogAxis>,
@@ -62,12 +60,11 @@ impl View<'_> {
             .all(|hand| hand.doing == Activity::Nothing)
     }
 
-    /// Returns the device name of an axis.
+    /// Returns the name of an axis.
     #[must_use]
     pub fn name(&self, axis: AxisIndex) -> &str {
-        let device = self.axes.get(axis);
-        let device = device.and_then(|&device| self.machine.devices.get(device));
-        device.map_or("?", |device| device.name.as_str())
+        let axis = self.machine.axes.get(axis);
+        axis.map_or("?", |axis| axis.name.as_str())
     }
 }
 
@@ -222,7 +219,7 @@ pub fn for_manual_mode(mut machine: Machine) -> Machine {
         .filter_map(|condition| Some(machine.inputs.get(condition.input.0)?.device))
         .collect();
     let free = |&device: &DeviceIndex| {
-        machine.devices[device].axis.is_some()
+        machine.devices[device].selection.mode.is_some()
             && machine.group_of(device) == GroupIndex::MACHINE
             && !watched.contains(&device)
     };

@@ -24,16 +24,17 @@ impl Supervisor {
         operator: &mut dyn Operator,
     ) -> Result<(), Error> {
         let timeout = self.machine.bus.enable_timeout_ns + self.longest_stop();
-        let all: Vec<_> = self.axes.indices().collect();
+        let all: Vec<_> = self.machine.axes.indices().collect();
         let timeout = timeout + self.longest_release(&all);
-        let mut worker = JogController::new(self.axes.len(), timeout);
-        let (machine, axes) = (Arc::clone(&self.machine), self.axes.clone());
+        let mut worker = JogController::new(all.len(), timeout);
+        let machine = Arc::clone(&self.machine);
         // Enabled axes whose mode must be read over CoE because it is not in their process data.
         let mut enabled: Vec<AxisIndex> = Vec::new();
         let hidden = |axis: AxisIndex| {
-            let device = axes.get(axis).and_then(|&d| machine.devices.get(d));
-            let layout = device.map(|device| &device.selection.layout);
-            layout.is_some_and(|layout| layout.tx_field(MODES_OF_OPERATION_DISPLAY, 0).is_none())
+            let setup = &machine.axes[axis];
+            let display = ecaxis_esi::axis::object(MODES_OF_OPERATION_DISPLAY, setup.number);
+            let layout = &machine.devices[setup.device].selection.layout;
+            layout.tx_field(display, 0).is_none()
         };
         let just_enabled = |news: &JogEvent| match *news {
             JogEvent::Done {
@@ -48,7 +49,6 @@ impl Supervisor {
             let scene = JogContext {
                 now: clock::now(),
                 machine: &machine,
-                axes: &axes,
                 snapshot: &snapshot,
             };
             for (axis, reason) in self.refused.drain(..) {
@@ -62,7 +62,6 @@ impl Supervisor {
             let turn = operator.turn(&View {
                 now: scene.now,
                 machine: scene.machine,
-                axes: scene.axes,
                 snapshot: &snapshot,
                 hands: &worker.hands,
                 news: &news,

@@ -2,7 +2,7 @@
 
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Command, Mode};
-use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, IndexVec};
 
 use super::{Settling, Supervisor, TargetKind};
 use crate::clock::Nanos;
@@ -18,7 +18,7 @@ impl Supervisor {
         step: &Step,
         start: Nanos,
         relative: bool,
-        targets: &[(DeviceIndex, f64)],
+        targets: &[(AxisIndex, f64)],
         [speed, ramp]: [f64; 2],
     ) -> Result<(), Error> {
         let targets = self.destinations(relative, targets).await?;
@@ -36,16 +36,15 @@ impl Supervisor {
     pub(in crate::supervise) async fn destinations(
         &mut self,
         relative: bool,
-        targets: &[(DeviceIndex, f64)],
+        targets: &[(AxisIndex, f64)],
     ) -> Result<Vec<(AxisIndex, f64)>, Error> {
-        let targets = self.targets(targets);
         let turning = targets.iter().any(|&(axis, _)| self.modulo(axis));
         let origin = if relative || turning {
             self.poll_and_query().await?.axes
         } else {
             IndexVec::default()
         };
-        let there = targets.into_iter().map(|(axis, target)| {
+        let there = targets.iter().map(|&(axis, target)| {
             let from = origin.get(axis).map_or(0.0, |s| s.target_position);
             let target = if relative {
                 from + target
@@ -66,9 +65,8 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        targets: &[(DeviceIndex, Mode)],
+        targets: &[(AxisIndex, Mode)],
     ) -> Result<(), Error> {
-        let targets = self.targets(targets);
         let axes: Vec<_> = targets.iter().map(|&(axis, _)| axis).collect();
         self.settle(&axes, start).await?;
         let commands = targets.iter();

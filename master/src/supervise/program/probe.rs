@@ -6,7 +6,7 @@
 
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{Command, Edge, Probe, ProbeStatus, Source};
-use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
+use ecaxis_ecat::index::AxisIndex;
 
 use super::{Settling, Supervisor, TargetKind};
 use crate::clock::{self, Nanos};
@@ -22,7 +22,7 @@ const LATE_EDGE: Nanos = 50_000_000;
 /// The target, input and edge of a search.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ProbeMove {
-    pub device: DeviceIndex,
+    pub axis: AxisIndex,
     pub probe: Probe,
     pub edge: Edge,
     pub relative: bool,
@@ -41,18 +41,15 @@ impl Supervisor {
         search: ProbeMove,
     ) -> Result<(), Error> {
         let ProbeMove {
-            device,
+            axis,
             probe,
             speed,
             ramp,
             ..
         } = search;
-        let Some(&axis) = self.places(&[device]).first() else {
-            return Ok(());
-        };
         self.arm(step, start, axis, &search).await?;
         let there = self
-            .destinations(search.relative, &[(device, search.target)])
+            .destinations(search.relative, &[(axis, search.target)])
             .await?;
         if self.over(start) {
             return Ok(());

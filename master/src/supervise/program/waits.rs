@@ -2,7 +2,7 @@
 
 use ecaxis_axis::status::HomingStatus;
 use ecaxis_axis::{AxisStatus, Command, Mode};
-use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
+use ecaxis_ecat::index::AxisIndex;
 
 use super::{SETTLE_TIMEOUT, STANDSTILL_TIME, Supervisor};
 use crate::clock::{self, Nanos};
@@ -81,22 +81,20 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        devices: &[DeviceIndex],
+        axes: &[AxisIndex],
     ) -> Result<(), Error> {
-        let timeout = |device: &DeviceIndex| {
-            let axis = self.machine.devices[*device].axis.as_ref();
-            let ns = axis.and_then(|a| a.homing.as_ref()).map(|h| h.timeout_ns);
-            ns.unwrap_or_default() as f64 * 1e-9
+        let timeout = |axis: &AxisIndex| {
+            let homing = self.machine.axes[*axis].homing.as_ref();
+            homing.map_or(0, |homing| homing.timeout_ns) as f64 * 1e-9
         };
-        let timeouts: Vec<f64> = devices.iter().map(timeout).collect();
-        let axes = self.places(devices);
-        self.settle(&axes, start).await?;
+        let timeouts: Vec<f64> = axes.iter().map(timeout).collect();
+        self.settle(axes, start).await?;
         let commands = axes.iter().zip(&timeouts);
         self.command(commands.map(|(&axis, &timeout_s)| (axis, Command::Home { timeout_s })))
             .await;
         self.wait_until(step, start, |this, snapshot| {
             let mut homed = true;
-            for &axis in &axes {
+            for &axis in axes {
                 let status = &snapshot.axes[axis];
                 homed &= match status.homing {
                     HomingStatus::Failed(error) => {

@@ -114,10 +114,12 @@ pub(super) fn axes(
         let Some(device) = segment.devices.get(*n) else {
             continue;
         };
-        let known = segment.known.axis(device.position, reported.product);
         for axis in device.axes.seen() {
-            // The machine file describes the first axis of a device.
-            let (scale, unit) = match known.filter(|_| axis.number == 0) {
+            let number = usize::from(axis.number);
+            let known = segment
+                .known
+                .axis(device.position, reported.product, number);
+            let (scale, unit) = match known {
                 Some((scale, unit)) => (Some(scale), unit.clone()),
                 None => (None, "counts".to_owned()),
             };
