@@ -9,9 +9,12 @@ use ecaxis_master::config::Machine;
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
 use ecaxis_master::session::{self, Options, Outcome, simulated_bus};
+use ecaxis_sim::Segment;
 use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::recordings::{LRW, datagrams};
 use ecaxis_test_support::{Heard, faults, machine, recorded, run_badly, run_well, virtual_time};
+
+use crate::states::run_changed;
 
 const MS: Nanos = 1_000_000;
 const LIMITS: &str = "limits = { position = [-1000.0, 1000.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 1.0 }";
@@ -47,6 +50,26 @@ fn a_device_that_does_not_take_the_time_runs_without_sync0_only() {
             .iter()
             .all(|axis| axis.final_error_counts == Some(0))
     );
+}
+
+/// ETG.1020: a device may need SYNC0 before SafeOp and refuses with 0x002D until it runs. SOEM's
+/// `ec_dcsync0` and its samples start SYNC0 before SafeOp for such devices.
+#[test]
+fn safe_op_is_requested_again_once_sync0_runs() {
+    let waiting = |index: usize| {
+        move |segment: &mut Segment| {
+            let device = segment.device_mut(index).expect("two drives");
+            device.require_sync0_in_safe_op();
+        }
+    };
+    let (outcome, heard) = run_changed(pair("", "", ""), waiting(1));
+    outcome
+        .result
+        .unwrap_or_else(|error| panic!("{error}; {:?}", heard.warnings()));
+    // Without SYNC0, the refusal is final.
+    let (outcome, _) = run_changed(pair("", "dc = \"off\"", ""), waiting(1));
+    let error = outcome.result.expect_err("no SYNC0").to_string();
+    assert!(error.contains("`y`") && error.contains("0x002d"), "{error}");
 }
 
 /// Clock readings with an error of up to 20 µs are never within 100 ns at five drives at once.

@@ -14,7 +14,7 @@ use ecaxis_test_support::{Heard, faults, recorded, run, run_well, virtual_time};
 const MS: u64 = 1_000_000;
 
 /// Runs a machine on its simulated bus, which `change` changes first.
-fn run_changed(machine: Machine, change: impl FnOnce(&mut Segment)) -> (Outcome, Heard) {
+pub fn run_changed(machine: Machine, change: impl FnOnce(&mut Segment)) -> (Outcome, Heard) {
     let options = virtual_time();
     options.clock.enter();
     let mut bus = simulated_bus(&machine, 1, None, None).expect("a bus");

@@ -2,6 +2,7 @@
 //!
 //! Registers: AL control 0x0120, AL status 0x0130, AL status code 0x0134 (ETG.1000.4, 6.1).
 
+use std::convert::Infallible;
 use std::fmt;
 use std::time::Duration;
 
@@ -178,32 +179,32 @@ pub(crate) fn is_wire(error: &Error) -> bool {
     matches!(*error.cause, Cause::State(StateError::Wire { .. }))
 }
 
-/// Requests a lower state from every device, even if some fail. Returns the first error at the end.
+/// True for a refusal by a device that may need SYNC0 before the change: synchronization error, fatal
+/// synchronization error, no synchronization, PLL error, DC I/O error, DC time-out (ETG.1020).
+pub(crate) fn awaits_sync(error: &Error) -> bool {
+    const CODES: [u16; 6] = [0x001a, 0x002c, 0x002d, 0x0032, 0x0033, 0x0034];
+    let Cause::State(StateError::Refused { code, .. }) = &*error.cause else {
+        return false;
+    };
+    CODES.contains(code)
+}
+
+/// Requests a lower state from all devices at the same time, even if some fail. Returns the first
+/// error at the end; one of the wire comes first.
 pub async fn lower_state(
     wire: &impl MailboxTransport,
     transitions: &[Transition<'_>],
     wanted: AlState,
 ) -> Result<(), Error> {
-    let mut trouble = None;
-    for transition in transitions {
-        if let Err(error) = request(wire, transition.device, wanted).await {
-            let silent = is_wire(&error);
-            trouble.get_or_insert(error);
-            // The wire failed, not a device: the other devices would only time out.
-            if silent {
-                break;
-            }
-        }
-    }
-    if !trouble.as_ref().is_some_and(is_wire) {
-        for transition in transitions {
-            let one = std::slice::from_ref(transition);
-            if let Err(error) = wait_state(wire, one, wanted).await {
-                trouble.get_or_insert(error);
-            }
-        }
-    }
-    trouble.map_or(Ok(()), Err)
+    let changes = transitions.iter().map(async |transition| {
+        let one = std::slice::from_ref(transition);
+        Ok::<_, Infallible>(change_states(wire, one, wanted).await)
+    });
+    let Ok(changes) = try_join_all(changes).await;
+    let mut errors: Vec<Error> = changes.into_iter().filter_map(Result::err).collect();
+    // `false` comes first.
+    errors.sort_by_key(|error| !is_wire(error));
+    errors.into_iter().next().map_or(Ok(()), Err)
 }
 
 /// Acknowledges an error that the device still has, then requests a state.

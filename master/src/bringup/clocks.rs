@@ -138,6 +138,14 @@ pub(super) async fn configure(
     Err(Cause::NoStart.with_device(&reference))
 }
 
+/// Waits until all devices have seen pulses of SYNC0.
+pub(super) async fn await_pulses(wire: &DatagramClient, plan: &ClockPlan) {
+    const PULSES: u64 = 5;
+    let begun = plan.release_at.saturating_add(PULSES * plan.cycle_ns);
+    let wait = begun.saturating_sub(wire.now());
+    wire.delay(Duration::from_nanos(wait)).await;
+}
+
 /// Stops SYNC0 and SYNC1 of devices that are back in PreOp or Init. Active pulses would indicate a
 /// running MainDevice.
 pub(crate) async fn stop(wire: &impl MailboxTransport, stations: impl Iterator<Item = u16>) {

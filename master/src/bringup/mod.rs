@@ -330,10 +330,19 @@ async fn set_up(
     let dc = clocks::configure(wire, machine, devices, &image, progress);
     let dc = times.measure("SYNC0", None, dc).await?;
 
-    let changes = devices.iter().map(|device| {
+    let each = machine.devices.iter().zip(&*devices);
+    let changes = each.map(|(config, device)| {
         let change = async {
             let transition = [device.transition(AlState::SafeOp, false)];
-            al::change_states(wire, &transition, AlState::SafeOp).await
+            let changed = al::change_states(wire, &transition, AlState::SafeOp).await;
+            match (&changed, config.selection.dc.is_some(), &dc) {
+                (Err(error), true, Some(plan)) if al::awaits_sync(error) => {
+                    tracing::debug!("{error}; requested again once SYNC0 runs");
+                    clocks::await_pulses(wire, plan).await;
+                    al::change_states(wire, &transition, AlState::SafeOp).await
+                }
+                _ => changed,
+            }
         };
         times.measure("SafeOp", Some(&device.at.name), change)
     });

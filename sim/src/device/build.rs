@@ -313,6 +313,7 @@ impl SimDevice {
             forced_aborts: Vec::new(),
             ignored_writes: Vec::new(),
             mailbox_silent: false,
+            sync0_before_safe_op: false,
         };
         sim.power_on(0);
         Ok(sim)

@@ -153,6 +153,9 @@ impl SimDevice {
             AlState::SafeOp if self.is_stopped() => Err(code::NO_VALID_FIRMWARE),
             AlState::SafeOp if rising => {
                 self.check_process_data(to)?;
+                if self.sync0_before_safe_op && self.sync0_pulses() == 0 {
+                    return Err(code::NO_SYNC_ERROR);
+                }
                 self.check_sync()
             }
             AlState::Op => {

@@ -172,6 +172,7 @@ pub struct SimDevice {
     pub(crate) forced_aborts: Vec<(u16, u8, u32)>,
     pub(crate) ignored_writes: Vec<(u16, u8)>,
     mailbox_silent: bool,
+    sync0_before_safe_op: bool,
 }
 
 impl SimDevice {
@@ -287,6 +288,11 @@ impl SimDevice {
     /// Sets [`DeviceOptions::state_change_ns`]. The time to read AL control stays.
     pub fn set_state_change(&mut self, ns: Nanos) {
         self.state_change_ns = ns.max(self.state_notice_ns);
+    }
+
+    /// Makes the device refuse SafeOp until SYNC0 has fired, as some do.
+    pub fn require_sync0_in_safe_op(&mut self) {
+        self.sync0_before_safe_op = true;
     }
 
     /// Stops the application, like a crashed processor with a running controller, or resumes it. A
