@@ -11,7 +11,7 @@ use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config;
 use ecaxis_master::rt::cycle::Engine;
-use ecaxis_master::session::{Options, RunBuilder};
+use ecaxis_master::session::{Attachments, Options, RunBuilder};
 
 /// Returns a machine of `count` CSP axes at 1 ms.
 fn machine(count: usize) -> String {
@@ -45,7 +45,7 @@ fn whole_cycle(c: &mut Criterion) {
             options: &options,
             stop,
             progress,
-            controller: None,
+            attachments: Attachments::default(),
         };
         let prepared = job.prepare().expect("comes up");
         let mut engine = Engine::new(prepared.parts);

@@ -10,6 +10,7 @@
 //! - [`supervise`]: all work outside the cycle while the machine runs;
 //! - [`bringup`]: the way from power-up to SafeOp; may block and allocate;
 //! - [`rt`]: the cycle; must not block or allocate;
+//! - [`samples`]: the values of every cycle, for other threads and processes;
 //! - [`mailbox`]: CoE and FoE over raw datagrams, also during operation;
 //! - [`acyclic`]: access to a bus without a cycle, in the state in which it is;
 //! - [`link`]: transports for Ethernet frames;
@@ -38,6 +39,7 @@ pub mod post_mortem;
 pub mod recording;
 pub mod report;
 pub mod rt;
+pub mod samples;
 pub mod session;
 pub mod supervise;
 pub mod sys;

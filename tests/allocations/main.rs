@@ -19,8 +19,12 @@ use ecaxis_master::mailbox::DeviceMailbox;
 use ecaxis_master::recording::Direction;
 use ecaxis_master::rt::controller::{Controller, CycleContext};
 use ecaxis_master::rt::cycle::{Engine, EngineReport};
-use ecaxis_master::session::{Cause, Error, Options, Prepared, Progress, RunBuilder};
+use ecaxis_master::samples::{SampleLayout, Samples};
+use ecaxis_master::session::{Attachments, Cause, Error, Options, Prepared, Progress, RunBuilder};
 use ecaxis_test_support::{axes, faults, load, machine, virtual_time};
+
+/// The machine time whose samples are kept.
+const SAMPLES_NS: u64 = 1_000_000_000;
 
 thread_local! {
     static METERED: Cell<bool> = const { Cell::new(false) };
@@ -146,12 +150,18 @@ fn metered_among_users(
     options.clock.enter();
     let (progress, reported) = channel();
     let stop = Arc::<CancelToken>::default();
+    // Every cycle also writes its sample.
+    let samples = Samples::create(SampleLayout::new(&machine), SAMPLES_NS).expect("memory");
     let job = RunBuilder {
         machine: &Arc::new(machine),
         options,
         stop,
         progress,
-        controller,
+        attachments: Attachments {
+            controller,
+            samples: samples.writer(),
+            ..Attachments::default()
+        },
     };
     let Prepared {
         mut parts,

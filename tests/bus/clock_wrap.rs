@@ -10,7 +10,7 @@ use ecaxis_master::config::Machine;
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
 use ecaxis_master::rt::cycle::Engine;
-use ecaxis_master::session::{Prepared, RunBuilder};
+use ecaxis_master::session::{Attachments, Prepared, RunBuilder};
 use ecaxis_sim::chip::EscInfo;
 use ecaxis_sim::{DeviceOptions, Segment, SegmentOptions, SimDevice};
 use ecaxis_test_support::{machine, virtual_time};
@@ -128,7 +128,7 @@ fn lock(
         options: &options,
         stop: Arc::<CancelToken>::default(),
         progress,
-        controller: None,
+        attachments: Attachments::default(),
     };
     let Prepared {
         parts,

@@ -13,7 +13,7 @@ use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
 use ecaxis_master::rt::cycle::Engine;
 use ecaxis_master::rt::phase::{Gains, Phase};
-use ecaxis_master::session::{Prepared, Progress, RunBuilder, simulated_bus};
+use ecaxis_master::session::{Attachments, Prepared, Progress, RunBuilder, simulated_bus};
 use ecaxis_test_support::{machine, virtual_time};
 
 const DRIVES: usize = 3;
@@ -123,7 +123,7 @@ fn keep(cycle: &str, seed: u64, gains: Gains, seconds: u64) -> Kept {
         options: &options,
         stop,
         progress,
-        controller: None,
+        attachments: Attachments::default(),
     };
     let Prepared {
         mut parts,

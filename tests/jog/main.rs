@@ -8,9 +8,9 @@ mod terminal;
 
 use ecaxis_axis::{Mode, State, Trip};
 use ecaxis_ecat::index::AxisIndex;
-use ecaxis_master::supervise::jog::{
-    Activity, HOLD_TO_RUN_TIMEOUT, JogEvent, MAX_MANUAL_SPEED, OperatorInput, Presence, Request,
-    View,
+use ecaxis_master::supervise::operator::{
+    Activity, HOLD_TO_RUN_TIMEOUT, MAX_MANUAL_SPEED, OperatorInput, Presence, Request,
+    RequestEvent, View,
 };
 use ecaxis_test_support::{axes, faults, machine, virtual_time};
 use operator::{Seen, by_hand, here, request};
@@ -90,19 +90,9 @@ fn a_released_axis_brakes() {
     assert!((held - (1.0 + LET_GO_S)).abs() < 0.02, "{held} s at speed");
     let braking = stands - slows;
     assert!(braking <= velocity / ACCELERATION + 0.005, "{braking} s");
-    let news: Vec<_> = seen.iter().flat_map(|s| s.news.clone()).collect();
-    let reported = [
-        JogEvent::Done {
-            axis: X,
-            what: Activity::Enabling,
-        },
-        JogEvent::LetGo { axis: X },
-        JogEvent::Done {
-            axis: X,
-            what: Activity::Stopping,
-        },
-    ];
-    assert_eq!(news, reported);
+    let news = seen.iter().flat_map(|s| &s.news);
+    let news: Vec<String> = news.map(ToString::to_string).collect();
+    assert_eq!(news, ["enabled", "let go, brakes", "stopped"]);
 }
 
 #[test]
@@ -220,7 +210,7 @@ fn jog_rejects_more_than_a_quarter_of_the_speed_limit() {
         machine(&axes(1)),
         virtual_time(),
         once_enabled(move |view, since| {
-            if since == 0.0 || view.news.iter().any(JogEvent::is_failure) {
+            if since == 0.0 || view.news.iter().any(RequestEvent::is_failure) {
                 return next.next().map(request);
             }
             (since < 5.0).then(here)
@@ -229,7 +219,7 @@ fn jog_rejects_more_than_a_quarter_of_the_speed_limit() {
     outcome.result.expect("leaving is no failure");
     assert!(seen.iter().all(|s| s.axes[0].target_velocity == 0.0));
     let refused = seen.iter().flat_map(|s| &s.news);
-    let refused = refused.filter(|news| matches!(news, JogEvent::Refused { .. }));
+    let refused = refused.filter(|news| matches!(news, RequestEvent::Refused { .. }));
     assert_eq!(refused.count(), all.len());
 }
 
@@ -362,7 +352,7 @@ fn an_emergency_stop_removes_power_and_requires_a_reset() {
                         assert!(!axis.enabled && axis.trip == Some(Trip::EmergencyStop));
                         (3, request(Request::Enable { axis: X }))
                     }
-                    3 if view.news.iter().any(JogEvent::is_failure) => {
+                    3 if view.news.iter().any(RequestEvent::is_failure) => {
                         assert!(!axis.enabled);
                         let enable = Request::Reset { axis: X };
                         (if reset { 4 } else { 6 }, request(enable))
@@ -441,8 +431,8 @@ fn jog_homes_an_axis_and_switches_its_mode() {
     outcome.result.expect("leaving is no failure");
     within_limits(&seen, 0);
     let news = seen.iter().flat_map(|s| s.news.clone());
-    let done: Vec<JogEvent> = news
-        .filter(|news| !matches!(news, JogEvent::LetGo { .. }))
+    let done: Vec<RequestEvent> = news
+        .filter(|news| !matches!(news, RequestEvent::LetGo { .. }))
         .collect();
     let done: Vec<String> = done.iter().map(ToString::to_string).collect();
     assert_eq!(done, ["enabled", "homed", "is there", "in CSV", "stopped"]);

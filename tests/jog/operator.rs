@@ -6,7 +6,9 @@ use std::sync::{Arc, Mutex};
 use ecaxis_axis::AxisStatus;
 use ecaxis_master::config::Machine;
 use ecaxis_master::session::{self, Options, Outcome};
-use ecaxis_master::supervise::jog::{JogEvent, Operator, OperatorInput, Presence, Request, View};
+use ecaxis_master::supervise::operator::{
+    Operator, OperatorInput, Presence, Request, RequestEvent, View,
+};
 
 use ecaxis_test_support::Heard;
 
@@ -16,7 +18,7 @@ pub struct Seen {
     /// The time of the cycle since the first cycle.
     pub time_s: f64,
     pub axes: Vec<AxisStatus>,
-    pub news: Vec<JogEvent>,
+    pub news: Vec<RequestEvent>,
 }
 
 pub fn here() -> OperatorInput {
@@ -53,10 +55,12 @@ impl<F: FnMut(&View<'_>, f64) -> OperatorInput + Send> Operator for Plan<F> {
     fn turn(&mut self, view: &View<'_>) -> OperatorInput {
         let began = *self.began.get_or_insert(view.now);
         let time_s = (view.now - began) as f64 * 1e-9;
+        let replaced = |event: &&RequestEvent| matches!(event, RequestEvent::Replaced { .. });
+        let news = view.news.iter().filter(|event| !replaced(event));
         self.seen.lock().expect("no panic").push(Seen {
             time_s: (view.snapshot.time.saturating_sub(began)) as f64 * 1e-9,
             axes: view.snapshot.axes.to_vec(),
-            news: view.news.to_vec(),
+            news: news.cloned().collect(),
         });
         (self.plan)(view, time_s)
     }

@@ -3,7 +3,9 @@
 
 use ecaxis_axis::Mode;
 use ecaxis_ecat::index::AxisIndex;
-use ecaxis_master::supervise::jog::{Activity, JogEvent, OperatorInput, Presence, Request, View};
+use ecaxis_master::supervise::operator::{
+    Activity, OperatorInput, Presence, Request, RequestEvent, View,
+};
 
 use super::operator::{Seen, by_hand, gone, here, request};
 use super::{LET_GO_S, VERSATILE, X, Y, once_enabled, within_limits};
@@ -149,10 +151,10 @@ fn every_rejection_is_reported() {
     );
     outcome.result.expect("leaving is no failure");
     let news = seen.iter().flat_map(|s| s.news.clone());
-    let news: Vec<JogEvent> = news
-        .skip_while(|news| matches!(news, JogEvent::Done { .. }))
+    let news: Vec<RequestEvent> = news
+        .skip_while(|news| matches!(news, RequestEvent::Done { .. }))
         .collect();
-    let refused = |n: usize| matches!(&news[n], JogEvent::Refused { axis, .. } if axis.0 == n);
+    let refused = |n: usize| matches!(&news[n], RequestEvent::Refused { axis, .. } if axis.0 == n);
     assert!(news.len() == 2 && refused(0) && refused(1), "{news:?}");
 }
 
@@ -185,6 +187,6 @@ fn rejected_homing_counts_as_finished() {
     );
     outcome.result.expect("leaving is no failure");
     let news = seen.iter().flat_map(|s| &s.news);
-    let refused = news.filter(|news| matches!(news, JogEvent::Refused { .. }));
+    let refused = news.filter(|news| matches!(news, RequestEvent::Refused { .. }));
     assert_eq!(refused.count(), 2);
 }

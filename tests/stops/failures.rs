@@ -13,7 +13,7 @@ use ecaxis_master::clock::Nanos;
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
 use ecaxis_master::rt::cycle::Engine;
-use ecaxis_master::session::{Cause, Options, RunBuilder, simulated_bus};
+use ecaxis_master::session::{Attachments, Cause, Options, RunBuilder, simulated_bus};
 use ecaxis_test_support::recordings::{FPWR, Frame, LRD, LRW, frames};
 use ecaxis_test_support::{faults, machine, recorded, run, run_badly, run_well, virtual_time};
 
@@ -545,7 +545,7 @@ fn a_panic_in_the_cycle_brings_the_axes_to_rest() {
             options: &options,
             stop: Arc::<CancelToken>::default(),
             progress,
-            controller: None,
+            attachments: Attachments::default(),
         };
         let prepared = job.prepare_on(Box::new(link)).expect("comes up");
         let mut engine = Engine::new(prepared.parts);

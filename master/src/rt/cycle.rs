@@ -17,6 +17,7 @@ use super::heartbeat;
 use super::image::SignalBits;
 use super::phase::Phase;
 use super::reaction_group::{GroupStatus, ReactionGroup};
+use super::samples::{CycleSample, SampleWriter, flags};
 use super::setpoint_generator::GeneratorState;
 use super::spin::SpinWindow;
 use super::stats::Stats;
@@ -78,7 +79,12 @@ pub struct Engine {
     started: Nanos,
     margin: SpinWindow,
     plain: Plain,
+    samples: Option<SampleWriter>,
     answer: CycleResult,
+    /// The time from the planned release to the last answer of this cycle.
+    round_trip: Option<Nanos>,
+    /// The duration of the last cycle's work.
+    work: Nanos,
     events_lost: u64,
     commands_taken: u64,
     /// Frames of other MainDevices so far.
@@ -100,6 +106,7 @@ pub struct EngineConfig {
     pub axes: IndexVec<AxisIndex, RtAxis>,
     pub signals: Signals,
     pub controller: Option<Box<dyn Controller>>,
+    pub samples: Option<SampleWriter>,
     pub tables: Box<[Table]>,
     pub phase: Option<Phase>,
     pub end: RtEndpoint,
@@ -178,7 +185,10 @@ impl Engine {
             started,
             margin: SpinWindow::new(config.spin, config.cycle_ns, mode),
             config,
+            samples: parts.samples,
             answer: CycleResult::default(),
+            round_trip: None,
+            work: 0,
             events_lost: 0,
             commands_taken: 0,
             halted: false,
@@ -258,7 +268,8 @@ impl Engine {
         self.exchange.stage();
         self.publish(woke, lateness);
         self.schedule_next_cycle(adjust);
-        self.stats.work.record(clock::now().saturating_sub(woke));
+        self.work = clock::now().saturating_sub(woke);
+        self.stats.work.record(self.work);
     }
 
     fn watch_bus(&mut self) {
@@ -391,6 +402,26 @@ impl Engine {
             self.phase_error,
         );
         self.history.keep(cycle, snapshot.axes.iter());
+        if let Some(samples) = &mut self.samples {
+            let locked = snapshot.phase.is_some_and(|phase| phase.locked);
+            let bits = [
+                (flags::FRESH, snapshot.inputs_fresh),
+                (flags::IN_OP, self.guarding),
+                (flags::STOPPING, snapshot.stopping.is_some()),
+                (flags::PHASE_LOCKED, locked),
+            ];
+            let sample = CycleSample {
+                time: woke,
+                number,
+                flags: bits.iter().map(|(bit, set)| bit * u64::from(*set)).sum(),
+                wake_up: lateness,
+                exchange: self.round_trip,
+                phase_error: snapshot.phase.map(|phase| phase.error_ns),
+                work: self.work,
+                next: self.next + self.config.cycle_ns,
+            };
+            samples.write(&sample, &snapshot.axes, &snapshot.inputs);
+        }
         self.end.snapshots.publish();
     }
 

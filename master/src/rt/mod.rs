@@ -12,6 +12,7 @@
 //! - [`stats`]: bounded histograms and counters;
 //! - [`event_log`]: the events of the cycle, in order;
 //! - [`flight_recorder`]: the state of the last cycles;
+//! - [`samples`]: a row of values for every cycle, for other threads and processes;
 //! - [`heartbeat`]: detects a dead supervisor thread;
 //! - [`channel`]: the queues to and from the other threads;
 //! - [`controller`]: user code in the cycle;
@@ -42,6 +43,7 @@ pub mod heartbeat;
 pub mod image;
 pub mod phase;
 pub mod reaction_group;
+pub mod samples;
 pub mod setpoint_generator;
 pub mod spin;
 pub mod stats;

@@ -21,8 +21,9 @@ use crate::link::Link;
 use crate::post_mortem::FaultReport;
 use crate::rt::controller::Controller;
 use crate::rt::cycle::EngineReport;
+use crate::rt::samples::SampleWriter;
 use crate::rt::stats::Stats;
-use crate::supervise::jog::{self, Operator};
+use crate::supervise::operator::{self, Operator};
 
 mod bus;
 mod cycle_thread;
@@ -115,6 +116,19 @@ impl From<Error> for Outcome {
     }
 }
 
+/// What takes part in a run besides the machine file.
+#[derive(Debug, Default)]
+pub struct Attachments {
+    /// User code in the cycle. Without an operator it replaces the program of the file.
+    pub controller: Option<Box<dyn Controller>>,
+    /// The operator replaces the program of the file, and may start it.
+    pub operator: Option<Box<dyn Operator>>,
+    /// The writer of every cycle's values.
+    pub samples: Option<SampleWriter>,
+    /// The link in place of the file's `nic`.
+    pub link: Option<Box<dyn Link>>,
+}
+
 /// Runs a machine until its program, its time limit, `stop` ([`stop_on_signals`]) or an error ends
 /// the run. Blocks, and reports progress to the observer. If the observer panics, the machine stops
 /// before the panic resumes.
@@ -124,7 +138,7 @@ pub fn run(
     stop: Arc<CancelToken>,
     observer: &mut dyn Observer,
 ) -> Outcome {
-    start(machine, options, stop, observer, ProgramSource::None, None)
+    run_attached(machine, options, stop, observer, Attachments::default())
 }
 
 /// Like [`run`], on the given link instead of the file's `nic`.
@@ -135,14 +149,11 @@ pub fn run_on(
     stop: Arc<CancelToken>,
     observer: &mut dyn Observer,
 ) -> Outcome {
-    start(
-        machine,
-        options,
-        stop,
-        observer,
-        ProgramSource::None,
-        Some(link),
-    )
+    let attachments = Attachments {
+        link: Some(link),
+        ..Attachments::default()
+    };
+    run_attached(machine, options, stop, observer, attachments)
 }
 
 /// Like [`run`], with the given controller instead of the file's program. All axes are enabled,
@@ -155,13 +166,16 @@ pub fn run_with(
     observer: &mut dyn Observer,
     controller: Box<dyn Controller>,
 ) -> Outcome {
-    let controller = ProgramSource::Controller(controller);
-    start(machine, options, stop, observer, controller, None)
+    let attachments = Attachments {
+        controller: Some(controller),
+        ..Attachments::default()
+    };
+    run_attached(machine, options, stop, observer, attachments)
 }
 
 /// Like [`run`], with an operator instead of the file's program. Axes are enabled and moved on
-/// request until the operator leaves or anything else ends the run. [`jog::for_manual_mode`] lists
-/// what differs from the machine file.
+/// request until the operator leaves or anything else ends the run.
+/// [`operator::for_manual_mode`] lists what differs from the machine file.
 pub fn run_with_operator(
     machine: Machine,
     options: Options,
@@ -169,30 +183,25 @@ pub fn run_with_operator(
     observer: &mut dyn Observer,
     operator: Box<dyn Operator>,
 ) -> Outcome {
-    let machine = jog::for_manual_mode(machine);
-    let options = Options {
-        enable: true,
-        ..options
+    let attachments = Attachments {
+        operator: Some(operator),
+        ..Attachments::default()
     };
-    let operator = ProgramSource::Operator(operator);
-    start(machine, options, stop, observer, operator, None)
+    run_attached(machine, options, stop, observer, attachments)
 }
 
-/// What controls the axes.
-enum ProgramSource {
-    None,
-    Controller(Box<dyn Controller>),
-    Operator(Box<dyn Operator>),
-}
-
-fn start(
-    machine: Machine,
-    options: Options,
+/// Like [`run`], with attachments. With an operator, the changes of [`run_with_operator`] apply.
+pub fn run_attached(
+    mut machine: Machine,
+    mut options: Options,
     stop: Arc<CancelToken>,
     observer: &mut dyn Observer,
-    instead: ProgramSource,
-    link: Option<Box<dyn Link>>,
+    attachments: Attachments,
 ) -> Outcome {
+    if attachments.operator.is_some() {
+        machine = operator::for_manual_mode(machine);
+        options.enable = true;
+    }
     report_panics_briefly();
     let (progress, reported) = channel();
     let stopped = Arc::clone(&stop);
@@ -200,7 +209,7 @@ fn start(
         .name(RT_THREAD.to_owned())
         .stack_size(STACK)
         .spawn(move || {
-            run_on_link_thread(&Arc::new(machine), &options, stop, progress, instead, link)
+            run_on_link_thread(&Arc::new(machine), &options, stop, progress, attachments)
         });
     let owner = match owner {
         Ok(owner) => owner,
@@ -243,32 +252,24 @@ fn run_on_link_thread(
     options: &Options,
     stop: Arc<CancelToken>,
     progress: Sender<Progress>,
-    instead: ProgramSource,
-    link: Option<Box<dyn Link>>,
+    mut attachments: Attachments,
 ) -> Outcome {
     options.clock.enter();
     let reported = progress.clone();
     let mut seen = BringUpEvidence::default();
-    let (controller, operator) = match instead {
-        ProgramSource::None => (None, None),
-        ProgramSource::Controller(controller) => (Some(controller), None),
-        ProgramSource::Operator(operator) => (None, Some(operator)),
-    };
+    let link = attachments.link.take();
     let job = RunBuilder {
         machine,
         options,
         stop,
         progress,
-        controller,
+        attachments,
     };
     let prepared = match link {
         Some(link) => job.prepare_with(link, &mut seen),
         None => job.prepare_with_evidence(&mut seen),
     };
-    let Prepared {
-        parts,
-        mut supervisor,
-    } = match prepared {
+    let Prepared { parts, supervisor } = match prepared {
         Ok(prepared) => prepared,
         Err(error) => {
             return Outcome {
@@ -277,7 +278,6 @@ fn run_on_link_thread(
             };
         }
     };
-    supervisor.operator = operator;
     let wire = supervisor.wire;
     let places = fault_evidence::places(&supervisor.bus);
     let log = supervisor.log.clone();

@@ -11,7 +11,7 @@ use ecaxis_ecat::registers;
 use ethercrab::{Command as Datagram, MainDevice};
 
 use super::fault_evidence::BringUpEvidence;
-use super::{Cause, EmergencyLog, Error, Options, Progress, open, panic_text};
+use super::{Attachments, Cause, EmergencyLog, Error, Options, Progress, open, panic_text};
 use crate::acyclic::{AlState, al};
 use crate::bringup::{Bus, Step, bring_up};
 use crate::cancel::CancelToken;
@@ -27,7 +27,6 @@ use crate::post_mortem::snapshot::{self, Depth};
 use crate::report::FailedStep;
 use crate::rt::axis::RtAxis;
 use crate::rt::channel::channel;
-use crate::rt::controller::Controller;
 use crate::rt::cycle::{EngineConfig, Signals, first_snapshot};
 use crate::rt::exchange::{Exchange, ExchangeDevice};
 use crate::rt::image::{self, AxisBits, BitField, DeviceRegion, ImagePlan, NotMapped, SignalBits};
@@ -50,8 +49,7 @@ pub struct RunBuilder<'a> {
     pub stop: Arc<CancelToken>,
     /// The receiver of progress reports.
     pub progress: Sender<Progress>,
-    /// The controller that replaces the file's program.
-    pub controller: Option<Box<dyn Controller>>,
+    pub attachments: Attachments,
 }
 
 impl RunBuilder<'_> {
@@ -89,7 +87,7 @@ impl RunBuilder<'_> {
             options,
             stop,
             progress,
-            controller,
+            attachments,
         } = self;
         let (image, ..) = plan(machine)?;
         let (main_device, mut port) = main_device(machine.bus.cycle_ns, machine.pre_op_timeout());
@@ -127,6 +125,12 @@ impl RunBuilder<'_> {
                 let (mailboxes, workers) =
                     mailbox_workers(&mut bus, wire, &exchange, machine.bus.cycle_ns, &log);
                 let _ = progress.send(Progress::Mailboxes(mailboxes.clone()));
+                let Attachments {
+                    controller,
+                    operator,
+                    samples,
+                    link: _,
+                } = attachments;
                 let controlled = controller.is_some();
                 let parts = EngineConfig {
                     clock,
@@ -137,6 +141,7 @@ impl RunBuilder<'_> {
                     axes: slots,
                     signals,
                     controller,
+                    samples,
                     tables: machine.tables.iter().map(|t| t.table.clone()).collect(),
                     phase: bus.dc.as_ref().map(Phase::new),
                     end: rt_end,
@@ -155,7 +160,8 @@ impl RunBuilder<'_> {
                     limit: options.limit,
                     enable: options.enable,
                     controlled,
-                    operator: None,
+                    operator,
+                    attendance: None,
                     seen: Vec::new(),
                     limited: vec![false; machine.axes.len()].into(),
                     commands_sent: 0,

@@ -34,7 +34,7 @@ mod coordinated;
 pub(crate) mod diagnosis_history;
 mod explain;
 mod groups;
-pub mod jog;
+pub mod operator;
 mod program;
 
 /// The period at which the supervisor reads the cycle's snapshot.
@@ -70,7 +70,9 @@ pub struct Supervisor {
     /// `true` if a controller replaces the program.
     pub controlled: bool,
     /// The operator that replaces the program.
-    pub operator: Option<Box<dyn jog::Operator>>,
+    pub operator: Option<Box<dyn operator::Operator>>,
+    /// The operator at work.
+    pub(crate) attendance: Option<Box<operator::Attendance>>,
     /// Axes whose faults and trips the operator has seen.
     pub seen: Vec<AxisIndex>,
     /// The number of commands sent to the cycle so far.
@@ -159,11 +161,11 @@ impl Supervisor {
         if !self.enable {
             return self.hold(clock::now()).await;
         }
+        if let Some(operator) = self.operator.take() {
+            return self.run_operator(operator, ended).await;
+        }
         if self.controlled {
             return self.follow_controller(ended).await;
-        }
-        if let Some(mut operator) = self.operator.take() {
-            return self.run_operator(operator.as_mut()).await;
         }
         if !enables(&self.machine.steps) {
             let all: Vec<_> = self.machine.axes.indices().collect();
@@ -374,6 +376,7 @@ impl Supervisor {
         {
             return Err(self.explain_stop(cause, None, &snapshot).await);
         }
+        self.attend(&snapshot).await?;
         Ok(snapshot)
     }
 

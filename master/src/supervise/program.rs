@@ -130,6 +130,7 @@ impl Supervisor {
                 if self.over(start) {
                     return Ok(());
                 }
+                self.await_program_step().await?;
                 if let Action::Repeat { times, steps } = &step.action {
                     for _ in 0..*times {
                         let begun = clock::now();

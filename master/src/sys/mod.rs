@@ -5,6 +5,7 @@
 //! - [`ethtool`]: queries to a network driver;
 //! - [`ring`]: the receive ring that is shared with the kernel;
 //! - [`process`]: the resource usage of a thread, and the settings of the heap;
+//! - [`shared_memory`]: memory that other processes can map;
 //! - [`signal`]: the signals that the process ignores.
 //!
 //! And what blocks or opens files, without unsafe code:
@@ -25,6 +26,7 @@ pub mod process;
 pub mod ring;
 #[deny(unsafe_code)]
 pub mod rt_thread;
+pub mod shared_memory;
 pub mod signal;
 
 use std::io;

@@ -199,6 +199,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
         axes: slots.into(),
         signals,
         controller: None,
+        samples: None,
         tables: Box::default(),
         phase: Some(Phase::new(&clock)),
         end,

@@ -22,7 +22,7 @@ use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
 use ecaxis_master::mailbox::MailboxTransport;
 use ecaxis_master::rt::cycle::Engine;
 use ecaxis_master::session::run_on_link;
-use ecaxis_master::session::{self, Prepared, RunBuilder, simulated_bus};
+use ecaxis_master::session::{self, Attachments, Prepared, RunBuilder, simulated_bus};
 
 const STACK: usize = 16 * 1024 * 1024;
 
@@ -231,7 +231,7 @@ fn ran_well(link: &Shared, machine: &Arc<Machine>) -> bool {
         options: &options,
         stop,
         progress,
-        controller: None,
+        attachments: Attachments::default(),
     };
     let Ok(Prepared { parts, supervisor }) = job.prepare_on(own) else {
         return false;

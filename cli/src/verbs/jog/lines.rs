@@ -11,8 +11,8 @@ use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config::{Machine, duration, nearest};
 use ecaxis_master::session::{self, Observer, Options, Progress};
-use ecaxis_master::supervise::jog::{
-    MAX_MANUAL_SPEED, Operator, OperatorInput, Presence, Request, View,
+use ecaxis_master::supervise::operator::{
+    MAX_MANUAL_SPEED, Operator, OperatorInput, Presence, Request, RequestEvent, View,
 };
 use serde_json::json;
 
@@ -251,8 +251,9 @@ impl Operator for Script {
             requests: Vec::new(),
         };
         let began = *self.began.get_or_insert(view.now);
-        for news in view.news {
-            let (axis, text) = (view.name(news.axis()), news.to_string());
+        let replaced = |event: &&RequestEvent| matches!(event, RequestEvent::Replaced { .. });
+        for news in view.news.iter().filter(|event| !replaced(event)) {
+            let (axis, text) = (view.name(news.axis().unwrap_or_default()), news.to_string());
             self.answers.news(axis, &text, news.is_failure());
             if news.is_failure() && self.fail(hints::FAILED, format!("{axis}: {text}")) {
                 return gone;

@@ -24,8 +24,8 @@ use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config::{Machine, Nic};
 use ecaxis_master::session::{self, Cause, Error, Observer, Options, Outcome, Progress};
-use ecaxis_master::supervise::jog::{
-    HOLD_TO_RUN_TIMEOUT, Operator, OperatorInput, Presence, Request, View,
+use ecaxis_master::supervise::operator::{
+    HOLD_TO_RUN_TIMEOUT, Operator, OperatorInput, Presence, Request, RequestEvent, View,
 };
 
 use crate::access::signals;
@@ -315,8 +315,9 @@ impl Operator for MachineSide {
     fn turn(&mut self, view: &View<'_>) -> OperatorInput {
         let now = view.now;
         let requests = self.hear(now);
-        for news in view.news {
-            let text = format!("{}: {news}", view.name(news.axis()));
+        let replaced = |event: &&RequestEvent| matches!(event, RequestEvent::Replaced { .. });
+        for news in view.news.iter().filter(|event| !replaced(event)) {
+            let text = format!("{}: {news}", view.name(news.axis().unwrap_or_default()));
             self.shared.show(text, news.is_failure());
         }
         let shown = self

@@ -7,7 +7,7 @@ use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, HomingStatus, Mode, State};
 use ecaxis_ecat::index::{AxisIndex, IndexVec};
 use ecaxis_master::config::{AxisSetup, TorqueUnit};
-use ecaxis_master::supervise::jog::{Activity, View};
+use ecaxis_master::supervise::operator::{Activity, View};
 use serde::Serialize;
 
 /// The modes that an axis can be switched to.
@@ -135,6 +135,8 @@ impl AxisPanel {
             Activity::Moving { by: false, value } => format!("moves to {} {unit}", number(value)),
             Activity::Enabling => "is being enabled".to_owned(),
             Activity::Disabling => "is being disabled".to_owned(),
+            Activity::Turning { velocity } => format!("turns at {} {unit}/s", number(velocity)),
+            Activity::Pressing { percent } => format!("presses with {} %", number(percent)),
             Activity::Homing => "looks for home".to_owned(),
             Activity::Switching { to } => format!("is switched to {to}"),
             Activity::Resetting => "is being reset".to_owned(),

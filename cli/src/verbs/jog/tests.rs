@@ -1,7 +1,7 @@
 //! Requests older than the hold-to-run time-out are dropped, except stops.
 
 use ecaxis_ecat::index::AxisIndex;
-use ecaxis_master::supervise::jog::Request;
+use ecaxis_master::supervise::operator::Request;
 
 use super::*;
 

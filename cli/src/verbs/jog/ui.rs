@@ -1,7 +1,9 @@
 //! Keys → requests. Independent of terminal and clock.
 
 use ecaxis_ecat::index::AxisIndex;
-use ecaxis_master::supervise::jog::{Activity, HOLD_TO_RUN_TIMEOUT, MAX_MANUAL_SPEED, Request};
+use ecaxis_master::supervise::operator::{
+    Activity, HOLD_TO_RUN_TIMEOUT, MAX_MANUAL_SPEED, Request,
+};
 
 use super::keys::Key;
 use super::panel::{AxisPanel, Panel};

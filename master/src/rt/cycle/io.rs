@@ -31,6 +31,7 @@ impl Engine {
     /// mode, takes only the frames that have already arrived.
     pub(super) fn receive(&mut self, woke: Nanos) {
         let released = self.next;
+        self.round_trip = None;
         let quarter = self.config.cycle_ns / 4;
         // After a late wake-up the frames still get time to return.
         let deadline = (released + 3 * quarter).max(woke + quarter);
@@ -50,7 +51,9 @@ impl Engine {
             }
             let now = clock::now();
             if self.exchange.complete() {
-                self.stats.round_trip.record(now.saturating_sub(released));
+                let round_trip = now.saturating_sub(released);
+                self.round_trip = Some(round_trip);
+                self.stats.round_trip.record(round_trip);
                 return;
             }
             if now >= deadline {

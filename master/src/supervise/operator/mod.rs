@@ -1,10 +1,10 @@
-//! Manual mode: an operator's requests replace the file's program.
+//! An operator's requests in place of the file's program: a person who jogs, or a server's clients.
 //!
 //! | file | |
 //! |---|---|
 //! | here | the operator interface and its requests |
-//! | `controller` | requests, time and status → commands: hold-to-run, speed limits, results |
-//! | `run` | the loop that serves the operator |
+//! | `requests` | requests, time and status → commands: hold-to-run, speed limits, results |
+//! | `run` | the loop that serves the operator, and the program that the operator starts |
 //!
 //! Nothing here is a safety function. Hold-to-run is checked outside the cycle: a computer that
 //! stalls also stalls this check.
@@ -16,13 +16,14 @@ use ecaxis_axis::Mode;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 
 use crate::clock::Nanos;
-use crate::config::{GroupStopScope, Machine, StopGroup};
+use crate::config::{GroupStopScope, Machine, OutputRef, StopGroup};
 use crate::rt::channel::Snapshot;
 
-mod controller;
+mod requests;
 mod run;
 
-pub use controller::{Activity, JogAxis};
+pub use requests::{Activity, AxisActivity};
+pub(crate) use run::Attendance;
 
 /// The time in ns after the last jog request at which the axis brakes within its limits.
 pub const HOLD_TO_RUN_TIMEOUT: Nanos = 300_000_000;
@@ -34,8 +35,36 @@ pub const RAMP: f64 = 0.25;
 
 /// An operator. Called outside the cycle, about every millisecond of the run's clock.
 pub trait Operator: Send + fmt::Debug {
-    /// Returns the operator's present requests. Must not block.
+    /// Returns the operator's present requests. Must not block, except in virtual time, which
+    /// stands meanwhile.
     fn turn(&mut self, view: &View<'_>) -> OperatorInput;
+
+    /// Returns the maximum speed and the acceleration of moves. Jogs keep [`MAX_MANUAL_SPEED`].
+    fn shares(&self) -> LimitShares {
+        LimitShares::MANUAL
+    }
+}
+
+/// Fractions of an axis's limits, above 0 and at most 1.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LimitShares {
+    /// The maximum speed of a move, as a fraction of the velocity limit.
+    pub speed: f64,
+    /// The acceleration of a move, as a fraction of the acceleration limit.
+    pub ramp: f64,
+}
+
+impl LimitShares {
+    /// The shares in manual mode.
+    pub const MANUAL: Self = Self {
+        speed: MAX_MANUAL_SPEED,
+        ramp: RAMP,
+    };
+    /// The whole limits.
+    pub const WHOLE: Self = Self {
+        speed: 1.0,
+        ramp: 1.0,
+    };
 }
 
 /// The state that an operator sees.
@@ -46,9 +75,19 @@ pub struct View<'v> {
     pub machine: &'v Machine,
     pub snapshot: &'v Snapshot,
     /// The state of each axis in manual mode.
-    pub hands: &'v IndexVec<AxisIndex, JogAxis>,
+    pub hands: &'v IndexVec<AxisIndex, AxisActivity>,
     /// Events since the last call, in order.
-    pub news: &'v [JogEvent],
+    pub news: &'v [RequestEvent],
+    /// The program that the operator has started.
+    pub program: &'v ProgramStatus,
+}
+
+/// The state of the file's program under an operator.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct ProgramStatus {
+    pub running: bool,
+    /// The program waits before its next step.
+    pub paused: bool,
 }
 
 impl View<'_> {
@@ -72,7 +111,8 @@ impl View<'_> {
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct OperatorInput {
     pub presence: Presence,
-    /// The requests in order. Beyond the first 64, only stops are accepted.
+    /// The requests in order. Beyond the first 64, only stops are accepted. All requests of an
+    /// operator are numbered from 1; events name the request by this number.
     pub requests: Vec<Request>,
 }
 
@@ -120,6 +160,18 @@ pub enum Request {
     Home {
         axis: AxisIndex,
     },
+    /// Moves at this velocity until another request, at most at the operator's share of the limit.
+    Velocity {
+        axis: AxisIndex,
+        velocity: f64,
+    },
+    /// Applies a torque in percent of the rated torque, in CST.
+    Torque {
+        axis: AxisIndex,
+        percent: f64,
+        /// The time in s from the present to the new torque.
+        ramp_s: f64,
+    },
     SetMode {
         axis: AxisIndex,
         mode: Mode,
@@ -132,62 +184,154 @@ pub enum Request {
     Stop {
         axis: AxisIndex,
     },
+    /// Triggers the drive's quick stop (0x605A).
+    QuickStop {
+        axis: AxisIndex,
+    },
     StopAll,
+    /// Sets an output that no axis drives.
+    SetOutput {
+        output: OutputRef,
+        value: f64,
+    },
+    /// Scales the speed of all moves and velocities; above 0 and at most 1. A move to a position
+    /// follows at once, other motions from the next on.
+    Override {
+        factor: f64,
+    },
+    Program(ProgramRequest),
     /// Stops all axes and removes power as fast as possible, as configured for each axis.
     EmergencyStop,
 }
 
 impl Request {
+    /// Returns the axis; `None` for requests to all axes, to outputs and to the program.
+    #[must_use]
+    pub fn axis(&self) -> Option<AxisIndex> {
+        match *self {
+            Self::Enable { axis }
+            | Self::Disable { axis }
+            | Self::Jog { axis, .. }
+            | Self::MoveBy { axis, .. }
+            | Self::MoveTo { axis, .. }
+            | Self::Home { axis }
+            | Self::Velocity { axis, .. }
+            | Self::Torque { axis, .. }
+            | Self::SetMode { axis, .. }
+            | Self::Reset { axis }
+            | Self::Stop { axis }
+            | Self::QuickStop { axis } => Some(axis),
+            Self::StopAll
+            | Self::EmergencyStop
+            | Self::SetOutput { .. }
+            | Self::Override { .. }
+            | Self::Program(_) => None,
+        }
+    }
+
     /// Returns `true` if the request only ends motion. Such a request is never dropped, neither for
     /// the number of requests nor for absence.
     #[must_use]
     pub fn stops(&self) -> bool {
         matches!(
             self,
-            Self::Stop { .. } | Self::StopAll | Self::EmergencyStop | Self::Disable { .. }
+            Self::Stop { .. }
+                | Self::QuickStop { .. }
+                | Self::StopAll
+                | Self::EmergencyStop
+                | Self::Disable { .. }
+                | Self::Program(ProgramRequest::Stop)
         )
     }
 }
 
-/// The result of a request.
+/// A request to the file's program.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ProgramRequest {
+    /// Starts the program. It enables the axes first, unless its steps do so.
+    Start,
+    /// Waits before the next step.
+    Pause,
+    Resume,
+    /// Runs one step of a paused program, then pauses again.
+    Step,
+    /// Stops the axes and ends the program.
+    Stop,
+}
+
+/// The result of a request. `request` is its number; 0 without a request.
 #[derive(Debug, Clone, PartialEq)]
-pub enum JogEvent {
+pub enum RequestEvent {
     /// The request is done.
-    Done { axis: AxisIndex, what: Activity },
+    Done {
+        request: u64,
+        axis: AxisIndex,
+        what: Activity,
+    },
     /// The request was refused. If it would have moved the axis, the axis brakes from its previous
     /// motion.
-    Refused { axis: AxisIndex, why: String },
+    Refused {
+        request: u64,
+        axis: AxisIndex,
+        why: String,
+    },
     /// A jog was not repeated, and the axis brakes.
-    LetGo { axis: AxisIndex },
+    LetGo { request: u64, axis: AxisIndex },
     /// The request has failed.
     Failed {
+        request: u64,
         axis: AxisIndex,
         what: Activity,
         why: String,
     },
+    /// Another request has replaced this one.
+    Replaced { request: u64, axis: AxisIndex },
+    /// A request to the program is done or refused, or the started program has ended.
+    Program {
+        request: u64,
+        result: Result<(), String>,
+    },
 }
 
-impl JogEvent {
-    /// Returns the axis index.
+impl RequestEvent {
+    /// Returns the axis index; `None` for events of the program.
     #[must_use]
-    pub fn axis(&self) -> AxisIndex {
+    pub fn axis(&self) -> Option<AxisIndex> {
         match self {
             Self::Done { axis, .. }
             | Self::Refused { axis, .. }
-            | Self::LetGo { axis }
-            | Self::Failed { axis, .. } => *axis,
+            | Self::LetGo { axis, .. }
+            | Self::Failed { axis, .. }
+            | Self::Replaced { axis, .. } => Some(*axis),
+            Self::Program { .. } => None,
+        }
+    }
+
+    /// Returns the number of the request.
+    #[must_use]
+    pub fn request(&self) -> u64 {
+        match self {
+            Self::Done { request, .. }
+            | Self::Refused { request, .. }
+            | Self::LetGo { request, .. }
+            | Self::Failed { request, .. }
+            | Self::Replaced { request, .. }
+            | Self::Program { request, .. } => *request,
         }
     }
 
     /// Returns `true` if a request was not carried out.
     #[must_use]
     pub fn is_failure(&self) -> bool {
-        matches!(self, Self::Refused { .. } | Self::Failed { .. })
+        matches!(
+            self,
+            Self::Refused { .. } | Self::Failed { .. } | Self::Program { result: Err(_), .. }
+        )
     }
 }
 
 /// Shows the event without the axis's name.
-impl fmt::Display for JogEvent {
+impl fmt::Display for RequestEvent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Done { what, .. } => f.write_str(match what {
@@ -195,6 +339,8 @@ impl fmt::Display for JogEvent {
                 Activity::Disabling => "disabled",
                 Activity::Jogging { .. } | Activity::Stopping => "stopped",
                 Activity::Moving { .. } => "is there",
+                Activity::Turning { .. } => "has the velocity",
+                Activity::Pressing { .. } => "has the torque",
                 Activity::Homing => "homed",
                 Activity::Switching { to } => return write!(f, "in {to}"),
                 Activity::Resetting => "reset",
@@ -203,6 +349,11 @@ impl fmt::Display for JogEvent {
             Self::Refused { why, .. } => write!(f, "refused: {why}"),
             Self::LetGo { .. } => f.write_str("let go, brakes"),
             Self::Failed { what, why, .. } => write!(f, "{what}: {why}"),
+            Self::Replaced { .. } => f.write_str("replaced by another request"),
+            Self::Program { result: Ok(()), .. } => f.write_str("program: done"),
+            Self::Program {
+                result: Err(why), ..
+            } => write!(f, "program: {why}"),
         }
     }
 }
@@ -236,4 +387,4 @@ pub fn for_manual_mode(mut machine: Machine) -> Machine {
 }
 
 /// Events that wait for the operator's next call.
-type Pending = VecDeque<JogEvent>;
+type Pending = VecDeque<RequestEvent>;

@@ -6,7 +6,10 @@ use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Command, CommandError, HomingStatus, Mode};
 use ecaxis_ecat::index::{AxisIndex, GroupIndex, IndexVec};
 
-use super::{HOLD_TO_RUN_TIMEOUT, JogEvent, MAX_MANUAL_SPEED, Pending, Presence, RAMP, Request};
+use super::{
+    HOLD_TO_RUN_TIMEOUT, LimitShares, MAX_MANUAL_SPEED, Pending, Presence, RAMP, Request,
+    RequestEvent,
+};
 use crate::clock::Nanos;
 use crate::config::{AxisSetup, Machine};
 use crate::rt::channel::Snapshot;
@@ -31,6 +34,14 @@ pub enum Activity {
         by: bool,
         value: f64,
     },
+    /// Turns at this velocity until another request.
+    Turning {
+        velocity: f64,
+    },
+    /// Applies this torque, in percent of the rated torque, until another request.
+    Pressing {
+        percent: f64,
+    },
     Homing,
     Switching {
         to: Mode,
@@ -43,7 +54,11 @@ impl Activity {
     fn moves(self) -> bool {
         matches!(
             self,
-            Self::Jogging { .. } | Self::Moving { .. } | Self::Homing
+            Self::Jogging { .. }
+                | Self::Moving { .. }
+                | Self::Turning { .. }
+                | Self::Pressing { .. }
+                | Self::Homing
         )
     }
 }
@@ -57,6 +72,8 @@ impl fmt::Display for Activity {
             Self::Jogging { velocity } => write!(f, "jog at {velocity}"),
             Self::Moving { by: true, value } => write!(f, "move by {value}"),
             Self::Moving { by: false, value } => write!(f, "move to {value}"),
+            Self::Turning { velocity } => write!(f, "turn at {velocity}"),
+            Self::Pressing { percent } => write!(f, "press with {percent} %"),
             Self::Homing => f.write_str("home"),
             Self::Switching { to } => write!(f, "mode {to}"),
             Self::Resetting => f.write_str("reset"),
@@ -67,31 +84,40 @@ impl fmt::Display for Activity {
 
 /// The state of one axis in manual mode.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct JogAxis {
+pub struct AxisActivity {
     pub doing: Activity,
     /// The time of the request. For a jog, the last request; for a move, the last time its
     /// set-point moved.
     pub since: Nanos,
+    /// The number of the request; 0 once its result is reported.
+    pub(super) request: u64,
+    /// The speed of a move without the override.
+    pub(super) speed: f64,
 }
 
 /// The state of all axes in manual mode.
 #[derive(Debug)]
-pub(super) struct JogController {
-    pub hands: IndexVec<AxisIndex, JogAxis>,
+pub(super) struct RequestController {
+    pub hands: IndexVec<AxisIndex, AxisActivity>,
     pub news: Pending,
     /// The maximum time in ns to wait for a drive.
     timeout: Nanos,
+    shares: LimitShares,
+    /// The factor of all speeds.
+    speed_override: f64,
+    /// The number of the request that is being taken.
+    number: u64,
 }
 
-/// The inputs of [`JogController`].
+/// The inputs of [`RequestController`].
 #[derive(Debug, Clone, Copy)]
-pub(super) struct JogContext<'s> {
+pub(super) struct RequestContext<'s> {
     pub now: Nanos,
     pub machine: &'s Machine,
     pub snapshot: &'s Snapshot,
 }
 
-impl JogContext<'_> {
+impl RequestContext<'_> {
     fn setup(&self, axis: AxisIndex) -> Option<&AxisSetup> {
         self.machine.axes.get(axis)
     }
@@ -121,13 +147,27 @@ impl JogContext<'_> {
 /// Commands with the indices of their axes.
 pub(super) type Commands = Vec<(AxisIndex, Command)>;
 
-impl JogController {
-    pub fn new(axes: usize, timeout: Nanos) -> Self {
+impl RequestController {
+    pub fn new(axes: usize, timeout: Nanos, shares: LimitShares) -> Self {
         Self {
-            hands: vec![JogAxis::default(); axes].into(),
+            hands: vec![AxisActivity::default(); axes].into(),
             news: Pending::new(),
             timeout,
+            shares,
+            speed_override: 1.0,
+            number: 0,
         }
+    }
+
+    /// Returns the factor of all speeds.
+    pub fn speed_override(&self) -> f64 {
+        self.speed_override
+    }
+
+    fn refuse(&mut self, axis: AxisIndex, why: String) {
+        let request = self.number;
+        self.news
+            .push_back(RequestEvent::Refused { request, axis, why });
     }
 
     /// Handles a command that the cycle refused. The snapshot may not show yet what the axis does
@@ -136,10 +176,12 @@ impl JogController {
         &mut self,
         axis: AxisIndex,
         reason: CommandError,
-        scene: &JogContext<'_>,
+        scene: &RequestContext<'_>,
         out: &mut Commands,
     ) {
+        let mut request = 0;
         if let Some(hand) = self.hands.get_mut(axis) {
+            request = std::mem::take(&mut hand.request);
             let moved = hand.doing.moves();
             if moved && scene.moving(axis) {
                 hand.stop(axis, scene.now, out);
@@ -151,11 +193,12 @@ impl JogController {
             }
         }
         let why = reason.to_string();
-        self.news.push_back(JogEvent::Refused { axis, why });
+        self.news
+            .push_back(RequestEvent::Refused { request, axis, why });
     }
 
     /// Reports finished activities. The snapshot must already show the effect of all commands.
-    pub fn look(&mut self, scene: &JogContext<'_>, out: &mut Commands) {
+    pub fn look(&mut self, scene: &RequestContext<'_>, out: &mut Commands) {
         for (axis, hand) in self.hands.enumerate_mut() {
             let Some(status) = scene.snapshot.axes.get(axis) else {
                 continue;
@@ -164,27 +207,50 @@ impl JogController {
             let Some(end) = hand.end(status, scene.stopped(axis), scene.now, self.timeout) else {
                 continue;
             };
+            let request = std::mem::take(&mut hand.request);
+            // Such a motion goes on, and its end by a stop or a fault is still watched.
+            let goes_on = matches!(what, Activity::Turning { .. } | Activity::Pressing { .. });
+            if goes_on && end.is_ok() {
+                if request != 0 {
+                    self.news.push_back(RequestEvent::Done {
+                        request,
+                        axis,
+                        what,
+                    });
+                }
+                continue;
+            }
             hand.doing = Activity::Nothing;
             self.news.push_back(match end {
-                Ok(()) => JogEvent::Done { axis, what },
+                Ok(()) => RequestEvent::Done {
+                    request,
+                    axis,
+                    what,
+                },
                 Err(why) => {
                     if what == Activity::Enabling {
                         out.push((axis, Command::Disable));
                     }
-                    JogEvent::Failed { axis, what, why }
+                    RequestEvent::Failed {
+                        request,
+                        axis,
+                        what,
+                        why,
+                    }
                 }
             });
         }
     }
 
     /// Stops motion without an operator or a repeated jog request. Must be called before `take`.
-    pub fn watch(&mut self, scene: &JogContext<'_>, presence: Presence, out: &mut Commands) {
+    pub fn watch(&mut self, scene: &RequestContext<'_>, presence: Presence, out: &mut Commands) {
         for (axis, hand) in self.hands.enumerate_mut() {
             let late = scene.now.saturating_sub(hand.since) >= HOLD_TO_RUN_TIMEOUT;
             let moving = scene.moving(axis);
             match hand.doing {
                 Activity::Jogging { .. } if late && presence == Presence::Here => {
-                    self.news.push_back(JogEvent::LetGo { axis });
+                    let request = std::mem::take(&mut hand.request);
+                    self.news.push_back(RequestEvent::LetGo { request, axis });
                     hand.stop(axis, scene.now, out);
                 }
                 Activity::Enabling if presence != Presence::Here => {
@@ -193,7 +259,8 @@ impl JogController {
                 }
                 Activity::Stopping | Activity::Disabling => {}
                 doing if presence != Presence::Here && (doing.moves() || moving) => {
-                    self.news.push_back(JogEvent::LetGo { axis });
+                    let request = std::mem::take(&mut hand.request);
+                    self.news.push_back(RequestEvent::LetGo { request, axis });
                     hand.stop(axis, scene.now, out);
                 }
                 _ => {}
@@ -207,7 +274,7 @@ impl JogController {
     }
 
     /// Stops everything that moves.
-    pub fn brake(&mut self, scene: &JogContext<'_>, out: &mut Commands) {
+    pub fn brake(&mut self, scene: &RequestContext<'_>, out: &mut Commands) {
         for (axis, hand) in self.hands.enumerate_mut() {
             if hand.doing.moves() {
                 hand.stop(axis, scene.now, out);
@@ -216,7 +283,14 @@ impl JogController {
     }
 
     /// Executes one request of a present operator, or reports why it is refused.
-    pub fn take(&mut self, request: Request, scene: &JogContext<'_>, out: &mut Commands) {
+    pub fn take(
+        &mut self,
+        number: u64,
+        request: Request,
+        scene: &RequestContext<'_>,
+        out: &mut Commands,
+    ) {
+        self.number = number;
         match request {
             Request::StopAll => {
                 for (axis, hand) in self.hands.enumerate_mut() {
@@ -245,12 +319,35 @@ impl JogController {
                 let doing = Activity::Switching { to: mode };
                 self.begin(axis, doing, Command::SetMode(mode), scene, out);
             }
+            Request::QuickStop { axis } => {
+                self.begin(axis, Activity::Stopping, Command::QuickStop, scene, out);
+            }
             Request::Jog { axis, velocity } => self.jog(axis, velocity, scene, out),
-            Request::MoveBy { .. } | Request::MoveTo { .. } | Request::Home { .. } => {
-                match motion(request, scene) {
-                    Ok((axis, doing, command)) => self.begin(axis, doing, command, scene, out),
-                    Err((axis, why)) => self.news.push_back(JogEvent::Refused { axis, why }),
-                }
+            Request::MoveBy { .. }
+            | Request::MoveTo { .. }
+            | Request::Home { .. }
+            | Request::Velocity { .. }
+            | Request::Torque { .. } => match self.motion(request, scene) {
+                Ok((axis, doing, command)) => self.begin(axis, doing, command, scene, out),
+                Err((axis, why)) => self.refuse(axis, why),
+            },
+            Request::Override { factor } => self.scale_speeds(factor, scene, out),
+            // The loop that serves the operator takes these.
+            Request::SetOutput { .. } | Request::Program(_) => {}
+        }
+    }
+
+    /// Takes a new factor of all speeds. Moves to a position continue with it.
+    fn scale_speeds(&mut self, factor: f64, scene: &RequestContext<'_>, out: &mut Commands) {
+        if !(factor > 0.0 && factor <= 1.0) {
+            return;
+        }
+        self.speed_override = factor;
+        for (axis, hand) in self.hands.enumerate() {
+            if let Activity::Moving { by: false, value } = hand.doing
+                && scene.moving(axis)
+            {
+                out.push((axis, self.move_to(axis, value, hand.speed, scene)));
             }
         }
     }
@@ -260,18 +357,29 @@ impl JogController {
         axis: AxisIndex,
         doing: Activity,
         command: Command,
-        scene: &JogContext<'_>,
+        scene: &RequestContext<'_>,
         out: &mut Commands,
     ) {
         if let Some(hand) = self.hands.get_mut(axis) {
             hand.preempt(doing, axis, out);
             hand.begin(doing, scene.now);
+            let request = std::mem::replace(&mut hand.request, self.number);
+            if request != 0 {
+                self.news
+                    .push_back(RequestEvent::Replaced { request, axis });
+            }
             out.push((axis, command));
         }
     }
 
-    fn jog(&mut self, axis: AxisIndex, velocity: f64, scene: &JogContext<'_>, out: &mut Commands) {
-        let (Some(hand), Some(setup)) = (self.hands.get_mut(axis), scene.setup(axis)) else {
+    fn jog(
+        &mut self,
+        axis: AxisIndex,
+        velocity: f64,
+        scene: &RequestContext<'_>,
+        out: &mut Commands,
+    ) {
+        let Some(setup) = scene.setup(axis) else {
             return;
         };
         let most = MAX_MANUAL_SPEED * setup.config.limits.velocity;
@@ -279,9 +387,13 @@ impl JogController {
         if !(-most..=most).contains(&velocity) {
             let unit = &setup.unit;
             let why = format!("{velocity} {unit}/s is more than the {most} {unit}/s of a jog");
-            self.news.push_back(JogEvent::Refused { axis, why });
+            self.refuse(axis, why);
             return;
         }
+        let Some(hand) = self.hands.get_mut(axis) else {
+            return;
+        };
+        hand.request = self.number;
         if velocity == 0.0 {
             hand.stop(axis, scene.now, out);
             return;
@@ -295,8 +407,115 @@ impl JogController {
         }
     }
 
+    /// Returns a motion.
+    fn motion(
+        &mut self,
+        request: Request,
+        scene: &RequestContext<'_>,
+    ) -> Result<Motion, (AxisIndex, String)> {
+        let LimitShares { speed: most, ramp } = self.shares;
+        let check = |axis: AxisIndex, speed: f64| {
+            if speed > 0.0 && speed <= most {
+                return Ok(());
+            }
+            let [speed, most] = [speed, most].map(|part| part * 100.0);
+            Err((
+                axis,
+                format!("{speed} % is not a speed above 0 and up to {most} %"),
+            ))
+        };
+        match request {
+            Request::MoveBy {
+                axis,
+                distance,
+                speed,
+            } => {
+                check(axis, speed)?;
+                let doing = Activity::Moving {
+                    by: true,
+                    value: distance,
+                };
+                let speed = speed * self.speed_override;
+                let command = Command::MoveBy {
+                    distance,
+                    speed,
+                    ramp,
+                };
+                Ok((axis, doing, command))
+            }
+            Request::MoveTo {
+                axis,
+                position,
+                speed,
+            } => {
+                check(axis, speed)?;
+                let doing = Activity::Moving {
+                    by: false,
+                    value: position,
+                };
+                if let Some(hand) = self.hands.get_mut(axis) {
+                    hand.speed = speed;
+                }
+                Ok((axis, doing, self.move_to(axis, position, speed, scene)))
+            }
+            Request::Velocity { axis, velocity } => {
+                let limit = scene.setup(axis).map(|s| most * s.config.limits.velocity);
+                // Written so that NaN is rejected, too.
+                if !limit.is_some_and(|limit| (-limit..=limit).contains(&velocity)) {
+                    let limit = limit.unwrap_or_default();
+                    let why = format!("{velocity} is not a velocity between -{limit} and {limit}");
+                    return Err((axis, why));
+                }
+                let doing = Activity::Turning { velocity };
+                let velocity = velocity * self.speed_override;
+                Ok((axis, doing, Command::Velocity { velocity, ramp }))
+            }
+            Request::Torque {
+                axis,
+                percent,
+                ramp_s,
+            } => {
+                let doing = Activity::Pressing { percent };
+                Ok((axis, doing, Command::Torque { percent, ramp_s }))
+            }
+            Request::Home { axis } => {
+                let setup = scene.setup(axis).and_then(|setup| setup.homing.as_ref());
+                let Some(homing) = setup else {
+                    return Err((
+                        axis,
+                        "the machine file says nothing of its homing".to_owned(),
+                    ));
+                };
+                let timeout_s = homing.timeout_ns as f64 * 1e-9;
+                Ok((axis, Activity::Homing, Command::Home { timeout_s }))
+            }
+            _ => Err((AxisIndex::default(), "not a motion".to_owned())),
+        }
+    }
+
+    /// Returns the command of a move to a position, on a modulo axis in its direction.
+    fn move_to(
+        &self,
+        axis: AxisIndex,
+        position: f64,
+        speed: f64,
+        scene: &RequestContext<'_>,
+    ) -> Command {
+        let there = scene.setup(axis).zip(scene.snapshot.axes.get(axis));
+        let position = there.map_or(position, |(setup, status)| {
+            let from = UserUnits(status.target_position);
+            let scale = &setup.config.scale;
+            scale.destination(from, UserUnits(position), setup.way).0
+        });
+        Command::MoveTo {
+            position,
+            speed: speed * self.speed_override,
+            ramp: self.shares.ramp,
+        }
+    }
+
     /// Resets an axis and everything that stopped with it.
-    fn reset(&mut self, axis: AxisIndex, scene: &JogContext<'_>, out: &mut Commands) {
+    fn reset(&mut self, axis: AxisIndex, scene: &RequestContext<'_>, out: &mut Commands) {
         let group = scene.group(axis);
         let stopped = scene.stopped(axis);
         for (other, hand) in self.hands.enumerate_mut() {
@@ -307,13 +526,14 @@ impl JogController {
             if other == axis || with_it {
                 hand.preempt(Activity::Resetting, other, out);
                 hand.begin(Activity::Resetting, scene.now);
+                hand.request = if other == axis { self.number } else { 0 };
                 out.push((other, Command::ResetFault));
             }
         }
     }
 }
 
-impl JogAxis {
+impl AxisActivity {
     fn begin(&mut self, doing: Activity, now: Nanos) {
         (self.doing, self.since) = (doing, now);
     }
@@ -358,6 +578,8 @@ impl JogAxis {
             Activity::Enabling => status.ready,
             Activity::Disabling => !status.state.has_power(),
             Activity::Stopping => !(status.enabled && status.moving),
+            Activity::Turning { .. } => return status.in_target.then_some(Ok(())),
+            Activity::Pressing { .. } => return (!status.moving).then_some(Ok(())),
             Activity::Moving { .. } => {
                 if status.moving && !status.held_by_range {
                     self.since = now;
@@ -408,72 +630,3 @@ impl JogAxis {
 }
 
 type Motion = (AxisIndex, Activity, Command);
-
-/// Returns a motion that ends by itself.
-fn motion(request: Request, scene: &JogContext<'_>) -> Result<Motion, (AxisIndex, String)> {
-    let ramp = RAMP;
-    let slow = |axis: AxisIndex, speed: f64| {
-        if speed > 0.0 && speed <= MAX_MANUAL_SPEED {
-            return Ok(());
-        }
-        let [speed, most] = [speed, MAX_MANUAL_SPEED].map(|part| part * 100.0);
-        Err((
-            axis,
-            format!("{speed} % is not a speed above 0 and up to {most} %"),
-        ))
-    };
-    match request {
-        Request::MoveBy {
-            axis,
-            distance,
-            speed,
-        } => {
-            slow(axis, speed)?;
-            let doing = Activity::Moving {
-                by: true,
-                value: distance,
-            };
-            let command = Command::MoveBy {
-                distance,
-                speed,
-                ramp,
-            };
-            Ok((axis, doing, command))
-        }
-        Request::MoveTo {
-            axis,
-            position,
-            speed,
-        } => {
-            slow(axis, speed)?;
-            let doing = Activity::Moving {
-                by: false,
-                value: position,
-            };
-            let there = scene.setup(axis).zip(scene.snapshot.axes.get(axis));
-            let there = there.map_or(position, |(setup, status)| {
-                let from = UserUnits(status.target_position);
-                let scale = &setup.config.scale;
-                scale.destination(from, UserUnits(position), setup.way).0
-            });
-            let command = Command::MoveTo {
-                position: there,
-                speed,
-                ramp,
-            };
-            Ok((axis, doing, command))
-        }
-        Request::Home { axis } => {
-            let setup = scene.setup(axis).and_then(|setup| setup.homing.as_ref());
-            let Some(homing) = setup else {
-                return Err((
-                    axis,
-                    "the machine file says nothing of its homing".to_owned(),
-                ));
-            };
-            let timeout_s = homing.timeout_ns as f64 * 1e-9;
-            Ok((axis, Activity::Homing, Command::Home { timeout_s }))
-        }
-        _ => Err((AxisIndex::default(), "not a motion".to_owned())),
-    }
-}

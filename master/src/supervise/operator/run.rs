@@ -1,0 +1,342 @@
+//! The loop that serves the operator.
+
+use std::sync::Arc;
+
+use ecaxis_axis::Command;
+use ecaxis_ecat::index::{AxisIndex, GroupIndex};
+
+use super::requests::{Activity, Commands, RequestContext, RequestController};
+use super::{Operator, Presence, ProgramRequest, ProgramStatus, Request, RequestEvent, View};
+use crate::clock;
+use crate::config::steps::enables;
+use crate::report::{Cause, Error};
+use crate::rt::channel::{RtCommand, Snapshot};
+use crate::rt::reaction_group::GroupStatus;
+use crate::supervise::explain::MODES_OF_OPERATION_DISPLAY;
+use crate::supervise::{ProgramOutcome, Supervisor};
+
+/// The maximum number of requests per call, not counting stops.
+const MOST_REQUESTS: usize = 64;
+
+/// The operator at work, and the activities that it has requested.
+#[derive(Debug)]
+pub(crate) struct Attendance {
+    operator: Box<dyn Operator>,
+    controller: RequestController,
+    program: ProgramStatus,
+    /// The number of the request that started the program.
+    program_request: u64,
+    /// The program is to start, end, or run one step.
+    start: bool,
+    end: bool,
+    step: bool,
+    /// The number of requests so far.
+    requests: u64,
+    gone: bool,
+    /// Enabled axes whose mode must be read over CoE because it is not in their process data.
+    to_confirm: Vec<AxisIndex>,
+}
+
+impl Supervisor {
+    /// Runs until the operator leaves. Axes are enabled on request.
+    pub(in crate::supervise) async fn run_operator(
+        &mut self,
+        operator: Box<dyn Operator>,
+        ended: &mut ProgramOutcome,
+    ) -> Result<(), Error> {
+        let timeout = self.machine.bus.enable_timeout_ns + self.longest_stop();
+        let all: Vec<_> = self.machine.axes.indices().collect();
+        let timeout = timeout + self.longest_release(&all);
+        let shares = operator.shares();
+        self.attendance = Some(Box::new(Attendance {
+            operator,
+            controller: RequestController::new(all.len(), timeout, shares),
+            program: ProgramStatus::default(),
+            program_request: 0,
+            start: false,
+            end: false,
+            step: false,
+            requests: 0,
+            gone: false,
+            to_confirm: Vec::new(),
+        }));
+        loop {
+            let snapshot = self.poll_snapshot().await?;
+            let Some(attendance) = &mut self.attendance else {
+                return Ok(());
+            };
+            if attendance.gone {
+                // The operator has seen these faults, so the shutdown does not report them.
+                let ill = |axis: &AxisIndex| {
+                    let status = snapshot.axes.get(*axis);
+                    status.is_some_and(|s| s.fault.is_some() || s.trip.is_some())
+                };
+                self.seen = all.iter().copied().filter(ill).collect();
+                return Ok(());
+            }
+            if std::mem::take(&mut attendance.start) {
+                self.run_attended_program(&all, ended).await?;
+                continue;
+            }
+            if attendance.controller.moves() {
+                continue;
+            }
+            // Mailbox reads may take long, and the jog timeout is not checked meanwhile.
+            let confirm = std::mem::take(&mut attendance.to_confirm);
+            self.report_stopped_groups(&snapshot).await;
+            for axis in confirm {
+                let own = self.setup(axis).map(|setup| setup.config.mode);
+                let other = own != snapshot.axes.get(axis).map(|status| status.mode);
+                if !other && let Err(error) = self.confirm_modes(&[axis]).await {
+                    if let Some(attendance) = &mut self.attendance {
+                        attendance.report(RequestEvent::Failed {
+                            request: 0,
+                            axis,
+                            what: Activity::Enabling,
+                            why: error.to_string(),
+                        });
+                    }
+                    let command = Command::Disable;
+                    self.send(RtCommand::Axis { axis, command }).await;
+                }
+            }
+        }
+    }
+
+    /// Runs the file's program. Its failure ends the program and stops the axes; only a failure of
+    /// the machine ends the run.
+    async fn run_attended_program(
+        &mut self,
+        all: &[AxisIndex],
+        ended: &mut ProgramOutcome,
+    ) -> Result<(), Error> {
+        let result = async {
+            if !enables(&self.machine.steps) {
+                self.enable_axes(None, all).await?;
+            }
+            self.run_program(ended).await
+        }
+        .await;
+        let stopping = self.outer.snapshots.read().stopping.is_some();
+        if stopping || self.outer.commands.is_abandoned() {
+            return result;
+        }
+        if result.is_err() {
+            let stops = all.iter().map(|&axis| (axis, Command::Stop));
+            self.command(stops).await;
+        }
+        if let Some(attendance) = &mut self.attendance {
+            attendance.program = ProgramStatus::default();
+            attendance.step = false;
+            let request = std::mem::take(&mut attendance.program_request);
+            let result = match (result, std::mem::take(&mut attendance.end)) {
+                (_, true) => Err("stopped".to_owned()),
+                (result, false) => result.map_err(|error| error.to_string()),
+            };
+            attendance.report(RequestEvent::Program { request, result });
+        }
+        Ok(())
+    }
+
+    /// Waits while the operator has paused the program.
+    pub(in crate::supervise) async fn await_program_step(&mut self) -> Result<(), Error> {
+        let waits = |supervisor: &mut Self| {
+            let attendance = supervisor.attendance.as_mut();
+            attendance.is_some_and(|a| a.program.paused && !std::mem::take(&mut a.step))
+        };
+        while waits(self) {
+            self.poll_and_query().await?;
+        }
+        Ok(())
+    }
+
+    /// Returns the factor of the program's speeds.
+    pub(in crate::supervise) fn speed_override(&self) -> f64 {
+        let attendance = self.attendance.as_ref();
+        attendance.map_or(1.0, |attendance| attendance.controller.speed_override())
+    }
+
+    /// Calls the operator and carries out its requests. Fails if the operator ends the program.
+    pub(in crate::supervise) async fn attend(&mut self, snapshot: &Snapshot) -> Result<(), Error> {
+        let Some(mut attendance) = self.attendance.take() else {
+            return Ok(());
+        };
+        let mut commands = Vec::new();
+        self.take_requests(&mut attendance, snapshot, &mut commands);
+        let ends = attendance.program.running && (attendance.end || attendance.gone);
+        self.attendance = Some(attendance);
+        if !commands.is_empty() {
+            self.send_all(&commands).await;
+        }
+        if ends {
+            return Err(Cause::Interrupted.into());
+        }
+        Ok(())
+    }
+
+    fn take_requests(
+        &mut self,
+        attendance: &mut Attendance,
+        snapshot: &Snapshot,
+        out: &mut Vec<RtCommand>,
+    ) {
+        let machine = Arc::clone(&self.machine);
+        let mut commands = Commands::new();
+        let scene = RequestContext {
+            now: clock::now(),
+            machine: &machine,
+            snapshot,
+        };
+        let controller = &mut attendance.controller;
+        // The steps of a program handle their own refusals.
+        if !attendance.program.running {
+            for (axis, reason) in self.refused.drain(..) {
+                controller.refused(axis, reason, &scene, &mut commands);
+            }
+        }
+        // Before this, the snapshot does not show the effect of the commands.
+        if snapshot.commands_taken >= self.commands_sent {
+            controller.look(&scene, &mut commands);
+        }
+        let news: Vec<RequestEvent> = controller.news.drain(..).collect();
+        let turn = attendance.operator.turn(&View {
+            now: scene.now,
+            machine: &machine,
+            snapshot,
+            hands: &controller.hands,
+            news: &news,
+            program: &attendance.program,
+        });
+        let there = turn.presence == Presence::Here;
+        if attendance.program.running {
+            attendance.end |= !there;
+        } else {
+            controller.watch(&scene, turn.presence, &mut commands);
+        }
+        for (index, request) in turn.requests.into_iter().enumerate() {
+            attendance.requests += 1;
+            if request.stops() || (there && index < MOST_REQUESTS) {
+                attendance.take(request, &scene, &mut commands, out);
+            } else {
+                attendance.refuse(request, "too many requests at once");
+            }
+        }
+        let stopped = |group: (GroupIndex, &GroupStatus)| {
+            group.1.stopped.is_some() && !self.is_stopped(group.0)
+        };
+        let just_stopped = snapshot.groups.enumerate().any(stopped);
+        let hidden = |axis: AxisIndex| {
+            let setup = &machine.axes[axis];
+            let display = ecaxis_esi::axis::object(MODES_OF_OPERATION_DISPLAY, setup.number);
+            let layout = &machine.devices[setup.device].selection.layout;
+            layout.tx_field(display, 0).is_none()
+        };
+        let just_enabled = |news: &RequestEvent| match *news {
+            RequestEvent::Done {
+                axis,
+                what: Activity::Enabling,
+                ..
+            } if hidden(axis) => Some(axis),
+            _ => None,
+        };
+        let enabled = news.iter().filter_map(just_enabled);
+        attendance.to_confirm.extend(enabled);
+        let waits = just_stopped || !attendance.to_confirm.is_empty();
+        if waits && !attendance.program.running {
+            attendance.controller.brake(&scene, &mut commands);
+        }
+        attendance.gone |= turn.presence == Presence::Gone;
+        let commands = commands.into_iter();
+        out.extend(commands.map(|(axis, command)| RtCommand::Axis { axis, command }));
+    }
+}
+
+impl Attendance {
+    fn report(&mut self, event: RequestEvent) {
+        self.controller.news.push_back(event);
+    }
+
+    fn refuse(&mut self, request: Request, why: &str) {
+        let (number, why) = (self.requests, why.to_owned());
+        self.report(match request.axis() {
+            Some(axis) => RequestEvent::Refused {
+                request: number,
+                axis,
+                why,
+            },
+            None => RequestEvent::Program {
+                request: number,
+                result: Err(why),
+            },
+        });
+    }
+
+    fn take(
+        &mut self,
+        request: Request,
+        scene: &RequestContext<'_>,
+        commands: &mut Commands,
+        out: &mut Vec<RtCommand>,
+    ) {
+        match request {
+            Request::Program(request) => self.take_program(request, scene),
+            Request::SetOutput { output, value } => out.push(RtCommand::Output { output, value }),
+            Request::Override { .. } => {
+                self.controller
+                    .take(self.requests, request, scene, commands);
+            }
+            // A motion by hand would disturb the program; a stop ends it.
+            request if self.program.running && !request.stops() => {
+                self.refuse(request, "the program runs: stop it first");
+            }
+            request => {
+                self.end |= self.program.running;
+                self.controller
+                    .take(self.requests, request, scene, commands);
+            }
+        }
+    }
+
+    fn take_program(&mut self, request: ProgramRequest, scene: &RequestContext<'_>) {
+        let running = self.program.running;
+        let refused = match request {
+            ProgramRequest::Start if running => Some("the program runs already"),
+            ProgramRequest::Start if scene.machine.steps.is_empty() => {
+                Some("the machine file has no [[step]]")
+            }
+            ProgramRequest::Start if self.controller.moves() => {
+                Some("an axis moves: stop it first")
+            }
+            ProgramRequest::Step if running && !self.program.paused => {
+                Some("the program is not paused")
+            }
+            ProgramRequest::Start | ProgramRequest::Step => None,
+            _ if !running => Some("no program runs"),
+            _ => None,
+        };
+        let result = refused.map_or(Ok(()), |why| Err(why.to_owned()));
+        let request_number = self.requests;
+        if refused.is_none() {
+            match request {
+                // The end of the program is the result of its start.
+                ProgramRequest::Start => {
+                    (self.start, self.program.running) = (true, true);
+                    self.program_request = request_number;
+                    return;
+                }
+                ProgramRequest::Step if !running => {
+                    (self.start, self.program.running) = (true, true);
+                    (self.program.paused, self.step) = (true, true);
+                }
+                ProgramRequest::Step => self.step = true,
+                ProgramRequest::Pause => self.program.paused = true,
+                ProgramRequest::Resume => self.program.paused = false,
+                ProgramRequest::Stop => self.end = true,
+            }
+        }
+        self.report(RequestEvent::Program {
+            request: request_number,
+            result,
+        });
+    }
+}
