@@ -13,6 +13,7 @@ mod cycles;
 mod demo;
 mod fsoe;
 mod homing;
+mod long_segment;
 mod lrw;
 mod mailboxes;
 mod phase;

@@ -45,11 +45,23 @@ pub fn skip(reason: &str) {
 /// Returns a third-party file or folder for tests, or skips the test.
 #[track_caller]
 pub fn fixture(path: &str) -> Option<PathBuf> {
-    let folder = std::env::var_os("ECAXIS_FIXTURES")
-        .map_or_else(|| root().join("../shared/fixtures"), PathBuf::from);
+    shared("ECAXIS_FIXTURES", "fixtures", path)
+}
+
+/// Returns a machine file or fault script of a review, or skips the test.
+#[track_caller]
+pub fn case(path: &str) -> Option<PathBuf> {
+    shared("ECAXIS_CASES", "cases", path)
+}
+
+/// Returns a file or folder below the folder that a variable names.
+#[track_caller]
+fn shared(variable: &str, default: &str, path: &str) -> Option<PathBuf> {
+    let folder = std::env::var_os(variable)
+        .map_or_else(|| root().join("../shared").join(default), PathBuf::from);
     let file = folder.join(path);
     if !file.exists() {
-        skip(&format!("no {} (set ECAXIS_FIXTURES)", file.display()));
+        skip(&format!("no {} (set {variable})", file.display()));
         return None;
     }
     Some(file)
