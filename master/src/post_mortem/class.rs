@@ -5,6 +5,7 @@ use super::evidence::{Evidence, Lateness};
 use crate::acyclic::{AlState, DeviceRef, StateError};
 use crate::mailbox::CoeCause;
 use crate::report::{Cause, Error};
+use crate::rt::setpoint_generator::GeneratorError;
 
 /// The class of causes that an error can have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -52,11 +53,10 @@ impl Class {
                 CoeCause::Timeout { .. } if evidence.other_frames() > 0 => Self::Bus,
                 _ => Self::Device,
             },
-            Cause::FollowLost { reason, .. }
-                if reason == crate::rt::setpoint_generator::HELD_UP =>
-            {
-                Self::Bus
-            }
+            Cause::FollowLost {
+                reason: Some(GeneratorError::Delayed),
+                ..
+            } => Self::Bus,
             Cause::NoStart
             | Cause::ClockDoesNotFollow
             | Cause::PhaseNotLocked { .. }

@@ -13,6 +13,7 @@ use crate::config::{LimitConflict, Step, UnitProblem};
 use crate::link::{LinkError, OpenError};
 use crate::mailbox::{DatagramError, InfoError, SdoError};
 use crate::rt::image::{NotMapped, TooLarge};
+use crate::rt::setpoint_generator::GeneratorError;
 use crate::text::{pluralize, rounded};
 
 use super::{DiagnosisMessage, EmergencyReport, StepRef};
@@ -330,11 +331,13 @@ pub enum Cause {
     #[error("emergency stop: {condition}")]
     EmergencyStop { condition: String },
     #[error(
-        "follows no longer: {reason}{}",
+        "follows no longer: {}{}",
+        reason.map_or_else(|| "another command took over".to_owned(), |reason| reason.to_string()),
         cause.as_ref().map_or_else(String::new, |cause| format!(": {cause}"))
     )]
     FollowLost {
-        reason: String,
+        /// `None`: another command took over the axis.
+        reason: Option<GeneratorError>,
         /// The error that stopped the group of the axis it followed.
         cause: Option<Arc<Error>>,
     },

@@ -54,18 +54,34 @@ enum Source {
 /// Smaller differences between two velocities are rounding; a stop by lost frames exceeds this.
 const ROUNDING: f64 = 1e-6;
 
-const RING: &str = "the axes would follow each other";
-const NO_MASTER: &str = "the axis that is followed has no power, or searches its home";
-/// For time-based sources. A line continues where it was interrupted, but points in time are past.
-pub(crate) const HELD_UP: &str = "lost frames held the axis up, and its time is past";
-const NO_PARTNER: &str = "an axis of the same line has stopped";
-const SLIPS: &str = "the axis cannot follow within its limits";
-
 /// The longest time that an engaged gear may lag.
 const SLIP_S: f64 = 0.02;
 /// The same for reported positions. They change in steps, and a drive that catches up accelerates
 /// more than its set-point.
 const SLIP_ACTUAL_S: f64 = 0.5;
+
+/// Why a generator did not start, or ended before its source.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum GeneratorError {
+    /// Not started: the axis was at another position or in motion.
+    #[error(transparent)]
+    NotBegun(SetpointError),
+    /// The axis rejected a set-point and decelerates.
+    #[error(transparent)]
+    Refused(CommandError),
+    #[error("the axes would follow each other")]
+    Ring,
+    #[error("the followed axis has no power or is homing")]
+    NoMaster,
+    /// Of time-based sources only. A line continues where it was interrupted, but points in time
+    /// are past.
+    #[error("lost frames delayed the axis, and the time of its set-points is past")]
+    Delayed,
+    #[error("another axis of the same line has stopped")]
+    PartnerStopped,
+    #[error("the axis cannot follow within its limits")]
+    Slipped,
+}
 
 /// The state of the last generator of an axis.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -77,12 +93,7 @@ pub enum GeneratorState {
     Engaged,
     /// The end is reached.
     Finished,
-    /// Not started: the axis was at another position or in motion.
-    NotBegun(SetpointError),
-    /// The axis rejected a set-point and decelerates.
-    Refused(CommandError),
-    /// The source has ended or cannot be followed, for this reason.
-    Lost(&'static str),
+    Failed(GeneratorError),
 }
 
 /// The set-point generator of one axis.
@@ -147,8 +158,10 @@ impl SetpointGenerator {
     ) {
         self.slipping_s = 0.0;
         if ring || (matches!(start, GeneratorRequest::Gear { .. }) && master.is_none()) {
-            let why = if ring { RING } else { NO_MASTER };
-            (self.source, self.state) = (None, GeneratorState::Lost(why));
+            self.fail(match ring {
+                true => GeneratorError::Ring,
+                false => GeneratorError::NoMaster,
+            });
             return;
         }
         let source = match start {
@@ -171,7 +184,10 @@ impl SetpointGenerator {
         self.given = None;
         (self.source, self.state) = match source {
             Ok(source) => (Some(source), GeneratorState::Running),
-            Err(error) => (None, GeneratorState::NotBegun(error)),
+            Err(error) => (
+                None,
+                GeneratorState::Failed(GeneratorError::NotBegun(error)),
+            ),
         };
     }
 
@@ -183,12 +199,16 @@ impl SetpointGenerator {
 
     /// Ends the line because another axis on it has stopped.
     pub fn abort_line(&mut self) {
-        (self.source, self.state) = (None, GeneratorState::Lost(NO_PARTNER));
+        self.fail(GeneratorError::PartnerStopped);
     }
 
     /// Rejects the start because the axis may not move.
     pub fn refuse(&mut self, reason: CommandError) {
-        (self.source, self.state) = (None, GeneratorState::Refused(reason));
+        self.fail(GeneratorError::Refused(reason));
+    }
+
+    fn fail(&mut self, error: GeneratorError) {
+        (self.source, self.state) = (None, GeneratorState::Failed(error));
     }
 
     /// Ends the source because the axis received another command.
@@ -236,7 +256,7 @@ impl SetpointGenerator {
             return false;
         };
         if self.master().is_some() && master.is_none() {
-            (self.source, self.state) = (None, GeneratorState::Lost(NO_MASTER));
+            self.fail(GeneratorError::NoMaster);
             return true;
         }
         let before = self.resume_motion(axis, dt_s);
@@ -285,11 +305,11 @@ impl SetpointGenerator {
             _ => SLIP_S,
         };
         if self.slipping_s > timeout {
-            (self.source, self.state) = (None, GeneratorState::Lost(SLIPS));
+            self.fail(GeneratorError::Slipped);
             return true;
         }
         if interrupted {
-            (self.source, self.state) = (None, GeneratorState::Lost(HELD_UP));
+            self.fail(GeneratorError::Delayed);
             return true;
         }
         match axis.set_point(next.position) {
@@ -301,7 +321,7 @@ impl SetpointGenerator {
             // The axis waits, and so does its source.
             Err(CommandError::FramesLost) => {}
             Err(reason) => {
-                (self.source, self.state) = (None, GeneratorState::Refused(reason));
+                self.fail(GeneratorError::Refused(reason));
                 return true;
             }
         }

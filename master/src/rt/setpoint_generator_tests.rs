@@ -181,7 +181,10 @@ fn rejected_set_point_ends_the_generator() {
         rig.cycle(None);
     }
     assert!(
-        matches!(rig.generator.state(), GeneratorState::Refused(_)),
+        matches!(
+            rig.generator.state(),
+            GeneratorState::Failed(GeneratorError::Refused(_))
+        ),
         "{:?}",
         rig.generator.state()
     );

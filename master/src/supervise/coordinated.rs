@@ -206,11 +206,7 @@ impl Supervisor {
             let mut late = None;
             for &(axis, _) in generators {
                 match snapshot.generators[axis] {
-                    GeneratorState::NotBegun(error) => return Err(this.refusal(step, axis, &error)),
-                    GeneratorState::Refused(reason) => {
-                        return Err(this.refusal(step, axis, &reason));
-                    }
-                    GeneratorState::Lost(why) => return Err(this.refusal(step, axis, &why)),
+                    GeneratorState::Failed(error) => return Err(this.refusal(step, axis, &error)),
                     // Another command has taken over the axis.
                     GeneratorState::None => {}
                     state => done &= state == until,

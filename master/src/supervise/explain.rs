@@ -50,9 +50,8 @@ impl Supervisor {
             StopCause::FollowLost { axis } => Cause::FollowLost {
                 cause: self.cause_of_others(axis, group, snapshot).await,
                 reason: match snapshot.generators.get(axis) {
-                    Some(GeneratorState::Refused(reason)) => reason.to_string(),
-                    Some(GeneratorState::Lost(why)) => (*why).to_owned(),
-                    _ => "of another command".to_owned(),
+                    Some(GeneratorState::Failed(error)) => Some(*error),
+                    _ => None,
                 },
             },
             StopCause::Controller => Cause::Controller,
