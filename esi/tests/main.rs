@@ -12,6 +12,7 @@ mod own_files;
 mod partial;
 mod selection;
 mod sii;
+mod sii_device;
 mod sii_vs_recorded;
 mod vendor_files;
 mod warnings;

@@ -1,9 +1,17 @@
 //! `ecaxis scan` on simulated buses.
 
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
+
+use ecaxis_master::cancel::CancelToken;
+use ecaxis_master::config::{self, Locator};
+use ecaxis_master::session::run_on;
+use ecaxis_sim::Segment;
 use serde_json::Value;
 
 use ecaxis_test_support::bench::Bench;
-use ecaxis_test_support::{assert_fits, assert_snapshot};
+use ecaxis_test_support::wire::{WatchedBus, Watcher};
+use ecaxis_test_support::{Heard, assert_contains, assert_fits, assert_snapshot, virtual_time};
 
 fn bench() -> Bench {
     let bench = Bench::new();
@@ -125,13 +133,30 @@ fn scan_write_describes_every_bus_of_the_project() {
     }
 }
 
-/// A device without ESI file is written as well, and the file names the missing ESI.
+/// The lowest and highest count of each drive's shaft, by the position of the drive.
+type Travel = Arc<Mutex<BTreeMap<usize, (i64, i64)>>>;
+
+struct Shafts(Travel);
+
+impl Watcher for Shafts {
+    fn after(&mut self, segment: &mut Segment) {
+        let mut travel = self.0.lock().expect("no panic");
+        for n in 0..segment.len() {
+            if let Some(drive) = segment.device(n).and_then(|device| device.drive()) {
+                let now = drive.position_counts();
+                let (low, high) = travel.entry(n).or_insert((now, now));
+                (*low, *high) = ((*low).min(now), (*high).max(now));
+            }
+        }
+    }
+}
+
+/// Without an ESI file, the EEPROM describes the device (ETG.1500, feature 301). The bus is
+/// simulated from the ESI files, the machine file knows the EEPROM images only.
 #[test]
 fn scan_write_includes_a_device_without_esi() {
     let bench = bench();
-    std::fs::create_dir(bench.path().join("few")).expect("a folder");
-    bench.write("few/EPOS4.xml", &bench.read("esi/EPOS4.xml"));
-    let ran = bench.ecaxis(&[
+    let write = [
         "scan",
         "--sim",
         "bench.toml",
@@ -139,18 +164,78 @@ fn scan_write_includes_a_device_without_esi() {
         "few",
         "--write",
         "machine.toml",
-    ]);
-    assert_eq!(ran.code, 0, "{}", ran.err);
-    assert!(
-        ran.err.contains("some devices have no ESI file"),
-        "{}",
-        ran.err
-    );
+    ];
+    std::fs::create_dir(bench.path().join("few")).expect("a folder");
+    bench.write("few/EPOS4.xml", &bench.read("esi/EPOS4.xml"));
+    let ran = bench.ecaxis(&write).exits(0);
+    assert_contains(&ran.err, &["no ESI file describes 8 devices", "(`sii`)"]);
     let text = bench.read("machine.toml");
-    assert_eq!(text.matches("MISSING.xml").count(), 8, "{text}");
-    let check = bench.ecaxis(&["check", "machine.toml"]);
-    assert_eq!(check.code, 2);
-    assert!(check.err.contains("MISSING.xml"), "{}", check.err);
+    assert_eq!(text.matches("\nsii ").count(), 8, "{text}");
+    assert_eq!(text.matches("\nesi ").count(), 1, "{text}");
+    let images: Vec<_> = std::fs::read_dir(bench.path())
+        .expect("a folder")
+        .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
+        .filter(|name| name.ends_with(".sii"))
+        .collect();
+    assert_eq!(images.len(), 8, "{images:?}");
+    bench.well(&["check", "machine.toml"]);
+    let compared = bench.well(&["compare", "machine.toml", "--sim", "bench.toml"]);
+    assert_eq!(compared, "as in the file\n");
+    let explained = bench.well(&["explain", "machine.toml"]);
+    assert!(!explained.contains("line 0"), "{explained}");
+
+    let [mut machine, bus] = ["machine.toml", "bench.toml"]
+        .map(|name| config::load(&bench.path().join(name)).expect("a machine"));
+    machine.enable = true;
+    let turn: Vec<(usize, f64)> = machine
+        .axes
+        .iter()
+        .map(|axis| match machine.devices[axis.device].at {
+            Locator::Position(n) => (usize::from(n), axis.config.scale.counts_per_turn()),
+            _ => unreachable!("no aliases"),
+        })
+        .collect();
+    assert_eq!(turn.len(), 3);
+    let travel = Travel::default();
+    let options = virtual_time();
+    let link = Box::new(WatchedBus::new(&bus, &options, Shafts(Arc::clone(&travel))));
+    let stop = Arc::<CancelToken>::default();
+    let outcome = run_on(link, machine, options, stop, &mut Heard::default());
+    outcome.result.expect("runs");
+    let summary = outcome.summary.expect("a summary");
+    assert_eq!((summary.counters.wkc_errors, summary.program_runs), (0, 1));
+    // A tenth of a turn there and back, in CSP.
+    for (position, counts) in turn {
+        let (low, high) = travel.lock().expect("no panic")[&position];
+        let turned = (high - low) as f64 / counts;
+        assert!((0.095..0.11).contains(&turned), "{position}: {turned}");
+    }
+
+    // The simulated bus takes the images, too.
+    bench.well(&["run", "machine.toml", "--virtual", "--enable"]);
+
+    // A damaged image is no description: its process data would be others.
+    let image = std::fs::read(bench.path().join("axis2.sii")).expect("an image");
+    std::fs::write(bench.path().join("axis2.sii"), &image[..image.len() - 40]).expect("written");
+    let refused = bench.ecaxis(&["check", "machine.toml"]);
+    refused.fails(
+        2,
+        &["damaged EEPROM image", "axis2.sii", "category", "ESI file"],
+    );
+    std::fs::write(bench.path().join("axis2.sii"), image).expect("written");
+
+    // The images are kept.
+    let kept = std::fs::read(bench.path().join("axis2.sii")).expect("an image");
+    std::fs::remove_file(bench.path().join("machine.toml")).expect("removed");
+    bench
+        .ecaxis(&write)
+        .fails(2, &["cp0.sii is there already", "--force"]);
+    assert!(!bench.path().join("machine.toml").exists());
+    bench.well(&[&write[..], &["--force"]].concat());
+    assert_eq!(
+        std::fs::read(bench.path().join("axis2.sii")).ok(),
+        Some(kept)
+    );
 }
 
 #[test]

@@ -130,13 +130,13 @@ fn same_file(a: &Path, b: &Path) -> bool {
 
 /// Replaces the text of a file atomically, or creates the file. Symlinks, owner and permissions are
 /// kept.
-pub(crate) fn replace(path: &Path, text: &str) -> Result<(), Failure> {
+pub(crate) fn replace(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
     let target = fs::canonicalize(path)
         // A symlink to a file that does not exist yet.
         .or_else(|_| fs::read_link(path).map(|to| folder(path).join(to)))
         .unwrap_or_else(|_| path.to_owned());
     let replaced =
-        sibling(&target, text.as_bytes()).and_then(|new| new.persist(&target).map_err(|e| e.error));
+        sibling(&target, bytes).and_then(|new| new.persist(&target).map_err(|e| e.error));
     replaced.map_err(|e| unwritable(path, &e))?;
     sync_folder(&target);
     Ok(())
@@ -194,7 +194,7 @@ mod tests {
         fs::write(at("m.toml.old"), "another").unwrap();
 
         assert_eq!(back_up(&at("m.toml")), Ok(at("m.toml.old.1")));
-        assert_eq!(replace(&at("m.toml"), "new"), Ok(()));
+        assert_eq!(replace(&at("m.toml"), b"new"), Ok(()));
         assert!(at("m.toml").is_symlink());
         let read = |name: &str| fs::read_to_string(at(name)).unwrap();
         let mode = |name: &str| fs::metadata(at(name)).unwrap().permissions().mode() & 0o777;
@@ -202,7 +202,7 @@ mod tests {
             assert_eq!((read(name).as_str(), mode(name)), (text, 0o640), "{name}");
         }
         assert_eq!(read("m.toml.old"), "another");
-        assert_eq!(replace(&at("o.toml"), "first"), Ok(()));
+        assert_eq!(replace(&at("o.toml"), b"first"), Ok(()));
         fs::write(at("like"), "").unwrap();
         assert_eq!(
             (read("o.toml").as_str(), mode("o.toml")),
@@ -214,7 +214,7 @@ mod tests {
             (1, 6),
             "no temporary file is left"
         );
-        let failure = replace(&at("no/such/folder"), "x").unwrap_err();
+        let failure = replace(&at("no/such/folder"), b"x").unwrap_err();
         assert!(failure.message.contains("cannot write"), "{failure:?}");
     }
 

@@ -72,7 +72,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         (None, None) => Bus::of(&machine),
     };
     let nic = bus.nic();
-    let library = args.apply.then(|| library(args, &machine)).transpose()?;
+    let library = args
+        .apply
+        .then(|| library(args, &machine))
+        .transpose()?
+        .flatten();
     let (scan, mut comparison) = look(bus, &machine, args)?;
     if args.parameters && !scan.asked {
         let text = "the parameters: the devices were not asked";
@@ -166,14 +170,15 @@ fn look(bus: Bus, machine: &Machine, args: &Args) -> Result<(Scan, Comparison), 
     bus::done(done?, &nic)
 }
 
-/// Returns the ESI library: `--esi`, else the folders of the file's own ESI files.
-fn library(args: &Args, machine: &Machine) -> Result<Library, Failure> {
+/// Returns the ESI library: `--esi`, else the folders of the file's own ESI files. `None` if the file
+/// names none.
+fn library(args: &Args, machine: &Machine) -> Result<Option<Library>, Failure> {
     if let Some(path) = &args.esi {
-        return open(path);
+        return open(path).map(Some);
     }
     let mut library: Option<Library> = None;
     let mut folders: Vec<&Path> = Vec::new();
-    for device in &machine.devices {
+    for device in machine.devices.iter().filter(|device| device.has_esi()) {
         let folder = device.esi_path.parent().unwrap_or(Path::new(""));
         if folders.contains(&folder) {
             continue;
@@ -194,7 +199,7 @@ fn library(args: &Args, machine: &Machine) -> Result<Library, Failure> {
             library = Some(next);
         }
     }
-    library.ok_or_else(|| Failure::new(hints::WRONG, "the file names no ESI file"))
+    Ok(library)
 }
 
 fn rewrite(
@@ -223,7 +228,7 @@ fn rewrite(
     };
     let applied = apply::apply(file, &text, machine, actual).map_err(|e| refused(file, &e))?;
     let kept = back_up(file)?;
-    replace(file, &applied.text)?;
+    replace(file, applied.text.as_bytes())?;
     for reported in &applied.reported {
         note(&format!("  {reported}"));
     }

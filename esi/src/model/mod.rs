@@ -50,6 +50,17 @@ pub struct Position {
     pub column: u32,
 }
 
+impl Position {
+    /// Returns the line as text. A device that an EEPROM image describes has none.
+    #[must_use]
+    pub fn origin(self) -> String {
+        match self.line {
+            0 => "EEPROM".to_owned(),
+            line => format!("line {line}"),
+        }
+    }
+}
+
 impl fmt::Display for Position {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}:{}", self.line, self.column)

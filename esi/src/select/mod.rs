@@ -258,11 +258,13 @@ fn watch_outputs(device: &Device, layout: &mut Layout, notes: &mut Vec<String>) 
         let of_file = sm.control_byte;
         sm.control_byte |= WATCHDOG_TRIGGER;
         if sm.control_byte != of_file {
-            let line = device.sync_managers.get(usize::from(sm.sm));
-            let line = line.map_or(0, |sm| sm.position.line);
+            let manager = device.sync_managers.get(usize::from(sm.sm));
+            let position = manager.map(|sm| sm.position).unwrap_or_default();
             notes.push(format!(
-                "SyncManager {} gets ControlByte 0x{:02x}, with the watchdog trigger that 0x{of_file:02x} (line {line}) lacks",
-                sm.sm, sm.control_byte
+                "SyncManager {} gets ControlByte 0x{:02x}, with the watchdog trigger that 0x{of_file:02x} ({}) lacks",
+                sm.sm,
+                sm.control_byte,
+                position.origin()
             ));
         }
     }

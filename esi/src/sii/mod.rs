@@ -1,7 +1,7 @@
 //! The EEPROM image (SII, ETG.2010): the self-description of a SubDevice, readable without its ESI.
 //!
-//! `image` derives the contents from an ESI device, `emit` writes the bytes and `parse` reads them.
-//! `strings` helps both. `warning` lists problems in one image, `compare` lists differences between
+//! `image` derives the contents from an ESI device, `device` a device from the contents. `emit`
+//! writes the bytes and `parse` reads them. `strings` helps both. `warning` lists problems in one image, `compare` lists differences between
 //! two images.
 //!
 //! [`Sii`] is the common type. `parse(emit(sii))` returns the same value if its texts are ASCII
@@ -21,6 +21,7 @@
 //! ```
 
 mod compare;
+mod device;
 mod emit;
 mod image;
 mod parse;

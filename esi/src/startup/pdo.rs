@@ -241,11 +241,9 @@ fn indices(list: &[u16]) -> String {
 }
 
 fn sm_origin(device: &Device, sm: u8) -> String {
-    let line = device
-        .sync_managers
-        .get(usize::from(sm))
-        .map_or(0, |sm| sm.position.line);
-    format!("Sm {sm} (line {line})")
+    let manager = device.sync_managers.get(usize::from(sm));
+    let position = manager.map(|sm| sm.position).unwrap_or_default();
+    format!("Sm {sm} ({})", position.origin())
 }
 
 fn pdo_origin(device: &Device, selection: &Selection, pdo: &Pdo) -> String {
@@ -259,8 +257,6 @@ fn pdo_origin(device: &Device, selection: &Selection, pdo: &Pdo) -> String {
     let module = module.map_or_else(String::new, |module| {
         format!("module {:?} ", module.type_name)
     });
-    format!(
-        "{module}{kind} 0x{:04x} (line {})",
-        pdo.index, pdo.position.line
-    )
+    let line = pdo.position.origin();
+    format!("{module}{kind} 0x{:04x} ({line})", pdo.index)
 }

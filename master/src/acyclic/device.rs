@@ -69,11 +69,23 @@ pub async fn read_sii(
     device: &DeviceRef,
     access: EepromAccess,
 ) -> Result<Sii, Error> {
-    let image = with_eeprom(wire, device, "reading its EEPROM", access, async |eeprom| {
+    let image = read_image(wire, device, access).await?;
+    sii::parse(&image).map_err(|error| Cause::Sii(error).with_device(device))
+}
+
+/// Reads the image in a device's EEPROM up to the end of its categories.
+///
+/// # Errors
+/// [`Cause::Eeprom`].
+pub async fn read_image(
+    wire: &impl MailboxTransport,
+    device: &DeviceRef,
+    access: EepromAccess,
+) -> Result<Vec<u8>, Error> {
+    with_eeprom(wire, device, "reading its EEPROM", access, async |eeprom| {
         eeprom.image(&mut |_, _| {}).await
-    });
-    let image: Result<Vec<u8>, Error> = image.await;
-    sii::parse(&image?).map_err(|error| Cause::Sii(error).with_device(device))
+    })
+    .await
 }
 
 /// Reads the content of a device's EEPROM; `None` if the PDI is using the EEPROM and the mailbox is

@@ -1,7 +1,5 @@
 //! One device: its ESI file, its entry there, mode, PDOs, start-up SDOs.
 
-use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
@@ -10,186 +8,18 @@ use ecaxis_esi::Field;
 use toml::Spanned;
 
 use super::fields::{Key, KeyExt};
-use super::problem::{Problems, Span, suggestion, unreadable};
+use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawDevice, RawEntry};
 use super::{DeviceConfig, Locator, Startup, sdo, sim};
-use crate::esi_library::{self, Library, LoadError, RevisionMatch};
+use crate::esi_library::RevisionMatch;
 use crate::rt::config::ProcessDataCopy;
 
 mod axes;
+mod esi_files;
 
 pub(crate) use axes::CheckedAxis;
-
-/// Data shared by all devices: the ESI folder, the files read so far, and the cycle.
-pub(crate) struct EsiFiles<'f> {
-    folder: &'f Path,
-    /// What the machine file says of its devices; other devices of an ESI file are not built.
-    queries: Vec<OwnedQuery>,
-    /// The cycle in ns and its place in the file; `None` if the cycle is invalid.
-    cycle: Option<(u64, Span)>,
-    /// The files; `None`: could not be read, which has been reported.
-    files: BTreeMap<PathBuf, Option<Arc<esi::EsiFile>>>,
-    folders: BTreeMap<PathBuf, Option<Library>>,
-}
-
-impl<'f> EsiFiles<'f> {
-    pub fn new(folder: &'f Path, devices: &[RawDevice], cycle: Option<(u64, Span)>) -> Self {
-        Self {
-            folder,
-            queries: devices.iter().map(OwnedQuery::new).collect(),
-            cycle,
-            files: BTreeMap::new(),
-            folders: BTreeMap::new(),
-        }
-    }
-
-    /// Returns the file that `esi` names, or the matching file in the folder that it names.
-    fn file(
-        &mut self,
-        raw: &RawDevice,
-        p: &mut Problems<'_>,
-    ) -> Option<(PathBuf, Arc<esi::EsiFile>)> {
-        let name = raw.esi.as_ref()?;
-        let mut path = self.folder.join(name.get_ref());
-        if path.is_dir() {
-            path = self.in_folder(&path, raw, name, p)?;
-        }
-        if let Some(known) = self.files.get(&path) {
-            return known.clone().map(|file| (path, file));
-        }
-        let wanted = |header: &esi::DeviceHeader| {
-            let fits = |query: &OwnedQuery| {
-                let query = query.borrow();
-                query.matches(header.identity, &header.type_name, &header.name)
-            };
-            self.queries.iter().any(fits)
-        };
-        let read = esi_library::load(&path, &wanted).map_err(|e| match e {
-            LoadError::Read { path, source } => {
-                let hint = match source.kind() {
-                    std::io::ErrorKind::NotFound => neighbours(&path),
-                    _ => "look at the file's permissions".to_owned(),
-                };
-                (unreadable(&path, &source), hint)
-            }
-            LoadError::Esi { .. } => (
-                e.to_string(),
-                "the file is damaged or is not an ESI file".to_owned(),
-            ),
-        });
-        let file = match read {
-            Ok(file) => Some(Arc::new(file)),
-            Err((message, hint)) => {
-                p.add_hint(name.span(), message, hint);
-                None
-            }
-        };
-        self.files.insert(path.clone(), file.clone());
-        file.map(|file| (path, file))
-    }
-
-    /// Returns the file of a folder that describes `type`, `vendor`, `product` and `revision`.
-    fn in_folder(
-        &mut self,
-        folder: &Path,
-        raw: &RawDevice,
-        name: &Spanned<String>,
-        p: &mut Problems<'_>,
-    ) -> Option<PathBuf> {
-        if !self.folders.contains_key(folder) {
-            let cache = esi_library::cache_file(folder);
-            let opened = Library::open(folder, cache.as_deref());
-            let opened = opened.map_err(|e| p.add(name.span(), e.to_string())).ok();
-            self.folders.insert(folder.to_owned(), opened);
-        }
-        let known = self.folders.get(folder)?.as_ref()?;
-        let type_name = raw.type_name.as_ref().map(|t| t.get_ref().trim());
-        let fits = |e: &&esi_library::Entry| {
-            raw.vendor.value().is_none_or(|vendor| vendor == e.vendor)
-                && raw
-                    .product
-                    .value()
-                    .is_none_or(|product| product == e.product)
-                && raw
-                    .revision
-                    .value()
-                    .is_none_or(|revision| revision == e.revision)
-                && type_name.is_none_or(|name| {
-                    e.type_name.eq_ignore_ascii_case(name) || e.name.eq_ignore_ascii_case(name)
-                })
-        };
-        // The newest of several revisions in several files.
-        let newest = known
-            .entries()
-            .iter()
-            .filter(fits)
-            .max_by_key(|e| e.revision);
-        let Some(newest) = newest else {
-            let message = format!(
-                "none of the {} devices described in {} fits `type`, `vendor`, `product` and `revision`",
-                known.entries().len(),
-                folder.display()
-            );
-            let names = known.entries().iter().map(|e| e.type_name.as_str());
-            let hint = match type_name {
-                Some(name) => suggestion(name, names, "devices described there"),
-                None => format!("`ecaxis esi list {}` shows them", folder.display()),
-            };
-            p.add_hint(name.span(), message, hint);
-            return None;
-        };
-        let product = (newest.vendor, newest.product);
-        let other = known
-            .entries()
-            .iter()
-            .filter(fits)
-            .find(|e| (e.vendor, e.product) != product);
-        if let Some(other) = other {
-            let message = format!(
-                "{} describes several devices that fit: {} in {}, {} in {}, perhaps more",
-                folder.display(),
-                newest.type_name,
-                newest.file.display(),
-                other.type_name,
-                other.file.display()
-            );
-            p.add_hint(
-                name.span(),
-                message,
-                "say which with `type`, or with `vendor` and `product`",
-            );
-            return None;
-        }
-        Some(folder.join(&newest.file))
-    }
-}
-
-/// Returns ESI files that could have been meant.
-fn neighbours(path: &Path) -> String {
-    let folder = path
-        .parent()
-        .filter(|p| !p.as_os_str().is_empty())
-        .unwrap_or(Path::new("."));
-    let Ok(entries) = std::fs::read_dir(folder) else {
-        return format!(
-            "paths are relative to the machine file, and there is no folder {}",
-            folder.display()
-        );
-    };
-    let mut names: Vec<String> = entries
-        .flatten()
-        .filter_map(|e| e.file_name().into_string().ok())
-        .filter(|n| n.to_ascii_lowercase().ends_with(".xml"))
-        .collect();
-    names.sort();
-    names.truncate(20);
-    if names.is_empty() {
-        return format!("there is no .xml file in {}", folder.display());
-    }
-    let word = path.file_name().unwrap_or_default().to_string_lossy();
-    let what = format!("ESI files in {}", folder.display());
-    suggestion(&word, names.iter().map(String::as_str), &what)
-}
+pub(crate) use esi_files::EsiFiles;
+use esi_files::OwnedQuery;
 
 /// A device and its axes, checked. Parts that are invalid have been reported.
 pub(crate) struct CheckedDevice {
@@ -208,7 +38,8 @@ pub(crate) fn check(
     let name = raw.name.as_ref().map(|name| name.get_ref().clone());
     let numbers = axes::numbers(&raw, p);
     let mode = mode(&raw, p);
-    let file = files.file(&raw, p);
+    let image = files.image(&raw, p);
+    let file = files.file(&raw, image.as_deref(), p);
     let device = file.as_ref().and_then(|(_, file)| find(&raw, file, p));
     let mut chosen = match (&file, device, mode, &files.cycle) {
         (Some((_, file)), Some(device), Ok(mode), Some((cycle_ns, cycle))) => {
@@ -247,6 +78,7 @@ pub(crate) fn check(
             esi_path,
             device: device?,
             esi: file,
+            sii: image,
             selection: chosen?,
             startup,
             identity: identity?,
@@ -379,31 +211,6 @@ fn mode(raw: &RawDevice, p: &mut Problems<'_>) -> Result<Option<esi::Mode>, ()> 
     }
 }
 
-/// `type`, `product` and `revision` of a device.
-struct OwnedQuery {
-    name: Option<String>,
-    product: Option<u32>,
-    revision: Option<u32>,
-}
-
-impl OwnedQuery {
-    fn new(raw: &RawDevice) -> Self {
-        Self {
-            name: raw.type_name.as_ref().map(|n| n.get_ref().clone()),
-            product: raw.product.value(),
-            revision: raw.revision.value(),
-        }
-    }
-
-    fn borrow(&self) -> esi::DeviceQuery<'_> {
-        esi::DeviceQuery {
-            name: self.name.as_deref(),
-            product: self.product,
-            revision: self.revision,
-        }
-    }
-}
-
 fn find<'e>(
     raw: &RawDevice,
     file: &'e esi::EsiFile,
@@ -411,6 +218,7 @@ fn find<'e>(
 ) -> Option<&'e esi::Device> {
     let at = raw.type_name.place().or(raw.product.place());
     let at = at.or(raw.revision.place()).or(raw.esi.place());
+    let at = at.or(raw.sii.place());
     match esi::find_device(file, &OwnedQuery::new(raw).borrow()) {
         Ok(device) => Some(device),
         Err(e) => {
@@ -506,7 +314,8 @@ impl DeviceQuery<'_> {
     fn report(&self, e: &esi::SelectError, p: &mut Problems<'_>) {
         use esi::SelectError as E;
         let raw = self.raw;
-        let device = raw.esi.place().unwrap_or(raw.span.clone());
+        let device = raw.esi.place().or(raw.sii.place());
+        let device = device.unwrap_or(raw.span.clone());
         let of = |value: Option<Span>| value.unwrap_or(device.clone());
         let entries = |name: &str| match name.contains("rx") {
             true => &raw.pdo.rx,

@@ -71,7 +71,7 @@ use fields::Read;
 use raw::RawMachine;
 
 use crate::acyclic::StateTimeouts;
-use crate::esi_library::RevisionMatch;
+use crate::esi_library::{RevisionMatch, SiiImage};
 use crate::file;
 pub use crate::rt::config::{Condition, ExchangeMode, GroupStopScope};
 use crate::rt::config::{GroupConfig, RtConfig};
@@ -220,8 +220,11 @@ pub struct DeviceConfig {
     pub modules_named: bool,
     pub name: String,
     pub at: Locator,
+    /// The file that describes the device: its ESI file, or its EEPROM image without one.
     pub esi_path: PathBuf,
     pub esi: Arc<esi::EsiFile>,
+    /// The EEPROM image that the file names.
+    pub sii: Option<Arc<SiiImage>>,
     pub device: Arc<esi::Device>,
     pub selection: esi::Selection,
     pub startup: Startup,
@@ -235,6 +238,13 @@ pub struct DeviceConfig {
 }
 
 impl DeviceConfig {
+    /// Returns `true` if an ESI file describes the device, and not its EEPROM image alone.
+    #[must_use]
+    pub fn has_esi(&self) -> bool {
+        let image = self.sii.as_ref();
+        image.is_none_or(|image| image.path != self.esi_path)
+    }
+
     /// Returns `true` if all these SyncManagers, or their FMMUs, are enabled in Op only.
     fn is_op_only(&self, sms: &[esi::layout::SmLayout]) -> bool {
         !sms.is_empty() && sms.iter().all(|sm| self.device.op_only(sm).fmmu)

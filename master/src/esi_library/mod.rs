@@ -35,6 +35,38 @@ pub enum LoadError {
         path: PathBuf,
         source: Box<esi::EsiError>,
     },
+    #[error("{}: {source}", path.display())]
+    Sii {
+        path: PathBuf,
+        source: esi::sii::SiiError,
+    },
+}
+
+/// The EEPROM image of a device, from a file.
+#[derive(Debug)]
+pub struct SiiImage {
+    pub path: PathBuf,
+    pub bytes: Vec<u8>,
+    pub sii: esi::sii::Sii,
+}
+
+/// Reads the file of an EEPROM image.
+pub fn load_sii(path: &Path) -> Result<SiiImage, LoadError> {
+    /// More than the EEPROM interface of a SubDevice can address.
+    const MAX_BYTES: u64 = 512 * 1024;
+    let bytes = file::read(path, MAX_BYTES).map_err(|source| LoadError::Read {
+        path: path.to_owned(),
+        source,
+    })?;
+    let sii = esi::sii::parse(&bytes).map_err(|source| LoadError::Sii {
+        path: path.to_owned(),
+        source,
+    })?;
+    Ok(SiiImage {
+        path: path.to_owned(),
+        bytes,
+        sii,
+    })
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, LoadError> {
@@ -336,6 +368,7 @@ fn describe(folder: &Path, file: &Path) -> Record {
     let parsed = parse(&folder.join(file), &|_| false).map_err(|error| match error {
         LoadError::Esi { source, .. } => source.to_string(),
         LoadError::Read { source, .. } => source.to_string(),
+        LoadError::Sii { source, .. } => source.to_string(),
     })?;
     Ok(devices(file, parsed))
 }

@@ -12,6 +12,8 @@ use ecaxis_sim::{
 };
 
 use super::{Cause, Error, Options};
+use crate::acyclic::eeprom::size_of;
+use crate::acyclic::image::with_alias;
 use crate::clock::{self, Clock};
 use crate::config::sim::{self, bus_order};
 use crate::config::{DeviceConfig, Locator, Machine, Nic};
@@ -180,6 +182,21 @@ fn with_configured_modules(device: &DeviceConfig) -> Cow<'_, Device> {
     Cow::Owned(hardware)
 }
 
+/// Returns the image with this serial number and station alias.
+fn with_own_numbers(image: &[u8], serial: u32, alias: u16) -> Vec<u8> {
+    const SERIAL: usize = 0x1c;
+    let mut image = image.to_vec();
+    // A file ends with the categories, a chip does not.
+    image.resize(image.len().max(size_of(&image)), 0xff);
+    if let Some(area) = image.first_chunk_mut() {
+        *area = with_alias(*area, alias);
+    }
+    if let Some(field) = image.get_mut(SERIAL..SERIAL + 4) {
+        field.copy_from_slice(&serial.to_le_bytes());
+    }
+    image
+}
+
 fn sim_device(
     machine: &Machine,
     device: &DeviceConfig,
@@ -221,7 +238,14 @@ fn sim_device(
     options.plant = plants.remove(0);
     options.further_plants = plants;
     let hardware = with_configured_modules(device);
-    if let Cow::Owned(_) = hardware {
+    if let Some(image) = &device.sii {
+        options.serial = device.serial.unwrap_or(image.sii.serial);
+        options.sii = Some(with_own_numbers(
+            &image.bytes,
+            options.serial,
+            options.alias,
+        ));
+    } else if let Cow::Owned(_) = hardware {
         // The EEPROM has its factory content, whatever modules are plugged in.
         let own = SiiOptions {
             serial: options.serial,

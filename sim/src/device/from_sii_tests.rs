@@ -1,3 +1,5 @@
+use ecaxis_esi::model::SmUse;
+use ecaxis_esi::sii::{General, MailboxAreas, Protocols, Sii, SiiPdo, SiiSyncManager};
 use proptest::prelude::*;
 
 use super::*;
@@ -96,45 +98,6 @@ fn image_without_mailbox_builds_a_plain_terminal() {
     assert_eq!(device.object(0x1008, 0), None);
     assert_eq!((device.pdo_len(0), device.pdo_len(1)), (2, 2));
     assert_eq!(device.al_state(), AlState::Init);
-}
-
-#[test]
-fn mailbox_without_category_uses_the_header_addresses() {
-    let mut sii = image();
-    sii.sync_managers.clear();
-    let sms = sync_managers(&sii);
-    let seen: Vec<_> = sms
-        .iter()
-        .map(|sm| (sm.usage, sm.start_address, sm.default_size, sm.control_byte))
-        .collect();
-    let expected = [
-        (SmUse::MBoxOut, 0x1000, 64, 0x26),
-        (SmUse::MBoxIn, 0x1080, 64, 0x22),
-    ];
-    assert_eq!(seen, expected);
-}
-
-#[test]
-fn an_open_usage_follows_from_mode_and_direction() {
-    let of = |control, enable| {
-        usage(&SiiSyncManager {
-            start_address: 0x1000,
-            len: 2,
-            control,
-            enable,
-            usage: SmUse::Other,
-        })
-    };
-    for (control, expected) in [
-        (0x20, SmUse::Inputs),
-        (0x64, SmUse::Outputs),
-        (0x22, SmUse::MBoxIn),
-        (0x26, SmUse::MBoxOut),
-        (0x23, SmUse::Other),
-    ] {
-        assert_eq!(of(control, 1), expected);
-        assert_eq!(of(control, 0), SmUse::Other);
-    }
 }
 
 #[test]

@@ -296,7 +296,8 @@ fn revision(
         .headers()
         .any(|(identity, ..)| identity == wanted)
     {
-        let path = write::relative(&described.path, place.folder);
+        let path = described.path.as_deref().unwrap_or(Path::new(""));
+        let path = write::relative(path, place.folder);
         set(table, "esi", &quoted(&path.display().to_string()));
     }
     let revision = wanted.revision;

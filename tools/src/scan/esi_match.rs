@@ -12,8 +12,8 @@ use ecaxis_master::esi_library::{self, Entry, Library, LoadError, RevisionMatch}
 /// The best description of a device.
 #[derive(Debug, Clone)]
 pub struct EsiMatch {
-    /// The ESI file.
-    pub path: PathBuf,
+    /// The ESI file; `None`: the device's own EEPROM describes it.
+    pub path: Option<PathBuf>,
     pub file: Arc<esi::EsiFile>,
     pub device: Arc<esi::Device>,
     /// The strictest revision rule that accepts the description.
@@ -21,6 +21,24 @@ pub struct EsiMatch {
 }
 
 impl EsiMatch {
+    /// Returns the description of a device by its EEPROM. `None` if the image is damaged, or has no
+    /// identity: a missing part would change the process data.
+    #[must_use]
+    pub fn from_eeprom(device: &Device) -> Option<Self> {
+        let sii = device.sii.as_ref().ok()?;
+        if !sii.damage.is_empty() || matches!(sii.identity.vendor, 0 | u32::MAX) {
+            return None;
+        }
+        let file = Arc::new(sii.to_esi_file());
+        let device = Arc::new(file.devices.first()?.clone());
+        Some(Self {
+            path: None,
+            file,
+            device,
+            rule: RevisionMatch::Equal,
+        })
+    }
+
     /// True if the ESI declares a drive by its profile or modes.
     #[must_use]
     pub fn is_drive(&self) -> bool {
@@ -77,7 +95,7 @@ pub fn describe(scan: &Scan, library: &Library) -> (Vec<Option<EsiMatch>>, Vec<L
         };
         let device = Arc::new(file.devices.iter().find(of)?.clone());
         Some(EsiMatch {
-            path,
+            path: Some(path),
             device,
             file,
             rule,

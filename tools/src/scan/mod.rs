@@ -15,11 +15,11 @@ use std::time::Duration;
 
 use ecaxis_ecat::registers as esc;
 use ecaxis_esi::Identity;
-use ecaxis_esi::sii::{General, Protocols, Sii};
+use ecaxis_esi::sii::{self, General, Protocols, Sii};
 
 use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::acyclic::al::{self, AlState};
-use ecaxis_master::acyclic::device::{read_sii, with_mailbox};
+use ecaxis_master::acyclic::device::{read_image, with_mailbox};
 use ecaxis_master::acyclic::eeprom::EepromAccess;
 use ecaxis_master::acyclic::enumerate::{self, EnumeratedDevice};
 use ecaxis_master::acyclic::topology::{ParentPort, open_ports, parents};
@@ -92,6 +92,8 @@ pub struct Device {
     pub dc: bool,
     /// The content of its EEPROM, or why it is unknown.
     pub sii: Result<Sii, String>,
+    /// The bytes of its EEPROM up to the end of the categories; empty if unknown.
+    pub image: Vec<u8>,
     /// The explicit device identification, if supported and readable.
     pub id: Option<u16>,
     /// The answers over CoE, or why there are none.
@@ -245,13 +247,20 @@ async fn look_at(
             Ok(1..)
         );
     let at = found.named(format!("position {position}"));
-    let sii = if readable {
-        let sii = read_sii(wire, &at, EepromAccess::IfFree).await;
-        sii.map_err(|error| error.to_string())
+    let image = if readable {
+        let image = read_image(wire, &at, EepromAccess::IfFree).await;
+        image.map_err(|error| error.to_string())
     } else {
         Err(format!(
             "{at}: its EEPROM was left alone: another master may be reading it"
         ))
+    };
+    let (sii, image) = match image {
+        Ok(image) => (
+            sii::parse(&image).map_err(|error| Cause::Sii(error).with_device(&at).to_string()),
+            image,
+        ),
+        Err(problem) => (Err(problem), Vec::new()),
     };
     Ok(Device {
         found,
@@ -260,6 +269,7 @@ async fn look_at(
         delay_ns: None,
         dc,
         sii,
+        image,
         id: None,
         answers: None,
     })

@@ -218,7 +218,7 @@ fn load(path: &Path, wanted: &dyn Fn(&DeviceHeader) -> bool) -> Result<EsiFile, 
                     "the file is damaged or is not an ESI file; download it from the vendor's site"
                 }
             }),
-            LoadError::Read { .. } => failure,
+            LoadError::Read { .. } | LoadError::Sii { .. } => failure,
         }
     })
 }

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_esi::model::Position;
 use ecaxis_master::acyclic::StateTimeouts;
 use ecaxis_master::config::{
     self, Action, BitRange, Bus, DeviceConfig, ExchangeMode, Machine, Nic, Step, duration,
@@ -165,13 +166,12 @@ fn bus(machine: &Machine, out: &mut Document) {
 fn device(machine: &Machine, index: DeviceIndex, out: &mut Document) {
     let device = &machine.devices[index];
     let selection = &device.selection;
-    let esi = device.esi_path.display();
     let (at, line) = (&device.at, device.line);
     out.heading(format!("device `{}` at {at} (line {line})", device.name));
     let (name, type_name) = (&selection.device_name, &device.device.type_name);
     out.line(format!(
-        "{type_name} {name:?}, {esi}:{}",
-        device.device.position
+        "{type_name} {name:?}, {}",
+        origin(device, device.device.position)
     ));
     out.line(selection.identity.to_string());
     if let Some(mode) = selection.mode {
@@ -179,8 +179,11 @@ fn device(machine: &Machine, index: DeviceIndex, out: &mut Document) {
     }
     for module in &selection.modules {
         out.line(format!(
-            "module {:?} (0x{:08x}) in slot {:?}, {esi}:{}",
-            module.type_name, module.ident, module.slot_name, module.position,
+            "module {:?} (0x{:08x}) in slot {:?}, {}",
+            module.type_name,
+            module.ident,
+            module.slot_name,
+            origin(device, module.position),
         ));
     }
     if let Some(assignment) = &selection.assignment {
@@ -203,16 +206,25 @@ fn device(machine: &Machine, index: DeviceIndex, out: &mut Document) {
     startup(&device.selection.startup, out);
 }
 
+/// Returns file, line and column of an element, or the EEPROM image.
+fn origin(device: &DeviceConfig, position: Position) -> String {
+    let file = device.esi_path.display();
+    match device.has_esi() {
+        true => format!("{file}:{position}"),
+        false => file.to_string(),
+    }
+}
+
 fn clock(device: &DeviceConfig, out: &mut Document) {
     out.gap();
     let Some(dc) = &device.selection.dc else {
         out.line("no distributed clock (0x0980 = 0x0000)");
         return;
     };
-    let (esi, position) = (device.esi_path.display(), &dc.position);
     out.line(format!(
-        "distributed clock: OpMode {:?}, {esi}:{position}",
-        dc.name
+        "distributed clock: OpMode {:?}, {}",
+        dc.name,
+        origin(device, dc.position)
     ));
     let [low, high] = dc.assign_activate.to_le_bytes();
     out.line(format!(

@@ -51,7 +51,7 @@ pub(crate) struct Args {
     /// Write a machine file; implies `--ask`
     #[arg(long, value_name = "FILE", conflicts_with_all = ["json", "tree"])]
     write: Option<PathBuf>,
-    /// Overwrite the file
+    /// Overwrite the file and the EEPROM images that it names
     #[arg(long, requires = "write")]
     force: bool,
     /// Print as JSON
@@ -80,7 +80,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let seen = ScanResult::new(&nic, scan, library.as_ref());
     seen.warn(args.intrude);
     if let Some(path) = &args.write {
-        return write::machine_file(&seen, path, library.is_some());
+        return write::machine_file(&seen, path, library.is_some(), args.force);
     }
     if args.json {
         print_json(&report::json(&seen))

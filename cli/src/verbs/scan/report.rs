@@ -77,7 +77,7 @@ fn described(described: &EsiMatch) -> Value {
     let bytes = described.default_bytes();
     let modes = esi::offered_modes(&described.file, &described.device);
     json!({
-        "file": described.path.display().to_string(),
+        "file": described.path.as_ref().map(|path| path.display().to_string()),
         "type": described.device.type_name,
         "name": described.device.name,
         "revision": described.device.identity.revision,

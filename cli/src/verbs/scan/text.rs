@@ -100,7 +100,8 @@ fn place(device: &Device) -> [String; 9] {
 
 fn description(device: &Device, described: Option<&EsiMatch>) -> [String; 6] {
     let both = described.and_then(EsiMatch::default_bytes);
-    let file = described.map(|d| d.path.file_name().unwrap_or_default().to_string_lossy());
+    let file = described.and_then(|d| d.path.as_ref()?.file_name());
+    let file = file.map(|name| name.to_string_lossy());
     cells![
         device.position(),
         file.unwrap_or("none".into()),

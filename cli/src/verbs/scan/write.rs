@@ -4,7 +4,7 @@ use std::path::Path;
 
 use ecaxis_master::config::{self, ConfigError};
 use ecaxis_master::text::pluralize;
-use ecaxis_tools::scan::write::{self, MARK, OutputPath};
+use ecaxis_tools::scan::write::{self, MARK, MISSING, MachineFile, OutputPath};
 
 use super::ScanResult;
 use crate::access::bus;
@@ -18,18 +18,37 @@ pub(super) fn refuse(path: &Path, force: bool) -> Result<(), Failure> {
         return Ok(());
     }
     let message = format!("{} is there already", path.display());
-    Err(Failure::new(hints::WRONG, message).hint(
-        "name another file, `--force` overwrites it, `ecaxis compare FILE --apply` only changes what differs",
-    ))
+    let hint = match path.extension() {
+        Some(extension) if extension == "sii" => "`--force` overwrites EEPROM images",
+        _ => {
+            "name another file, `--force` overwrites it, `ecaxis compare FILE --apply` only changes what differs"
+        }
+    };
+    Err(Failure::new(hints::WRONG, message).hint(hint))
 }
 
-pub(super) fn machine_file(seen: &ScanResult, path: &Path, library: bool) -> Result<(), Failure> {
+pub(super) fn machine_file(
+    seen: &ScanResult,
+    path: &Path,
+    library: bool,
+    force: bool,
+) -> Result<(), Failure> {
     let place = OutputPath {
         nic: &seen.nic,
         folder: path.parent().unwrap_or(Path::new("")),
     };
-    let text = write::machine_file(&seen.scan, &seen.described, place);
-    replace(path, &text)?;
+    let MachineFile { text, images } = write::machine_file(&seen.scan, &seen.described, place);
+    for (image, _) in &images {
+        if image == path {
+            let message = format!("{} is the EEPROM image of a device", path.display());
+            return Err(Failure::new(hints::WRONG, message).hint("name another file"));
+        }
+        refuse(image, force)?;
+    }
+    for (image, bytes) in &images {
+        replace(image, bytes)?;
+    }
+    replace(path, text.as_bytes())?;
     let devices = seen.scan.devices.len();
     let axes = text.matches("[device.axis]").count();
     let of_them = if axes == 1 { "an axis" } else { "axes" };
@@ -44,14 +63,28 @@ pub(super) fn machine_file(seen: &ScanResult, path: &Path, library: bool) -> Res
     if !seen.scan.asked {
         bus::warn("the devices were not asked: units, limits and modules in the file are guesses");
     }
-    if seen.described.iter().any(Option::is_none) {
-        bus::warn("some devices have no ESI file, so the file cannot be run yet");
-        note(if library {
-            "  = help: put their vendors' files into the folder of ESI files, and scan again with --force"
-        } else {
-            "  = help: name the folder of ESI files with `--esi`"
-        });
-    } else if let Err(ConfigError::Problems(problems)) = config::load(path) {
+    let help = if library {
+        "  = help: put their vendors' files into the folder of ESI files, and scan again with --force"
+    } else {
+        "  = help: name the folder of ESI files with `--esi`"
+    };
+    let missing = text.matches(MISSING).count();
+    if missing > 0 {
+        let devices = pluralize(missing, "device");
+        bus::warn(format_args!(
+            "no ESI file describes {devices}, and no whole EEPROM: the file cannot be run yet"
+        ));
+        note(help);
+    } else if !images.is_empty() {
+        let devices = pluralize(images.len(), "device");
+        bus::warn(format_args!(
+            "no ESI file describes {devices}: the file uses the EEPROM images (`sii`), which lack start-up commands and objects"
+        ));
+        note(help);
+    }
+    if missing == 0
+        && let Err(ConfigError::Problems(problems)) = config::load(path)
+    {
         let problems = pluralize(problems.len(), "problem");
         bus::warn(format_args!(
             "the file has {problems}: `ecaxis check {file}` shows them"

@@ -92,7 +92,8 @@ impl Read for Spin {
 table! { "[[device]]",
     table RawDevice {
         name: Key<String> = "\"x\"",
-        esi: Key<String> = "\"esi/EPOS4.xml\"",
+        esi: Key<String>,
+        sii: Key<String>,
         position: Key<u16>,
         alias: Key<u16> [1..=u16::MAX],
         id: Key<u16> [1..=u16::MAX],

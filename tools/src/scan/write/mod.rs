@@ -23,6 +23,9 @@ use lines::TomlWriter;
 /// The marker of uncertain lines, which users can search for.
 pub const MARK: &str = "CHECK:";
 
+/// The ESI file of a device that neither a file nor its EEPROM describes.
+pub const MISSING: &str = "esi/MISSING.xml";
+
 /// Preferred cycle times in ns: the first that all devices support is used.
 const CYCLES: [u64; 5] = [1_000_000, 2_000_000, 4_000_000, 500_000, 250_000];
 
@@ -42,19 +45,54 @@ pub struct DeviceName {
     pub mode: Option<esi::Mode>,
 }
 
-/// Returns a complete machine file. Lines with [`MARK`] need a check.
+/// A machine file and the EEPROM images that it names, each with its path.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct MachineFile {
+    pub text: String,
+    pub images: Vec<(PathBuf, Vec<u8>)>,
+}
+
+/// Returns a complete machine file. Lines with [`MARK`] need a check. A device without an ESI file
+/// is described by its EEPROM image.
 #[must_use]
-pub fn machine_file(scan: &Scan, described: &[Option<EsiMatch>], place: OutputPath<'_>) -> String {
+pub fn machine_file(
+    scan: &Scan,
+    described: &[Option<EsiMatch>],
+    place: OutputPath<'_>,
+) -> MachineFile {
+    let both = scan.devices.iter().zip(described);
+    let described: Vec<Option<EsiMatch>> = both
+        .map(|(device, described)| described.clone().or_else(|| EsiMatch::from_eeprom(device)))
+        .collect();
     let described = || described.iter().map(Option::as_ref);
     let named = names(scan.devices.iter().zip(described()), &[]);
     let cycle_ns = cycle(described().zip(&named));
     let mut text = head(&named, place, cycle_ns);
     let aliases = aliases(scan);
+    let mut images = Vec::new();
     for ((device, described), named) in scan.devices.iter().zip(described()).zip(&named) {
         text += "\n";
         text += &device_section(device, described, named, &aliases, place, cycle_ns);
+        images.extend(image_file(device, described, named, place));
     }
-    text + &steps(&named)
+    text += &steps(&named);
+    MachineFile { text, images }
+}
+
+/// Returns the EEPROM image of a device that no ESI file describes, with its path.
+fn image_file(
+    device: &Device,
+    described: Option<&EsiMatch>,
+    named: &DeviceName,
+    place: OutputPath<'_>,
+) -> Option<(PathBuf, Vec<u8>)> {
+    described.filter(|described| described.path.is_none())?;
+    let path = place.folder.join(image_name(named));
+    Some((path, device.image.clone()))
+}
+
+fn image_name(named: &DeviceName) -> String {
+    format!("{}.sii", named.name)
 }
 
 fn head(named: &[DeviceName], place: OutputPath<'_>, cycle_ns: u64) -> String {
@@ -193,7 +231,13 @@ pub fn device_section(
     lines.header("[[device]]");
     let what = described.map(|d| d.device.name.as_str());
     lines.add("name", &quoted(&named.name), what.unwrap_or_default());
-    esi_keys(device, described, place, &mut lines);
+    match described {
+        Some(described) if described.path.is_none() => {
+            let comment = "its EEPROM: no ESI file here describes it";
+            lines.add("sii", &quoted(&image_name(named)), comment);
+        }
+        _ => esi_keys(device, described, place, &mut lines),
+    }
     locator(device, aliases, &mut lines);
     if let Some(mode) = named.mode {
         let offered = described.map(|d| esi::offered_modes(&d.file, &d.device));
@@ -244,10 +288,11 @@ fn esi_keys(
         let comment = format!(
             "{MARK} no ESI file here describes {identity}: get it from its vendor, put it here"
         );
-        lines.add("esi", &quoted("esi/MISSING.xml"), &comment);
+        lines.add("esi", &quoted(MISSING), &comment);
         return;
     };
-    let path = relative(&described.path, place.folder);
+    let path = described.path.as_deref().unwrap_or(Path::new(""));
+    let path = relative(path, place.folder);
     lines.add("esi", &quoted(&path.display().to_string()), "");
     let ours = described.device.identity;
     let mut others = described

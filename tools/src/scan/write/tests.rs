@@ -47,7 +47,7 @@ fn written(drive: Option<DriveInfo>) -> String {
         nic: "sim",
         folder: &folder,
     };
-    machine_file(&scan, &described, place)
+    machine_file(&scan, &described, place).text
 }
 
 /// Returns the problems that `check` reports.
