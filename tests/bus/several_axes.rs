@@ -2,12 +2,14 @@
 
 use std::fmt::Write as _;
 
-use ecaxis_ecat::index::AxisIndex;
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 use ecaxis_master::config::Machine;
 use ecaxis_master::session::Summary;
 use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::recordings::{FPWR, datagrams, process_images};
-use ecaxis_test_support::{assert_contains, faults, recorded, run, run_well, virtual_time};
+use ecaxis_test_support::{
+    assert_contains, faults, fixture, recorded, run, run_well, virtual_time,
+};
 
 /// Returns the element from `open` to `close` behind `from`, and where it ends.
 fn element<'t>(text: &'t str, open: &str, close: &str) -> Option<(usize, &'t str)> {
@@ -232,4 +234,25 @@ fn mistakes_with_several_axes_are_explained() {
         let error = bench.parse(&text).expect_err("a mistake");
         assert_contains(&error, parts);
     }
+}
+
+/// ETG.2000: `MinInstances="0"` makes the second slot of this vendor's device optional. It holds the
+/// second axis: `SlotIndexIncrement` is 0x800.
+#[test]
+fn an_axis_in_an_optional_slot_moves() {
+    let Some(esi) = fixture("esi/hpmicro/ECAT_CIA402.xml") else {
+        return;
+    };
+    let text = format!(
+        "[bus]\ncycle = \"1ms\"\n[[device]]\nname = \"d\"\nesi = \"{}\"\nposition = 0\nmode = \"csp\"\n\
+         {}{}[[step]]\nmove = {{ first = 1.0, second = -2.0 }}\n",
+        esi.display(),
+        axis("first", 1),
+        axis("second", 2),
+    );
+    let machine = Bench::new().machine(&text);
+    assert_eq!(machine.devices[DeviceIndex(0)].selection.modules.len(), 2);
+    let summary = run_well(machine, virtual_time());
+    let expected = [("first".to_owned(), 1.0), ("second".to_owned(), -2.0)];
+    assert_eq!(positions(&summary), expected);
 }

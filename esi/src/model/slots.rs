@@ -201,7 +201,7 @@ impl SlotPosition {
         self.shifted(index, on, self.steps.pdo, self.steps.group_pdo)
     }
 
-    fn object_index(&self, index: u16, on: SlotDependence) -> u16 {
+    pub fn object_index(&self, index: u16, on: SlotDependence) -> u16 {
         self.shifted(index, on, self.steps.index, self.steps.group_index)
     }
 

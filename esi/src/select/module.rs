@@ -4,9 +4,11 @@ use std::collections::HashMap;
 use std::rc::Rc;
 
 use super::SelectError;
+use crate::axis;
 use crate::mode::Mode;
 use crate::model::{Device, Module, Slot, SlotPosition, Slots};
 
+const CONTROLWORD: u16 = 0x6040;
 const MODES_OF_OPERATION: u16 = 0x6060;
 /// The number of subindices of 0xF030.
 const MAX_PLACES: usize = 254;
@@ -40,8 +42,7 @@ struct Instance<'a> {
 /// stay empty.
 ///
 /// `wanted` names modules place by place (type, name or identity; `-` for none). A mode fills each
-/// required place that `wanted` does not name. Without required places, the mode fills the
-/// places of the axes.
+/// place that `wanted` does not name and that is required or holds an axis in use.
 pub(super) fn choose<'m>(
     modules: &'m [Module],
     device: &'m Device,
@@ -66,14 +67,11 @@ pub(super) fn choose<'m>(
             places: places.len(),
         });
     }
-    let any_required = places.iter().any(|place| place.required);
     let (mut chosen, mut size) = (Vec::new(), 0usize);
     for (number, place) in places.iter().enumerate() {
         let by_name = wanted.get(number).map(|name| name.trim());
-        let takes_mode = |axes: &[u16]| {
-            let is_used = || axes.iter().any(|&axis| usize::from(axis) == number);
-            place.required || (!any_required && is_used())
-        };
+        let at = SlotPosition::new(slots, place.slot, number);
+        let takes_mode = |axes: &[u16]| place.required || place.holds_axis(number, &at, axes);
         let module = match (by_name, mode) {
             (Some(name), _) => named(device, place, name)?,
             (None, Some((mode, axes))) if takes_mode(axes) => for_mode(device, place, mode)?,
@@ -98,7 +96,6 @@ pub(super) fn choose<'m>(
                 limit: MAX_SIZE,
             });
         }
-        let at = SlotPosition::new(slots, place.slot, number);
         chosen.push(PluggedModule {
             place: number,
             slot_name: place.name.clone(),
@@ -108,6 +105,24 @@ pub(super) fn choose<'m>(
         });
     }
     Ok(chosen)
+}
+
+impl Instance<'_> {
+    /// True if a module here, at place `number`, commands one of these axes. Modules without a
+    /// Controlword leave open which: then the places count as the axes do.
+    fn holds_axis(&self, number: usize, at: &SlotPosition, axes: &[u16]) -> bool {
+        let pdos = self.offered.iter().flat_map(|module| &module.rx_pdos);
+        let entries = pdos.flat_map(|pdo| &pdo.entries);
+        let mut commanded = entries
+            .filter_map(|entry| axis::of(at.object_index(entry.index, entry.depends_on)))
+            .filter(|(_, object)| *object == CONTROLWORD)
+            .map(|(axis, _)| axis)
+            .peekable();
+        match commanded.peek() {
+            Some(_) => commanded.any(|axis| axes.contains(&axis)),
+            None => axes.iter().any(|&axis| usize::from(axis) == number),
+        }
+    }
 }
 
 fn places<'a>(modules: &'a [Module], slots: &'a Slots) -> Result<Vec<Instance<'a>>, SelectError> {

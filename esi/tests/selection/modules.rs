@@ -38,6 +38,41 @@ fn a_module_in_the_second_slot_has_shifted_indices() {
     assert_eq!(modes, [(0x6060, 9), (0x6860, 8)]);
 }
 
+/// ETG.2000: a slot with `MinInstances="0"` may stay empty. The second slot of this vendor's device
+/// is one; its objects are 0x800 later, so it holds the second axis (CiA 402-1).
+#[test]
+fn an_optional_slot_is_filled_if_its_axis_is_used() {
+    let Some(file) = file("esi/hpmicro/ECAT_CIA402.xml") else {
+        return;
+    };
+    let device = &file.devices[0];
+    let slots = device.slots.as_ref().expect("slots");
+    assert_eq!(slots.slots[1].min_instances, 0);
+    let choose = |axes: &[u16], modules: &[&str]| {
+        let choice = SelectOptions {
+            mode: Some(Mode::Csp),
+            axes,
+            modules,
+            cycle_ns: MS,
+            ..SelectOptions::default()
+        };
+        choose(&file, &choice)
+    };
+    let places = |axes: &[u16]| -> Vec<(usize, u32)> {
+        let selection = choose(axes, &[]).unwrap();
+        let modules = selection.modules.iter();
+        modules.map(|m| (m.place, m.ident)).collect()
+    };
+    assert_eq!(places(&[0]).len(), 1);
+    let two = places(&[0, 1]);
+    assert_eq!(two.len(), 2, "{two:?}");
+    assert_eq!((two[0].1, two[1].0), (two[1].1, 1));
+    // Only the second axis: the first slot needs a module all the same.
+    assert_eq!(places(&[1]), two);
+    // The user's own choice wins.
+    assert!(choose(&[0, 1], &["0x319800", "-"]).is_err());
+}
+
 #[test]
 fn a_module_that_does_not_fit_is_rejected_by_name() {
     let Some(file) = file("esi/hpmicro/ECAT_CIA402.xml") else {
