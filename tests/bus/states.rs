@@ -1,15 +1,18 @@
 //! State changes as ETG.1000.6, ETG.1020 and ETG.2000 define them, on the whole bus.
 
-use std::sync::Arc;
+use std::fmt;
+use std::sync::{Arc, Mutex};
 
 use ecaxis_master::cancel::CancelToken;
+use ecaxis_master::clock::{self, Nanos};
 use ecaxis_master::config::Machine;
 use ecaxis_master::link::sim::SimLink;
+use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
 use ecaxis_master::session::{self, Outcome, simulated_bus};
 use ecaxis_sim::Segment;
 use ecaxis_test_support::bench::Bench;
-use ecaxis_test_support::recordings::{BWR, Datagram, FPWR, LRW, datagrams};
-use ecaxis_test_support::{Heard, faults, recorded, run, run_well, virtual_time};
+use ecaxis_test_support::recordings::{APWR, BWR, Datagram, FPWR, Frame, LRW, datagrams};
+use ecaxis_test_support::{Heard, faults, load, recorded, run, run_well, virtual_time};
 
 const MS: u64 = 1_000_000;
 
@@ -168,6 +171,89 @@ fn op_only_sync_manager_is_enabled_in_op_only() {
     counters.dedup();
     // SafeOp: 3 of the drive and 1 of the inputs; Op: and 2 of the outputs.
     assert_eq!(counters.get(..3), Some(&[4, 6, 4][..]), "{counters:?}");
+}
+
+/// A simulated bus that keeps every write to AL control.
+struct AlControls {
+    bus: SimLink,
+    written: Arc<Mutex<Vec<Datagram>>>,
+}
+
+impl fmt::Debug for AlControls {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("AlControls")
+    }
+}
+
+impl Link for AlControls {
+    fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
+        let datagrams = Frame::parse(frame).datagrams.into_iter();
+        let writes =
+            datagrams.filter(|d| [APWR, FPWR, BWR].contains(&d.command) && d.register() == 0x0120);
+        self.written.lock().expect("kept").extend(writes);
+        self.bus.send(frame)
+    }
+
+    fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+        self.bus.recv(buf)
+    }
+
+    fn next_arrival(&self) -> Option<Nanos> {
+        self.bus.next_arrival()
+    }
+}
+
+/// Returns an APWR of AL control.
+fn write_al_control(position: u16, value: u8) -> [u8; 30] {
+    let mut frame = [0; 30];
+    frame[..18].copy_from_slice(&[
+        0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0x10, 0x10, 0x10, 0x10, 0x10, 0x30, 0x88, 0xa4, 14,
+        0x10, APWR, 0,
+    ]);
+    frame[18..20].copy_from_slice(&position.wrapping_neg().to_le_bytes());
+    frame[20..24].copy_from_slice(&[0x20, 0x01, 2, 0]);
+    frame[26] = value;
+    frame
+}
+
+/// ETG.1500, feature 103: a device with device emulation (0x0140 bit 8) never receives the
+/// acknowledge bit, not even as a broadcast. ETG.1000.6, 6.4: every other device leaves an error after
+/// the acknowledgement only; here another MainDevice has left both in one.
+#[test]
+fn bring_up_acknowledges_errors_of_devices_without_device_emulation_only() {
+    const COUPLER: u16 = 0;
+    const DRIVE: u16 = 5;
+    let machine = load("terminals.toml");
+    let options = virtual_time();
+    options.clock.enter();
+    let mut bus = simulated_bus(&machine, 1, None, None).expect("a bus");
+    // The coupler copies the error bit; the drive refuses Op in Init.
+    for (position, value) in [(COUPLER, 0x12), (DRIVE, 0x08)] {
+        bus.transit(&mut write_al_control(position, value), clock::now());
+        options.clock.relax(clock::now() + 10 * MS);
+        bus.advance(clock::now());
+    }
+    let states = [COUPLER, DRIVE].map(|position| {
+        let device = bus.device(position.into()).expect("a device");
+        device.registers(0x0130, 1)[0]
+    });
+    assert_eq!(states, [0x12, 0x11]);
+
+    let written = Arc::default();
+    let link = Box::new(AlControls {
+        bus: SimLink::new(bus),
+        written: Arc::clone(&written),
+    });
+    let stop = Arc::<CancelToken>::default();
+    let outcome = session::run_on(link, machine, options, stop, &mut Heard::default());
+    outcome.result.expect("comes up and moves");
+    let written = written.lock().expect("kept");
+    let acknowledged: Vec<_> = written.iter().filter(|d| d.data[0] & 0x10 != 0).collect();
+    let [one] = acknowledged[..] else {
+        panic!("{acknowledged:?}")
+    };
+    let to = (one.command, one.station(), one.data[0]);
+    assert_eq!(to, (APWR, DRIVE.wrapping_neg(), 0x11));
 }
 
 /// Runs one device whose ESI is a changed one of `configs/esi`, next to nothing else. Returns the

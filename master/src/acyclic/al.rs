@@ -299,28 +299,48 @@ async fn wait_one(
     }
 }
 
-/// Acknowledges the errors of all devices, with another request of Init.
-pub(crate) async fn acknowledge_in_init(wire: &DatagramClient) {
+/// Acknowledges the errors of all devices with requests of Init, except for devices that emulate
+/// their states. Devices that fail or do not answer are skipped: the caller notices them.
+pub(crate) async fn acknowledge_errors_in_init(wire: &DatagramClient) {
     let Ok(count) = wire.count().await else {
         return;
     };
-    for position in 0..count {
-        let byte = async |register| {
-            let mut byte = [0];
-            let answer = wire.read_at(position, register, &mut byte).await;
-            (answer == Ok(1)).then_some(byte[0])
-        };
-        let failed = byte(registers::AL_STATUS).await;
-        if failed.is_none_or(|status| status & ERROR == 0) {
-            continue;
+    let each = (0..count).map(async |position| {
+        acknowledge_in_init(wire, position).await;
+        Ok::<_, Infallible>(())
+    });
+    let Ok(_) = try_join_all(each).await;
+}
+
+/// Acknowledges the error of a device, if it has one, with a request of Init, and waits until the device has
+/// ended the error.
+async fn acknowledge_in_init(wire: &DatagramClient, position: u16) {
+    let byte = async |register| {
+        let mut byte = [0];
+        let answer = wire.read_at(position, register, &mut byte).await;
+        (answer == Ok(1)).then_some(byte[0])
+    };
+    let failed = async || {
+        let status = byte(registers::AL_STATUS).await;
+        status.is_some_and(AlState::has_error)
+    };
+    if !failed().await {
+        return;
+    }
+    let configuration = byte(registers::ESC_CONFIGURATION).await;
+    if configuration.is_none_or(|bits| bits & DEVICE_EMULATION != 0) {
+        return;
+    }
+    let acknowledge = [AlState::Init.code() | ERROR, 0];
+    let _ = wire
+        .write_at(position, registers::AL_CONTROL, &acknowledge)
+        .await;
+    // A request that arrives before the device has read the acknowledgement is lost.
+    for _ in 0..ACKNOWLEDGE_POLLS {
+        if !failed().await {
+            return;
         }
-        let configuration = byte(registers::ESC_CONFIGURATION).await;
-        if configuration.is_some_and(|bits| bits & DEVICE_EMULATION == 0) {
-            let acknowledge = [AlState::Init.code() | ERROR, 0];
-            let _ = wire
-                .write_at(position, registers::AL_CONTROL, &acknowledge)
-                .await;
-        }
+        wire.delay(POLL).await;
     }
 }
 

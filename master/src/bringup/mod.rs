@@ -190,6 +190,7 @@ pub async fn bring_up(
                 Cause::Datagram(_) => error.with_action("scanning"),
                 _ => error,
             })?;
+        al::acknowledge_errors_in_init(&wire).await;
         // ethercrab's tables are large, and futures hold them by value.
         let scan = Box::pin(main_device.init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now));
         match mailbox::enable_during(&wire, machine, scan).await {

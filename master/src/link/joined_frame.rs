@@ -1,6 +1,7 @@
 //! Joins frames with one datagram each into one Ethernet frame, and takes the answer apart again.
 
-use ecaxis_ecat::datagram::{HEADER, Header, WORKING_COUNTER};
+use ecaxis_ecat::datagram::{Command, HEADER, Header, WORKING_COUNTER};
+use ecaxis_ecat::registers;
 
 use super::{Link, LinkError, MAX_FRAME};
 
@@ -12,6 +13,8 @@ const TYPE: u16 = 0x1000;
 /// Length and flags in a datagram's header: the high byte, and the flag of another datagram.
 const FLAGS: usize = 7;
 const MORE: u8 = 0x80;
+/// The bit of AL control that acknowledges an error.
+const ACKNOWLEDGE: u8 = 0x10;
 
 /// A frame that collects the datagrams of others.
 #[derive(Debug)]
@@ -42,6 +45,7 @@ impl JoinedFrame {
             return false;
         };
         place.copy_from_slice(datagram);
+        clear_broadcast_acknowledgement(place);
         if self.len == 0 {
             self.bytes[..FRAME_HEADER].copy_from_slice(&frame[..FRAME_HEADER]);
         } else {
@@ -61,6 +65,21 @@ impl JoinedFrame {
         self.bytes[FRAME_HEADER - 2..FRAME_HEADER]
             .copy_from_slice(&(TYPE | datagrams).to_le_bytes());
         link.send(&self.bytes[..len])
+    }
+}
+
+/// Clears the acknowledge bit of a broadcast to AL control. ethercrab starts its scan with one, but a
+/// device that emulates its states must not receive the bit (ETG.1500, feature 103).
+/// `acyclic::al::acknowledge_errors_in_init` acknowledges the errors of all other devices before.
+fn clear_broadcast_acknowledgement(datagram: &mut [u8]) {
+    let Some((header, [control, ..])) = datagram.split_first_chunk_mut::<HEADER>() else {
+        return;
+    };
+    let Header {
+        command, address, ..
+    } = Header::parse(header);
+    if command == Command::BWR && address >> 16 == u32::from(registers::AL_CONTROL) {
+        *control &= !ACKNOWLEDGE;
     }
 }
 

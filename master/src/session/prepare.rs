@@ -8,7 +8,7 @@ use std::time::Duration;
 use ecaxis_axis::Axis;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
-use ethercrab::{Command as Datagram, MainDevice};
+use ethercrab::MainDevice;
 
 use super::fault_evidence::BringUpEvidence;
 use super::{Attachments, Cause, EmergencyLog, Error, Options, Progress, open, panic_text};
@@ -364,16 +364,13 @@ pub(super) fn broadcast_init(
     /// The delay until SYNC0 is switched off. A device in Op reports a missing SYNC0 until it has
     /// read the request.
     const TO_INIT: Duration = Duration::from_millis(20);
-    let all = async |register: u16, value: u16| {
-        let datagram = Datagram::bwr(register).ignore_wkc();
-        let _ = datagram.send(main_device, value).await;
-    };
     let wire = DatagramClient::without_cycle(main_device);
     let silence = async {
-        all(registers::AL_CONTROL, u16::from(AlState::Init.code())).await;
+        let init = [AlState::Init.code(), 0];
+        let _ = wire.write_all(registers::AL_CONTROL, &init).await;
         clock::delay(TO_INIT).await;
-        al::acknowledge_in_init(&wire).await;
-        all(registers::DC_CYCLIC_CONTROL, 0).await;
+        al::acknowledge_errors_in_init(&wire).await;
+        let _ = wire.write_all(registers::DC_CYCLIC_CONTROL, &[0, 0]).await;
     };
     let _ = drive_pdu_loop(port, link, clock, silence);
 }

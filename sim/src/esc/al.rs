@@ -87,12 +87,14 @@ pub enum Request {
 }
 
 /// Evaluates AL control in the current state. An error must be acknowledged, except for a request
-/// of Init.
+/// of Init in a higher state: as in Beckhoff's Slave Stack Code, a request of the same state does not
+/// end an error.
 #[must_use]
 pub fn judge(current: AlState, error: bool, control: u16) -> Request {
     use AlState::{Boot, Init, Op, PreOp, SafeOp};
     let wanted = AlState::from_code((control & 0x0f) as u8);
-    if error && control & ERROR == 0 && wanted != Some(Init) {
+    let to_init = wanted == Some(Init) && current != Init;
+    if error && control & ERROR == 0 && !to_init {
         return Request::Ignored;
     }
     let Some(wanted) = wanted else {
@@ -130,7 +132,7 @@ mod tests {
             for (to, expected) in columns.into_iter().zip(row) {
                 let control = u16::from(to.code());
                 assert_eq!(judge(from, false, control), expected, "{from} to {to}");
-                let unacknowledged = if to == Init {
+                let unacknowledged = if to == Init && from != Init {
                     expected
                 } else {
                     Request::Ignored

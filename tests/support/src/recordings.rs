@@ -4,6 +4,7 @@ use std::path::Path;
 
 use pcap_file::pcapng::{Block, PcapNgReader};
 
+pub const APWR: u8 = 2;
 pub const FPRD: u8 = 4;
 pub const FPWR: u8 = 5;
 pub const BWR: u8 = 8;
