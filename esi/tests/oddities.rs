@@ -312,23 +312,146 @@ fn an_empty_mapping_object_leaves_a_usable_default_alone() {
     }
 }
 
-/// Register 0x09A4 is the time from SYNC0 to SYNC1 (ET1100 data sheet, section I, 9.2.3). EL7201
-/// and EL3702 with the values that TwinCAT writes for them.
+/// SOEM, `ecx_dcsync01`: the period of SYNC1 (`TrueCyclTime`) from the cycle of SYNC0 and 0x09A4.
+fn soem_true_cycle_time(sync0: u32, delay: u32) -> u32 {
+    (delay / sync0 + 1) * sync0
+}
+
+/// Register 0x09A4 is the time from SYNC0 to SYNC1 (ET1100 data sheet, section I, 9.2.3). Rows:
+///
+/// - EL7201 and EL3174, ESI: factor 1, shift 1,000 and 25,000.
+/// - EL3702 with 4 samples: factors -4 and -1 (EtherLab), 750,000 in 0x09A4 at 1 ms (`ecmccfg`, used
+///   with the terminal; TwinCAT's values, the cycles themselves, make the period too long there).
+/// - EL1262 with 10 samples and AX5000, ESI: factors -10 and -1; 125 µs and factor -1.
+///
+/// The period of SYNC1 that SOEM computes from the two registers is the SYNC1 cycle of the ESI. No ENI
+/// file among the fixtures has a command for 0x09A4.
 #[test]
 fn sync1_is_the_delay_after_sync0() {
+    const MS: u32 = 1_000_000;
     let rows = [
-        // (SYNC0 factor, SYNC1 text, shift, AssignActivate, SYNC0 cycle, 0x09A4)
-        ("1", "Factor=\"1\">0", 1_000, "#x700", 1_000_000, 1_000),
-        ("-4", "Factor=\"1\">0", 0, "#x700", 250_000, 750_000),
-        ("1", "Factor=\"-1\">0", 0, "#x700", 1_000_000, 0),
-        ("2", "Factor=\"-1\">0", 25_000, "#x700", 2_000_000, 25_000),
-        ("1", "Factor=\"2\">0", 0, "#x700", 1_000_000, 1_000_000),
-        ("1", ">4000000", 0, "#x700", 1_000_000, 3_000_000),
-        ("1", "Factor=\"0\">0", 500, "#x700", 1_000_000, 500),
-        ("1", "Factor=\"1\">0", 1_000, "#x300", 1_000_000, 0),
+        // (SYNC0 and SYNC1 text, shift, AssignActivate, SYNC0 cycle, 0x09A4, period of SYNC1)
+        (
+            "Factor=\"1\">0",
+            "Factor=\"1\">0",
+            1_000,
+            "#x700",
+            MS,
+            1_000,
+            MS,
+        ),
+        (
+            "Factor=\"1\">0",
+            "Factor=\"1\">0",
+            25_000,
+            "#x700",
+            MS,
+            25_000,
+            MS,
+        ),
+        (
+            "Factor=\"-4\">0",
+            "Factor=\"-1\">0",
+            0,
+            "#x730",
+            250_000,
+            750_000,
+            MS,
+        ),
+        (
+            "Factor=\"-4\">0",
+            "Factor=\"1\">0",
+            0,
+            "#x700",
+            250_000,
+            750_000,
+            MS,
+        ),
+        (
+            "Factor=\"-10\">0",
+            "Factor=\"-1\">0",
+            0,
+            "#x730",
+            100_000,
+            900_000,
+            MS,
+        ),
+        (
+            ">125000",
+            "Factor=\"-1\">0",
+            0,
+            "#x730",
+            125_000,
+            875_000,
+            MS,
+        ),
+        ("Factor=\"1\">0", "Factor=\"-1\">0", 0, "#x700", MS, 0, MS),
+        (
+            "Factor=\"1\">0",
+            "Factor=\"2\">0",
+            0,
+            "#x700",
+            MS,
+            MS,
+            2 * MS,
+        ),
+        ("Factor=\"1\">0", ">4000000", 0, "#x700", MS, 3 * MS, 4 * MS),
+        (
+            "Factor=\"1\">0",
+            "Factor=\"0\">0",
+            500,
+            "#x700",
+            MS,
+            500,
+            MS,
+        ),
+        // SYNC1 alone counts from a SYNC0 without output.
+        (
+            "Factor=\"1\">0",
+            "Factor=\"1\">0",
+            1_000,
+            "#x500",
+            MS,
+            1_000,
+            MS,
+        ),
+        (
+            ">0",
+            "Factor=\"2\">0",
+            1_000,
+            "#x500",
+            MS,
+            MS + 1_000,
+            2 * MS,
+        ),
+        (
+            "Factor=\"1\">0",
+            "Factor=\"1\">0",
+            1_000,
+            "#x300",
+            MS,
+            0,
+            MS,
+        ),
         // SYNC1 cannot come before SYNC0.
-        ("1", "Factor=\"-4\">0", 0, "#x700", 1_000_000, 250_000),
-        ("1", "Factor=\"1\">0", -100, "#x700", 1_000_000, 999_900),
+        (
+            "Factor=\"1\">0",
+            "Factor=\"-4\">0",
+            0,
+            "#x700",
+            MS,
+            250_000,
+            MS,
+        ),
+        (
+            "Factor=\"1\">0",
+            "Factor=\"1\">0",
+            -100,
+            "#x700",
+            MS,
+            999_900,
+            MS,
+        ),
     ];
     let pdos = pdo(
         "RxPdo",
@@ -336,10 +459,10 @@ fn sync1_is_the_delay_after_sync0() {
         0x1600,
         &[CONTROL, POSITION],
     ) + STATUS;
-    for (factor, sync1, shift, activate, sync0, delay) in rows {
+    for (sync0_text, sync1, shift, activate, sync0, delay, period) in rows {
         let dc = format!(
             "<Dc><OpMode><Name>DC</Name><AssignActivate>{activate}</AssignActivate>\
-             <CycleTimeSync0 Factor=\"{factor}\">0</CycleTimeSync0>\
+             <CycleTimeSync0 {sync0_text}</CycleTimeSync0>\
              <CycleTimeSync1 {sync1}</CycleTimeSync1><ShiftTimeSync1>{shift}</ShiftTimeSync1>\
              </OpMode></Dc>"
         );
@@ -347,8 +470,9 @@ fn sync1_is_the_delay_after_sync0() {
         assert_eq!(
             (dc.sync0_cycle_ns, dc.sync1_delay_ns),
             (sync0, delay),
-            "{sync1}"
+            "{sync0_text}, {sync1}"
         );
-        assert_eq!(dc.activates_sync1(), activate == "#x700");
+        assert_eq!(soem_true_cycle_time(sync0, delay), period, "{sync1}");
+        assert_eq!(dc.activates_sync1(), activate != "#x300");
     }
 }

@@ -27,6 +27,12 @@ impl DcSettings {
     pub fn activates_sync1(&self) -> bool {
         self.assign_activate & SYNC1 != 0
     }
+
+    /// Returns `true` if the device generates SYNC0 or SYNC1. Others only use the system time.
+    #[must_use]
+    pub fn activates_sync(&self) -> bool {
+        self.assign_activate & (SYNC0 | SYNC1) != 0
+    }
 }
 
 const SYNC0: u16 = 0x0200;
@@ -90,14 +96,13 @@ pub(super) fn settings(mode: &DcMode, cycle_ns: u64) -> Result<DcSettings, Selec
         what,
     };
     let bus = i128::from(cycle_ns);
-    // An active SYNC signal without cycle and factor uses the bus cycle.
+    // An active SYNC signal without cycle and factor uses the bus cycle. SYNC1 depends on the cycle of
+    // SYNC0, also if only SYNC1 is active.
     let sync0 = match cycle(mode.sync0, bus) {
-        0 if mode.assign_activate & SYNC0 != 0 => bus,
+        0 if mode.assign_activate & (SYNC0 | SYNC1) != 0 => bus,
         cycle => cycle,
     };
-    // A positive factor multiplies the bus cycle, a negative one divides the SYNC0 cycle.
-    let base = if mode.sync1.factor < 0 { sync0 } else { bus };
-    let sync1_cycle = match cycle(mode.sync1, base) {
+    let sync1_cycle = match cycle(mode.sync1, bus) {
         0 => sync0,
         cycle => cycle,
     };

@@ -240,7 +240,9 @@ impl SyncUnit {
     /// Fires all pulses that are due at `local`.
     pub fn fire(&mut self, local: u64) -> Edges {
         let mut edges = Edges::default();
-        // SYNC1 counts from the first SYNC0 that is not before its own pulse.
+        // SYNC1 counts from the first SYNC0 after its own pulse. A SYNC0 at the same time is not after
+        // it.
+        let sync1_pending = self.next1.is_some() && self.due1 >= self.due0;
         if self.due1 <= local {
             (self.due1, self.next1) = (u64::MAX, None);
             edges.sync1 = self.edge(1, activation::SYNC1, false);
@@ -261,7 +263,7 @@ impl SyncUnit {
                 edges.sync1 = self.edge(1, activation::SYNC1, self.pulses > 1);
                 self.status &= !0x02;
             }
-            cycle1 if self.next1.is_none() => {
+            cycle1 if !sync1_pending => {
                 self.next1 = Some(self.width.cut(next.wrapping_add(u64::from(cycle1))));
                 self.due1 = due.saturating_add(u64::from(cycle1));
             }
@@ -321,16 +323,21 @@ mod tests {
         (sync0, sync1)
     }
 
+    /// ESC data sheet, section I, 9.2.3: SYNC1 comes its cycle time after SYNC0, and the next one is
+    /// counted from the next SYNC0. SOEM's `ec_dcsync01` has the same period,
+    /// `((CyclTime1 / CyclTime0) + 1) * CyclTime0`. EL3702 with 2 and 4 samples at 1 ms, as `ecmccfg`
+    /// configures them on hardware: 500 µs after 500 µs, and 750 µs after 250 µs.
     #[test]
     fn sync1_counts_from_sync0() {
-        // (SYNC0 cycle, SYNC1 cycle, SYNC1 pulses in µs after the start), data sheet figure 38.
-        let rows: [(u32, u32, &[u64]); 6] = [
+        // (SYNC0 cycle, SYNC1 cycle, SYNC1 pulses in µs after the start)
+        let rows: [(u32, u32, &[u64]); 7] = [
             (100, 0, &[0, 100, 200, 300, 400, 500, 600]),
             (100, 30, &[30, 130, 230, 330, 430, 530]),
-            (100, 100, &[100, 200, 300, 400, 500, 600]),
+            (100, 100, &[100, 300, 500]),
             (100, 150, &[150, 350, 550]),
-            (100, 200, &[200, 400, 600]),
+            (100, 200, &[200, 500]),
             (100, 250, &[250, 550]),
+            (100, 300, &[300]),
         ];
         for (cycle0, cycle1, expected) in rows {
             let mut unit = unit(cycle0 * 1_000, cycle1 * 1_000);
@@ -340,9 +347,27 @@ mod tests {
             let (sync0, sync1) = pulses(&mut unit, 5_600_000);
             let relative: Vec<u64> = sync1.iter().map(|at| (at - 5_000_000) / 1_000).collect();
             assert_eq!(relative, expected, "SYNC1 cycle {cycle1}");
+            let soem = u64::from((cycle1 / cycle0 + 1) * cycle0);
+            assert!(relative.windows(2).all(|pair| pair[1] - pair[0] == soem));
             assert_eq!(sync0.len(), 7);
             assert_eq!(unit.status(), 0);
             assert_eq!(unit.next_sync0(), 5_700_000);
+        }
+    }
+
+    /// `ecmccfg` with terminals that sample 2, 4 and 10 times in 1 ms: the period of SYNC1 is 1 ms. The
+    /// cycle itself in 0x09A4 makes it one SYNC0 cycle too long.
+    #[test]
+    fn sync1_of_oversampling_terminals_has_the_period_of_the_bus() {
+        for (samples, excess) in [(2, 0), (4, 0), (10, 0), (2, 500_000), (10, 100_000)] {
+            let cycle0 = 1_000_000 / samples;
+            let mut unit = unit(cycle0, 1_000_000 - cycle0 + excess);
+            unit.write_start(5_000_000, true, true, 0, 0);
+            unit.write_activation(ON, true, 0, 0);
+            let (_, sync1) = pulses(&mut unit, 30_000_000);
+            assert!(sync1.len() > 10);
+            let period = u64::from(1_000_000 + excess);
+            assert!(sync1.windows(2).all(|pair| pair[1] - pair[0] == period));
         }
     }
 
