@@ -100,6 +100,43 @@ fn sync_window_and_time_out_are_those_of_the_machine_file() {
     assert!((1_290..1_310).contains(&(waits[1] - waits[0])), "{waits:?}");
 }
 
+/// ETG.2000, `AssignActivate`: 0x0981 has a bit for SYNC0 and one for SYNC1. A device with 0x0100, such
+/// as Beckhoff's EL6224, has a clock and neither: its outputs wait for no pulse, so its clock need not
+/// be inside the window before Op. These clocks never are; the drive still reaches Op and moves.
+#[test]
+fn clock_without_sync_signals_need_not_settle_before_op() {
+    let bench = Bench::new();
+    for (file, activate) in [("timed.xml", "#x100"), ("synced.xml", "#x500")] {
+        bench.write(file, &bench.read("esi/IO8.xml"));
+        bench.change(file, |esi| {
+            let dc = format!(
+                "<Dc><OpMode><Name>DC</Name><AssignActivate>{activate}</AssignActivate></OpMode></Dc><Eeprom>"
+            );
+            esi.replace("<Eeprom>", &dc)
+        });
+    }
+    let bus = |file: &str| {
+        let mut text = String::from(
+            "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\nsync_window = \"100ns\"\nsync_timeout = \"1s\"\n",
+        );
+        text += &drive("x", 0, "", "");
+        for n in 1..6 {
+            let _ = write!(
+                text,
+                "[[device]]\nname = \"io{n}\"\nesi = \"{file}\"\nposition = {n}\n[device.sim]\njitter = \"20us\"\n"
+            );
+        }
+        bench.machine(&(text + "[[step]]\nmove = { x = 1.0 }\n"))
+    };
+    let summary = run_well(bus("timed.xml"), virtual_time());
+    assert_eq!(summary.axes[0].final_error_counts, Some(0));
+    let (error, _) = run_badly(bus("synced.xml"), virtual_time());
+    assert!(
+        error.contains("`io") && error.contains("does not settle"),
+        "{error}"
+    );
+}
+
 /// The time from SYNC0 to the arrival of outputs at the drives, after every cyclic frame.
 #[derive(Debug)]
 struct Watched {

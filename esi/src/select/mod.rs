@@ -119,6 +119,14 @@ pub struct Selection {
     pub notes: Vec<String>,
 }
 
+impl Selection {
+    /// Returns `true` if the device generates SYNC0 or SYNC1.
+    #[must_use]
+    pub fn activates_sync(&self) -> bool {
+        self.dc.as_ref().is_some_and(DcSettings::activates_sync)
+    }
+}
+
 /// A module in its slot.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]

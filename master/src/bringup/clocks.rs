@@ -240,7 +240,7 @@ pub(super) async fn distribute_during<T>(
     tokio::join!(work, distribution).0
 }
 
-/// Distributes the time until all clocks with SYNC0 have settled, within [`SETTLING_TIMEOUT`].
+/// Distributes the time until all clocks with SYNC signals have settled, within [`SETTLING_TIMEOUT`].
 /// Returns false if one has not: then the cycle continues, and Op waits for it.
 pub(super) async fn settle(
     wire: &DatagramClient,
@@ -251,9 +251,11 @@ pub(super) async fn settle(
         return Ok(true);
     };
     let window = machine.bus.sync_window_ns;
-    let uses_sync = machine.devices.iter().zip(devices);
-    let others: Vec<_> = uses_sync
-        .filter(|(config, _)| config.selection.dc.is_some())
+    let others: Vec<_> = machine
+        .devices
+        .iter()
+        .zip(devices)
+        .filter(|(config, _)| config.selection.activates_sync())
         .map(|(_, device)| device)
         .filter(|device| device.dc && device.at != reference)
         .collect();

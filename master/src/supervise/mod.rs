@@ -261,7 +261,8 @@ impl Supervisor {
         }
     }
 
-    /// Returns the devices that must follow the reference clock before Op, because they use SYNC0.
+    /// Returns the devices that must follow the reference clock before Op, because they use
+    /// SYNC0 or SYNC1.
     fn synchronized<'a>(
         &'a self,
         snapshot: &'a Snapshot,
@@ -271,7 +272,7 @@ impl Supervisor {
         let devices = self.machine.devices.iter().zip(&self.bus.devices);
         let devices = (0..).map(DeviceIndex).zip(devices.zip(&snapshot.diagnoses));
         devices.filter_map(move |(index, ((config, device), found))| {
-            let uses = config.selection.dc.is_some() && Some(index) != reference;
+            let uses = config.selection.activates_sync() && Some(index) != reference;
             uses.then_some((device, found))
         })
     }
