@@ -203,3 +203,28 @@ fn only_a_maxon_drive_clears_voltage_enabled_without_power() {
         assert_eq!(word & 0x0050, 0x0040 | expected, "0x{word:04x}");
     }
 }
+
+/// ETG.5001 part 1: a modular device starts with its configured modules; their PDOs with `Sm` are
+/// assigned (ETG.2000, `RxPdo/@Sm`).
+#[test]
+fn modular_device_powers_on_with_the_assignment_of_its_default_modules() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/esi/MIO2.xml");
+    let file = ecaxis_esi::parse(&std::fs::read(path).unwrap()).unwrap();
+    let device = &file.devices[0];
+    let sim = SimDevice::from_esi(device, &file.modules, DeviceOptions::default()).unwrap();
+    // IN8 in slot 1, OUT8 in slot 2.
+    for (index, pdo) in [(0x1c13, 0x1a00_u16), (0x1c12, 0x1601)] {
+        assert_eq!(sim.object(index, 0), Some(vec![1]), "0x{index:04x}");
+        assert_eq!(sim.object(index, 1), Some(pdo.to_le_bytes().to_vec()));
+    }
+    // The process data of the power-on assignment are one byte each.
+    let mut bus = Bus::new(vec![sim]);
+    assert_eq!(bus.address_all(), 1);
+    let station = 0x1001;
+    bus.sm(station, 0, 0x1000, 128, 0x26);
+    bus.sm(station, 1, 0x1100, 128, 0x22);
+    bus.to(station, PREOP);
+    bus.sm(station, 2, 0x1200, 1, 0x64);
+    bus.sm(station, 3, 0x1300, 1, 0x20);
+    bus.to(station, SAFEOP);
+}

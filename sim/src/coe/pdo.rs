@@ -1,7 +1,9 @@
 //! PDO assignment (0x1C10 + SyncManager) and mapping (0x16xx, 0x1Axx): permitted writes, the effect
 //! of modules, and the resulting bit layout.
 
-use ecaxis_esi::model::{Access, Device, Direction, Module, ObjectCode, Pdo, SmUse, Writable};
+use ecaxis_esi::model::{
+    Access, Device, Direction, Module, ObjectCode, Pdo, Slot, SmUse, Writable,
+};
 
 use super::Abort;
 use super::object_dictionary::{EntryHandle, Item, ObjectStore};
@@ -51,6 +53,37 @@ pub struct Mapped {
     pub bits: usize,
 }
 
+/// The PDOs of the default modules, by slot.
+#[derive(Debug, Default)]
+struct DefaultPdos {
+    rx: Vec<Pdo>,
+    tx: Vec<Pdo>,
+}
+
+impl DefaultPdos {
+    fn new(device: &Device, modules: &[Module]) -> Self {
+        let mut all = Self::default();
+        let Some(slots) = &device.slots else {
+            return all;
+        };
+        for (position, slot) in expand(slots).enumerate() {
+            let default = default_module(slot);
+            let Some(module) = modules.iter().find(|m| Some(m.ident) == default) else {
+                continue;
+            };
+            let module = module.at(slots, slot, position);
+            all.rx.extend(module.rx_pdos);
+            all.tx.extend(module.tx_pdos);
+        }
+        all
+    }
+}
+
+fn default_module(slot: &Slot) -> Option<u32> {
+    let default = slot.module_idents.iter().find(|(_, default)| *default);
+    default.map(|(ident, _)| *ident)
+}
+
 #[derive(Debug, Clone, Default)]
 pub struct PdoRules {
     pdos: Vec<KnownPdo>,
@@ -77,6 +110,7 @@ impl PdoRules {
             rules.learn(store, pdo, config);
         }
         rules.learn_modules(store, device, modules, config);
+        let plugged = DefaultPdos::new(device, modules);
         for (n, sm) in device.sync_managers.iter().enumerate().take(8) {
             let direction = match sm.usage {
                 SmUse::Outputs => Direction::Rx,
@@ -90,20 +124,22 @@ impl PdoRules {
                 mode: Mode::from_control(sm.control_byte),
                 max_len: sm.max_size,
             });
-            let all = if direction == Direction::Rx {
-                &device.rx_pdos
-            } else {
-                &device.tx_pdos
+            let (own, plugged) = match direction {
+                Direction::Rx => (&device.rx_pdos, &plugged.rx),
+                Direction::Tx => (&device.tx_pdos, &plugged.tx),
             };
-            let assigned: Vec<u16> = all
-                .iter()
-                .filter(|pdo| pdo.sm == Some(n))
-                .map(|pdo| pdo.index)
-                .collect();
+            let mut assigned = Vec::new();
+            for pdo in own.iter().chain(plugged).filter(|pdo| pdo.sm == Some(n)) {
+                // A module may overwrite a PDO of the device.
+                if !assigned.contains(&pdo.index) {
+                    assigned.push(pdo.index);
+                }
+            }
+            let room = MAX_ASSIGNED.max(u8::try_from(assigned.len()).unwrap_or(u8::MAX));
             let index = ASSIGNMENT + u16::from(n);
             let name = format!("SyncManager {n} PDO assignment");
             store.describe(index, ObjectCode::Array, &name);
-            rules.fill(store, index, 16, &assigned, MAX_ASSIGNED, assign);
+            rules.fill(store, index, 16, &assigned, room, assign);
         }
         rules.plug_defaults(store, device);
         rules
@@ -185,10 +221,7 @@ impl PdoRules {
     fn plug_defaults(&mut self, store: &mut ObjectStore, device: &Device) {
         let Some(slots) = &device.slots else { return };
         let defaults: Vec<u32> = expand(slots)
-            .map(|slot| {
-                let default = slot.module_idents.iter().find(|(_, default)| *default);
-                default.map_or(0, |(ident, _)| *ident)
-            })
+            .map(|slot| default_module(slot).unwrap_or(0))
             .collect();
         let max = u8::try_from(defaults.len()).unwrap_or(u8::MAX);
         store.describe(MODULE_LIST, ObjectCode::Array, "Configured modules");
@@ -481,9 +514,7 @@ impl PdoRules {
 }
 
 /// Returns the slots of a modular device one by one. A slot with several instances is repeated.
-pub(crate) fn expand(
-    slots: &ecaxis_esi::model::Slots,
-) -> impl Iterator<Item = &ecaxis_esi::model::Slot> + '_ {
+pub(crate) fn expand(slots: &ecaxis_esi::model::Slots) -> impl Iterator<Item = &Slot> + '_ {
     slots.slots.iter().flat_map(|slot| {
         let n = usize::try_from(slot.max_instances.clamp(1, 254)).unwrap_or(1);
         std::iter::repeat_n(slot, n)
