@@ -226,15 +226,17 @@ export class Connection extends EventTarget {
     this.#layout = null;
     await this.request("unsubscribe", { topics: ["samples"] });
     if (signals.length === 0 || signals !== this.#samples) return;
-    await this.request("subscribe", { topics: ["samples"], interval_ms: 40, signals });
-    if (signals === this.#samples) this.#layout = signals;
+    const { subscription = null } = await this.request("subscribe", { topics: ["samples"], interval_ms: 40, signals });
+    if (signals === this.#samples) this.#layout = { signals, subscription };
   }
 
   #batch(buffer) {
     const batch = readBatch(buffer);
-    if (batch && this.#layout && batch.values.length === this.#layout.length) {
-      this.#say("samples", { ...batch, signals: this.#layout });
-    }
+    const layout = this.#layout;
+    if (!batch || !layout || batch.values.length !== layout.signals.length) return;
+    // A batch of an earlier subscription has other signals.
+    if (layout.subscription !== null && batch.subscription !== layout.subscription) return;
+    this.#say("samples", { ...batch, signals: layout.signals });
   }
 }
 
@@ -245,6 +247,7 @@ export function readBatch(buffer) {
   const [rows, signals] = [head.getUint32(4, true), head.getUint32(8, true)];
   if (head.getUint8(0) !== 1 || buffer.byteLength < 32 + 8 * rows * (2 + signals)) return null;
   return {
+    subscription: head.getUint32(12, true),
     missed: Number(head.getBigUint64(24, true)),
     rows: new BigUint64Array(buffer, 32, rows),
     times: new BigUint64Array(buffer, 32 + 8 * rows, rows),

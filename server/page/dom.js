@@ -69,6 +69,7 @@ export function duration(ns) {
 
 /** Returns a value with its unit; seconds get a prefix. */
 export function quantity(value, unit, digits) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return NONE;
   if (unit === "s") return duration(value * 1e9);
   const text = figure(value, digits ?? decimals(Math.abs(value), 5));
   return unit && unit !== "code" && unit !== "bits" ? `${text} ${unit}` : text;

@@ -6,11 +6,11 @@ export class Samples {
   missed = 0;
   #capacity;
 
-  constructor(signals, capacity) {
+  constructor(signals, capacity, base = null) {
     this.signals = signals;
     this.#capacity = capacity;
     /** Times are kept relative to the first, where a number is exact. */
-    this.base = null;
+    this.base = base;
     this.at = new Float64Array(2 * capacity);
     this.rows = new Float64Array(2 * capacity);
     this.values = signals.map(() => new Float64Array(2 * capacity));

@@ -77,6 +77,7 @@ export class Scope {
     part.length = select("Length of the window", [["", ""], ...LENGTHS.map((ns) => [ns, short(ns)])], this.#length, (value) => value && this.#setLength(Number(value)));
     part.mode = select("Trigger", [["off", "Trigger off"], ["auto", "Auto"], ["normal", "Normal"], ["single", "Single"]], this.#trigger.mode, (value) => {
       this.#trigger.mode = value;
+      this.#goLive();
       changed();
     });
     part.signal = h("select", { "aria-label": "Trigger signal", onchange: () => {
@@ -176,7 +177,7 @@ export class Scope {
     this.#trigger.signal = part.signal.value || null;
     if (this.#xy) this.#xy = [part.x.value, part.y.value];
     const capacity = Math.ceil(KEEP_NS / this.#cycle);
-    this.#samples = new Samples(names, Math.max(2000, Math.min(150000, capacity)));
+    this.#samples = new Samples(names, Math.max(2000, Math.min(150000, capacity)), this.#samples?.base ?? null);
     this.#trigger.arm(this.#samples);
     this.#scales.forget();
     this.#triggerTools();
@@ -191,7 +192,7 @@ export class Scope {
 
   shown() {
     if (!this.#page.connection.machine) return;
-    if (this.#samples?.base === null) this.#subscribe();
+    if (this.#samples?.length === 0) this.#subscribe();
     this.#draw();
   }
 

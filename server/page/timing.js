@@ -11,6 +11,8 @@ const KINDS = [
 ];
 const COLUMNS = [["count", "Cycles"], ["p50_ns", "p50"], ["p99_ns", "p99"], ["p99_9_ns", "p99.9"], ["max_ns", "Maximum"]];
 const POLL_MS = 1000;
+/** Buckets per decade. */
+const BINS = 24;
 
 export class Timing {
   visible = false;
@@ -81,6 +83,20 @@ export class Timing {
   }
 }
 
+/** Sums buckets of any width into buckets of equal width on a logarithmic scale. */
+function rebin(buckets) {
+  const sums = new Map();
+  for (const [from, to, amount] of buckets) {
+    if (!(amount > 0)) continue;
+    const value = from < 0 ? from : to;
+    const bin = Math.floor(Math.log10(Math.max(1, Math.abs(value))) * BINS + 1e-6);
+    const key = from < 0 ? -1 - bin : bin;
+    sums.set(key, (sums.get(key) ?? 0) + amount);
+  }
+  const edge = (bin) => 10 ** (bin / BINS);
+  return [...sums].map(([key, amount]) => (key < 0 ? [-edge(-key), -edge(-1 - key), amount] : [edge(key), edge(key + 1), amount]));
+}
+
 /** Both scales are logarithmic. Negative values are on the left of zero. */
 function drawHistogram(canvas, buckets, percentiles) {
   const { context, width, height } = prepare(canvas);
@@ -88,7 +104,7 @@ function drawHistogram(canvas, buckets, percentiles) {
   context.clearRect(0, 0, width, height);
   context.font = colour.font;
   context.fillStyle = colour.muted;
-  const counted = buckets.filter(([, , amount]) => amount > 0);
+  const counted = rebin(buckets);
   if (counted.length === 0) {
     context.textAlign = "center";
     context.fillText("No data", width / 2, height / 2);
