@@ -102,6 +102,42 @@ fn a_name_without_a_test_is_found() {
     }
 }
 
+/// Returns the cells of all table rows. The first and the last cell are empty.
+fn rows(text: &str) -> Vec<Vec<&str>> {
+    let rows = text.lines().filter(|line| line.starts_with("| "));
+    rows.map(|row| row.split('|').map(str::trim).collect())
+        .collect()
+}
+
+/// ETG.1500 1.0.2: what a MainDevice of Class B must have, if it also has FoE, firmware updates and
+/// DC. The document claims the class, so each of these features is there and tested.
+#[test]
+fn every_mandatory_feature_of_class_b_is_tested() {
+    const MANDATORY: [&str; 17] = [
+        "103", "104", "105", "107", "201", "301", "302", "305", "401", "402", "404", "501", "505",
+        "701", "703", "1101", "1201",
+    ];
+    let text = std::fs::read_to_string(root().join("docs/conformance.md")).expect("the document");
+    assert!(text.contains("claims Class B"));
+    let rows = rows(&text);
+    for feature in MANDATORY {
+        let row = rows.iter().find(|row| row[1] == feature).expect("listed");
+        let [class_b, ecaxis, tests] = [row[4], row[5], row[6]];
+        assert!(class_b.starts_with("shall"), "{row:?}");
+        assert!(ecaxis.starts_with("yes"), "{row:?}");
+        assert!(!named_tests(&format!("|{tests}|")).is_empty(), "{row:?}");
+    }
+    // All other demands have a condition, which the row answers.
+    let others = rows.iter().filter(|row| row.len() == 8);
+    let unconditional =
+        others.filter(|row| row[4].starts_with("shall") && !row[4].contains(" if "));
+    assert!(
+        unconditional
+            .map(|row| row[1])
+            .all(|feature| MANDATORY.contains(&feature))
+    );
+}
+
 /// The features of ETG.1500 1.0.2 are listed once each, in order.
 #[test]
 fn conformance_lists_every_feature_of_the_directive() {
@@ -111,11 +147,7 @@ fn conformance_lists_every_feature_of_the_directive() {
         1102, 1103, 1201, 1301,
     ];
     let text = std::fs::read_to_string(root().join("docs/conformance.md")).expect("the document");
-    let rows: Vec<Vec<&str>> = text
-        .lines()
-        .filter(|line| line.starts_with("| "))
-        .map(|line| line.split('|').map(str::trim).collect())
-        .collect();
+    let rows = rows(&text);
     let numbers = rows
         .iter()
         .filter_map(|row| row.get(1)?.parse::<u16>().ok());
