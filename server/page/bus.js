@@ -241,8 +241,7 @@ class DeviceRow {
     cells.bar.hidden = difference === null || !windowNs;
     if (!cells.bar.hidden) {
       const share = Math.max(-1, Math.min(1, difference / windowNs));
-      cells.fill.style.left = `${50 + Math.min(0, share) * 50}%`;
-      cells.fill.style.width = `${Math.abs(share) * 50}%`;
+      cells.fill.style.transform = `translateX(${50 + Math.min(0, share) * 50}%) scaleX(${Math.max(0.01, Math.abs(share) / 2)})`;
       mark(cells.bar, "data-level", Math.abs(difference) > windowNs ? "over" : Math.abs(share) > 0.5 ? "near" : null);
       mark(cells.bar, "aria-valuetext", `${duration(difference)} of ±${duration(windowNs)}`);
     }

@@ -9,7 +9,7 @@ const MAX_GAP_MS = 250;
 /** A keyboard that repeats no key for so long: the hold ends. */
 const MAX_KEY_GAP_MS = 300;
 /** With a state older than this, the machine cannot be seen: the hold ends. */
-const MAX_STATE_AGE_MS = 500;
+const MAX_STATE_AGE_MS = 400;
 
 export class Control {
   #connection;
@@ -22,7 +22,11 @@ export class Control {
     document.addEventListener("visibilitychange", () => document.hidden && this.#leave());
     for (const kind of ["pagehide", "freeze"]) addEventListener(kind, () => this.#leave());
     addEventListener("blur", () => this.letGo());
-    addEventListener("contextmenu", () => this.letGo());
+    addEventListener("contextmenu", (event) => {
+      // A long touch asks for a menu; it is a hold all the same.
+      if (this.#hold?.touch && event.target === this.#hold.button) event.preventDefault();
+      else this.letGo();
+    }, true);
     connection.addEventListener("event", ({ detail }) => {
       const hold = this.#hold;
       if (hold && detail.axis === hold.axis && ["refused", "failed"].includes(detail.event)) {
@@ -106,10 +110,10 @@ export class Control {
     this.#connection.request("halt", { axis: hold.axis }).catch(() => {});
   }
 
-  #begin(button, axis, velocity, keys) {
+  #begin(button, axis, velocity, { keys = false, touch = false }) {
     this.letGo();
-    const hold = { button, axis, tickAt: performance.now(), keyAt: performance.now(), timer: 0 };
-    const jog = () => this.#connection.request("jog", { axis, velocity: velocity() }).catch((error) => {
+    const hold = { button, axis, touch, tickAt: performance.now(), keyAt: performance.now(), timer: 0 };
+    const jog = () => this.#connection.request("jog", { axis, velocity: velocity(), seen_ns: this.#connection.state.time_ns }).catch((error) => {
       if (this.#hold !== hold) return;
       this.letGo();
       message(`${axis}: ${error.message}`, error.help);
@@ -117,7 +121,11 @@ export class Control {
     hold.timer = setInterval(() => {
       const now = performance.now();
       const late = now - hold.tickAt > MAX_GAP_MS || (keys && now - hold.keyAt > MAX_KEY_GAP_MS);
-      if (late || !this.#mayJog(axis)) return this.letGo();
+      const refusal = this.#jogRefusal(axis);
+      if (late || refusal) {
+        this.letGo();
+        return message(`${axis}: the jog ends: ${refusal ?? "the page stood still"}`, "", "note");
+      }
       hold.tickAt = now;
       jog();
     }, JOG_INTERVAL_MS);
@@ -126,10 +134,12 @@ export class Control {
     jog();
   }
 
-  #mayJog(axis) {
+  /** Says why an axis may not jog now, or returns `null`. */
+  #jogRefusal(axis) {
     const { state, age } = this.#connection;
-    const enabled = state?.axes?.find(({ name }) => name === axis)?.enabled;
-    return this.mine && enabled && age < MAX_STATE_AGE_MS && !document.hidden;
+    if (document.hidden || !this.mine) return "this page has no control";
+    if (!state.axes?.find(({ name }) => name === axis)?.enabled) return "the axis is not enabled";
+    return age < MAX_STATE_AGE_MS ? null : `the last state is ${Math.round(age)} ms old: the connection or the computer is too slow`;
   }
 
   /**
@@ -147,10 +157,11 @@ export class Control {
       if (!event.isPrimary || event.button !== 0 || pointer !== null) return end();
       event.preventDefault();
       button.focus();
-      if (!this.#mayJog(axis)) return;
+      const refusal = this.#jogRefusal(axis);
+      if (refusal) return message(`${axis}: ${refusal}`, "", "note");
       pointer = event.pointerId;
       button.setPointerCapture(pointer);
-      this.#begin(button, axis, velocity, false);
+      this.#begin(button, axis, velocity, { touch: event.pointerType !== "mouse" });
     });
     button.addEventListener("pointermove", (event) => {
       if (pointer === null) return;
@@ -161,10 +172,7 @@ export class Control {
     for (const kind of ["pointerup", "pointercancel", "pointerleave", "lostpointercapture"]) {
       button.addEventListener(kind, end);
     }
-    button.addEventListener("contextmenu", (event) => {
-      event.preventDefault();
-      end();
-    });
+    button.addEventListener("contextmenu", (event) => event.preventDefault());
     const meant = (event) => event.key === arrow || (event.target === button && [" ", "Enter"].includes(event.key));
     // A single key event moves nothing; its repetition does.
     group.addEventListener("keydown", (event) => {
@@ -172,7 +180,7 @@ export class Control {
       event.preventDefault();
       if (!event.repeat || event.ctrlKey || event.altKey || event.metaKey) return;
       if (held()) this.#hold.keyAt = performance.now();
-      else if (this.#mayJog(axis)) this.#begin(button, axis, velocity, true);
+      else if (!this.#jogRefusal(axis)) this.#begin(button, axis, velocity, { keys: true });
     });
     for (const kind of ["keyup", "focusout"]) group.addEventListener(kind, end);
   }
