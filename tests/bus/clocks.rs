@@ -9,9 +9,10 @@ use ecaxis_master::config::Machine;
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
 use ecaxis_master::session::{self, Options, Outcome, simulated_bus};
-use ecaxis_sim::Segment;
+use ecaxis_sim::{AlState, Segment};
 use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::recordings::{LRW, datagrams};
+use ecaxis_test_support::wire::{WatchedBus, Watcher};
 use ecaxis_test_support::{Heard, faults, machine, recorded, run_badly, run_well, virtual_time};
 
 use crate::states::run_changed;
@@ -263,5 +264,93 @@ fn frames_arrive_between_the_pulses_of_a_faster_sync0() {
     assert!(arrivals.len() > 500);
     for (at, _, after) in &arrivals[arrivals.len() / 2..] {
         assert!((200_000..300_000).contains(after), "at {at}: {after} ns");
+    }
+}
+
+/// Registers 0x0980 to 0x09A7 of a device in Op, and the true times of its last pulses.
+#[derive(Debug, Default)]
+struct SyncUnit {
+    control: [u8; 2],
+    cycles: [u32; 2],
+    pulses: [Vec<Nanos>; 2],
+}
+
+struct SyncObserver(Arc<Mutex<SyncUnit>>);
+
+impl Watcher for SyncObserver {
+    fn after(&mut self, segment: &mut Segment) {
+        let device = segment.device(1).expect("two devices");
+        if device.al_state() != AlState::Op {
+            return;
+        }
+        let word = |register| {
+            let bytes = device.registers(register, 4).first_chunk();
+            u32::from_le_bytes(*bytes.expect("four bytes"))
+        };
+        *self.0.lock().expect("one thread") = SyncUnit {
+            control: word(0x0980).to_le_bytes()[..2].try_into().expect("two"),
+            cycles: [0x09a0, 0x09a4].map(word),
+            pulses: [device.sync0_log().collect(), device.sync1_log().collect()],
+        };
+    }
+}
+
+/// ETG.2000, `AssignActivate`: the low byte goes to 0x0980, the high byte to 0x0981. ESC data sheet,
+/// section I, 9.2.3: SYNC1 comes 0x09A4 after SYNC0. Rows: an oversampling terminal with four samples
+/// (EL3702, 750,000 at 1 ms as `ecmccfg` writes it), the same with 0x0700, EL7201 with 1,000, and 0x0500:
+/// SYNC1 without the output SYNC0.
+#[test]
+fn sync1_follows_sync0_as_the_esi_says() {
+    let rows: [(&str, i32, i32, u32, [u8; 2], u32, u64); 4] = [
+        ("#x0730", -4, -1, 0, [0x30, 0x07], 750_000, 4),
+        ("#x700", -4, -1, 0, [0x00, 0x07], 750_000, 4),
+        ("#x700", 1, 1, 1_000, [0x00, 0x07], 1_000, 1),
+        ("#x500", 1, 1, 1_000, [0x00, 0x05], 1_000, 0),
+    ];
+    for (activate, sync0, sync1, shift, control, delay, sync0_per_cycle) in rows {
+        let bench = Bench::new();
+        bench.write("own.xml", &bench.read("esi/IO8.xml"));
+        bench.change("own.xml", |esi| {
+            let dc = format!(
+                "<Dc><OpMode><Name>DC</Name><AssignActivate>{activate}</AssignActivate>\
+                 <CycleTimeSync0 Factor=\"{sync0}\">0</CycleTimeSync0>\
+                 <CycleTimeSync1 Factor=\"{sync1}\">0</CycleTimeSync1>\
+                 <ShiftTimeSync1>{shift}</ShiftTimeSync1></OpMode></Dc><Eeprom>"
+            );
+            esi.replace("<Eeprom>", &dc)
+        });
+        let mut text = String::from("[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n");
+        text += &drive("x", 0, "", "");
+        text += "[[device]]\nname = \"io\"\nesi = \"own.xml\"\nposition = 1\n[[step]]\nmove = { x = 1.0 }\n";
+        let machine = bench.machine(&text);
+        let seen = Arc::default();
+        let observer = SyncObserver(Arc::clone(&seen));
+        let bus = WatchedBus::new(&machine, &virtual_time(), observer);
+        let stop = Arc::<CancelToken>::default();
+        let outcome = session::run_on(
+            Box::new(bus),
+            machine,
+            virtual_time(),
+            stop,
+            &mut Heard::default(),
+        );
+        outcome.result.expect("runs");
+        let seen = seen.lock().expect("one thread");
+        assert_eq!(seen.control, control, "{activate}");
+        assert_eq!(seen.cycles[1], delay, "{activate}");
+        let [sync0, sync1] = &seen.pulses;
+        let near = |a: Nanos, b: Nanos| a.abs_diff(b) < 1_000;
+        assert!(sync1.len() > 1, "{activate}");
+        assert!(sync1.windows(2).all(|pair| near(pair[1] - pair[0], MS)));
+        let last = *sync1.last().expect("a pulse");
+        let before = sync0.iter().filter(|at| (last - MS..last).contains(*at));
+        assert_eq!(before.count() as u64, sync0_per_cycle, "{activate}");
+        if sync0_per_cycle > 0 {
+            assert!(
+                sync0
+                    .iter()
+                    .any(|at| near(last - at.min(&last), u64::from(delay)))
+            );
+        }
     }
 }

@@ -382,3 +382,37 @@ fn a_startup_sdo_that_is_not_stored_stops_bring_up_with_verification() {
         assert!(reported.contains(part), "{part}: {reported}");
     }
 }
+
+/// ETG.2000, `Info/Mailbox/Timeout/ResponseTimeout`: the time in which a device answers. The first
+/// answer of this device takes 6.5 s, longer than the default of 6 s (`mailbox::Timeouts`).
+#[test]
+fn a_slow_mailbox_has_the_time_of_its_esi() {
+    let run_slow = |response: &str| {
+        let bench = Bench::new();
+        bench.write("own.xml", &bench.read("esi/MIO2.xml"));
+        bench.change("own.xml", |esi| {
+            let info = format!(
+                "<Info><Mailbox><Timeout><RequestTimeout>100</RequestTimeout>{response}</Timeout>\
+                 </Mailbox></Info><GroupType>"
+            );
+            esi.replacen("<GroupType>", &info, 1)
+        });
+        let machine = bench.machine(
+            "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n\
+             [[device]]\nname = \"io\"\nesi = \"own.xml\"\nposition = 0\n[[step]]\ndwell = \"20ms\"\n",
+        );
+        let silent =
+            "[[fault]]\nkind = \"mailbox-silent\"\ndevice = 0\nat = \"0ms\"\nfor = \"6500ms\"\n";
+        let (outcome, _) = run(machine, faults(silent));
+        outcome.result.map_err(|error| error.to_string())
+    };
+    let long = "<ResponseTimeout>7000</ResponseTimeout>";
+    assert_eq!(run_slow(long), Ok(()));
+    for short in ["", "<ResponseTimeout>2000</ResponseTimeout>"] {
+        let error = run_slow(short).expect_err("too slow");
+        assert!(
+            error.contains("`io`") && error.contains("no answer"),
+            "{error}"
+        );
+    }
+}

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use ecaxis_esi::model::{Dictionary, EsiFile};
 
 use super::*;
+use crate::{DeviceOptions, SimDevice};
 
 /// Reads an ESI file from `ECAXIS_FIXTURES`, or from `../shared/fixtures` next to the workspace. A
 /// missing file is reported; on CI it is a failure.
@@ -122,6 +123,30 @@ fn torque_limits_without_a_factory_value_are_the_peak() {
     let rig = rig_of(&[&device.dictionary]);
     let value = |index| rig.store.get(rig.slot(index, 0));
     assert_eq!((value(0x6072), value(0x6073)), (3000, 3000));
+}
+
+/// 0x6065 at power-on is the `DefaultValue` or `DefaultData` of the vendor's ESI. Without one, it is
+/// 0xFFFFFFFF: the supervision is off (CiA 402-2, following error window); maxon's drives have 2000
+/// (EPOS4 firmware specification).
+#[test]
+fn following_error_window_has_its_factory_value() {
+    for (path, expected) in [
+        ("inovance/SV660_EOE_1Axis_V9.12.xml", 0x01a3_6ae7),
+        ("stepperonline/STEPPERONLINE_A6_Servo_V0.02.xml", 0x0010_0000),
+        ("synapticon/SOMANET_CiA_402_v4.xml", 0xffff_ffff),
+        ("elmo/Elmo_ECAT_00010420_V11.xml", 0xffff_ffff),
+    ] {
+        let Some(file) = esi(path) else {
+            return;
+        };
+        let device = file.devices.first().unwrap();
+        let options = DeviceOptions::default();
+        let sim = SimDevice::from_esi(device, &file.modules, options).unwrap();
+        let value = sim.object(0x6065, 0).unwrap();
+        assert_eq!(value, u32::to_le_bytes(expected), "{path}");
+    }
+    let own = rig();
+    assert_eq!(own.store.get(own.slot(0x6065, 0)), 2000);
 }
 
 /// The factory limits (0x607D, 7,129,736 to 9,713,015) exclude the position 0 of the axis.
