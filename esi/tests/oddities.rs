@@ -73,7 +73,8 @@ const CONTROL: (u16, u8) = (0x6040, 16);
 const POSITION: (u16, u8) = (0x607a, 32);
 const VELOCITY: (u16, u8) = (0x60ff, 32);
 
-/// One PDO per mode, all with the Controlword: the drive must see one Controlword.
+/// ETG.2000, `RxPdo/@Sm`: the default assignment; PDOs without `Sm` can replace it. One PDO per
+/// mode, all with the Controlword: the drive must see one Controlword.
 #[test]
 fn the_pdo_of_the_mode_replaces_a_default_pdo_with_its_objects() {
     let csp = pdo("RxPdo", "Fixed=\"1\"", 0x1601, &[CONTROL, POSITION]);
@@ -113,6 +114,7 @@ fn the_pdo_of_the_mode_replaces_a_default_pdo_with_its_objects() {
     assert_eq!(rx(&in_mode(&file, Mode::Csp)), [0x1601]);
 }
 
+/// ETG.6010: CSV and CST need their set-point and the actual value; the position is optional.
 #[test]
 fn velocity_mode_keeps_the_position_that_a_pdo_contains() {
     let csv = pdo(
@@ -177,6 +179,7 @@ fn a_named_assignment_wins_over_exclude() {
     assert_eq!(excluded, None);
 }
 
+/// ETG.2000, `OpMode/Sm/Pdo`: optional. Without it, the `Sm` attributes of the PDOs apply.
 #[test]
 fn a_sync_manager_of_an_opmode_without_pdos_keeps_the_default() {
     let pdos = pdo(
@@ -202,6 +205,8 @@ fn object(index: u16, kind: &str, bits: u16, access: &str) -> String {
     )
 }
 
+/// ETG.1000.6, PDO mapping: a writable 0x1600 or 0x1A00 can be configured, also if no `RxPdo`
+/// describes it.
 #[test]
 fn a_mapping_that_only_the_dictionary_has_takes_the_objects_of_the_mode() {
     let mapping = "<DataType><Name>MAP</Name><BitSize>80</BitSize>\

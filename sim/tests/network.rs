@@ -422,6 +422,8 @@ fn broken_ring_reaches_every_device_from_one_side() {
     }
 }
 
+/// ESC data sheet, section I, 3: a port without link closes its loop, so a broken ring is two
+/// lines.
 #[test]
 fn a_fault_script_breaks_the_closing_cable_of_a_ring() {
     let script = "[[fault]]\nat = '1ms'\nfor = '1ms'\nkind = 'link-break'\ndevice = 3\nport = 1";

@@ -73,6 +73,7 @@ fn safe_op_is_requested_again_once_sync0_runs() {
     assert!(error.contains("`y`") && error.contains("0x002d"), "{error}");
 }
 
+/// ETG.1500, feature 1103: the MainDevice observes the clock difference (0x092C) of each device.
 /// Clock readings with an error of up to 20 µs are never within 100 ns at five drives at once.
 #[test]
 fn sync_window_and_time_out_are_those_of_the_machine_file() {

@@ -137,7 +137,8 @@ fn in_op(cycles: &[Cycle]) -> std::ops::Range<usize> {
     first.expect("it was in Op")..last.expect("it was in Op") + 1
 }
 
-/// The first outputs in Op are already the inputs of the cycle before; every later one follows.
+/// ETG.1500, feature 1201: the MainDevice copies within at most two cycles. The first outputs in Op
+/// are already the inputs of the cycle before; every later one follows.
 #[test]
 fn a_value_arrives_one_cycle_later_or_two_with_a_pipelined_exchange() {
     let copies =
@@ -162,7 +163,8 @@ fn a_value_arrives_one_cycle_later_or_two_with_a_pipelined_exchange() {
     }
 }
 
-/// Whole PDOs and byte ranges have the same bits, gaps included.
+/// ETG.1500, feature 1201: the copied parts are configured. Whole PDOs and byte ranges have the
+/// same bits, gaps included.
 #[test]
 fn copies_of_bytes_and_pdos_are_exact() {
     let copies = "[[copy]]\nfrom = \"source.bytes.0..2\"\nto = \"target.bytes.0..2\"\n";
@@ -191,6 +193,8 @@ fn assert_held(cycles: &[Cycle]) -> usize {
     held
 }
 
+/// ETG.1000.4, working counter: inputs are new only if their datagram came back with the expected
+/// counter. Otherwise the target keeps its value.
 #[test]
 fn the_target_holds_its_value_while_answers_are_lost() {
     let machine = machine("lost_frames = 20", WORD_1);
@@ -201,8 +205,8 @@ fn the_target_holds_its_value_while_answers_are_lost() {
     assert!(held > 50, "{held}");
 }
 
-/// The first wrong counter is that of the datagram that both devices share, the next ones are the
-/// source's own.
+/// ETG.1000.4, working counter, as above. The first wrong counter is that of the datagram that both
+/// devices share, the next ones are the source's own.
 #[test]
 fn the_target_holds_its_value_while_the_working_counter_of_the_source_is_wrong() {
     let machine = machine("lost_frames = 20", WORD_1);
@@ -241,6 +245,7 @@ fn the_working_counter_of_the_target_does_not_matter() {
     assert!((1..5).contains(&held), "{held}");
 }
 
+/// ETG.1000.4, working counter, as above.
 #[test]
 fn the_target_holds_its_value_when_the_source_disappears() {
     let machine = machine("lost_frames = 150\nwatchdog = \"1s\"", WORD_1);

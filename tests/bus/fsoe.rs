@@ -462,7 +462,8 @@ fn run(
     (outcome, endpoints)
 }
 
-/// A safety PDU and its answer take four bus cycles, six with a pipelined exchange.
+/// ETG.5100: each safety PDU is answered within the FSoE watchdog. A safety PDU and its answer take
+/// four bus cycles, six with a pipelined exchange.
 #[test]
 fn a_safety_connection_stays_connected() {
     for (exchange, cycles) in [("same-cycle", 4), ("pipelined", 6)] {
@@ -482,6 +483,7 @@ fn a_safety_connection_stays_connected() {
     }
 }
 
+/// ETG.5100: a repeated safety PDU is no error; the watchdog bounds the repetitions.
 #[test]
 fn a_safety_connection_survives_lost_frames() {
     let (outcome, endpoints) = run("same-cycle", virtual_time(), |n| n > 300 && n % 40 < 9);
@@ -495,7 +497,8 @@ fn a_safety_connection_survives_lost_frames() {
     }
 }
 
-/// The held value never passes as a new PDU: both ends detect the loss.
+/// ETG.5100: without a new safety PDU, the FSoE watchdog of each end expires. The held value never
+/// passes as a new PDU: both ends detect the loss.
 #[test]
 fn both_ends_detect_the_loss_of_a_device() {
     let script = "[[fault]]\nkind = \"absent\"\ndevice = 1\nat = \"1s\"\n";
@@ -530,7 +533,8 @@ fn run_with_other_master(
     Some((outcome, master, slave))
 }
 
-/// 10⁵ cycles with nine lost answers of 40; a PDU and its answer then take four to 13 cycles.
+/// The FSoE master of PyPI judges each answer (`fsoe-master`). 10⁵ cycles with nine lost answers of
+/// 40; a PDU and its answer then take four to 13 cycles.
 #[test]
 fn another_safety_master_stays_connected_with_lost_frames() {
     let lost = |n: usize| n > 300 && n % 40 < 9;
@@ -544,6 +548,7 @@ fn another_safety_master_stays_connected_with_lost_frames() {
     assert!(master.checked > 10_000, "{}", master.checked);
 }
 
+/// ETG.5100: the FSoE watchdog, here that of `fsoe-master` of PyPI.
 #[test]
 fn another_safety_master_detects_the_loss_of_a_device() {
     let script = "[[fault]]\nkind = \"absent\"\ndevice = 1\nat = \"1s\"\n";

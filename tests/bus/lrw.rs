@@ -49,6 +49,8 @@ fn logical(recording: &Path) -> Vec<BTreeMap<u8, u16>> {
     counters.filter(|frame| !frame.is_empty()).collect()
 }
 
+/// ETG.2000, `Type/@UseLrdLwr`, and ETG.1000.4, 0x0008 bit 9: the device does not support LRW.
+/// ETG.1000.4, working counter: 1 for LRD, 1 for LWR, 3 for LRW.
 #[test]
 fn each_device_is_reached_by_a_supported_command() {
     // LRW counts 1 for reading and 2 for writing per device, LRD and LWR count 1. In every second

@@ -179,8 +179,8 @@ fn keep(cycle: &str, seed: u64, gains: Gains, seconds: u64, stall: impl Fn(u64) 
 }
 
 /// ETG.1020, synchronization: outputs arrive at a fixed distance from SYNC0. Measured against the
-/// pulses of the simulated drives (ESC data sheet, section I, 9.2.3), not against the controller's own
-/// error.
+/// pulses of the simulated drives (ESC data sheet, section I, 9.2.3), not against the controller's
+/// own error.
 #[test]
 fn frames_keep_their_phase_to_a_drifting_and_jittering_reference() {
     for cycle in ["1ms", "250us", "4ms"] {

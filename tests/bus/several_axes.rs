@@ -125,7 +125,8 @@ fn all_axes_of_a_drive_move_by_themselves() {
     }
 }
 
-/// An axis that the machine does not use receives zeros: no power, and no limit is held.
+/// CiA 402-2, Controlword: with 0, a drive stays in Switch on disabled. An axis that the machine
+/// does not use receives zeros: no power, and no limit is held.
 #[test]
 fn an_unused_axis_receives_nothing() {
     let bench = Bench::new();
@@ -174,7 +175,8 @@ fn start_up_sdos_and_homing_are_those_of_the_axis() {
     assert!(downloads.contains(&(0x6860, 0)), "{downloads:?}");
 }
 
-/// The drive has one set of FMMUs, so its axes stop together.
+/// ETG.1000.4: working counter and watchdog belong to FMMUs and SyncManagers, not to axes. The
+/// drive has one set of FMMUs, so its axes stop together.
 #[test]
 fn a_fault_of_one_axis_stops_the_group_of_the_drive() {
     let bench = Bench::new();

@@ -256,6 +256,8 @@ fn run(case: &Case) -> Result<Result<(), String>, String> {
         .ok_or(format!("moved {turned:.3} turns")))
 }
 
+/// The vendors' ESI files say what the devices offer (ETG.2000), and the simulated drive turns its
+/// shaft.
 #[test]
 fn every_vendor_device_reaches_op_or_is_refused_with_its_reason() {
     let Some(folder) = fixture("esi") else {

@@ -298,6 +298,8 @@ fn run_error(bench: &Bench, other: &str) -> String {
     outcome.result.expect_err("another bus").to_string()
 }
 
+/// ETG.1500, feature 302: the configuration is compared at start. Identities are those of the
+/// EEPROMs (ETG.1000.6, words 8 to 15).
 #[test]
 fn run_names_a_device_missing_in_the_middle_as_compare() {
     let bench = bench();

@@ -462,6 +462,7 @@ mod tests {
         }
     }
 
+    /// ETG.2000, `ShiftTimeSync0`: each device has its own pulses within the cycle.
     #[test]
     fn release_time_is_in_the_middle_of_the_longest_pause() {
         for (shifts, expected) in [

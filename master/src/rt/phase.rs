@@ -259,6 +259,8 @@ mod tests {
         }
     }
 
+    /// ESC data sheet, section I, 9.2.3: SYNC0 goes on without frames, so its pulses stay where
+    /// they were, however many cycles the host slept.
     #[test]
     fn a_wake_up_several_cycles_late_does_not_move_the_phase() {
         let mut phase = Phase::new(&plan(1_000_000, 0));

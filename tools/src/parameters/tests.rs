@@ -160,6 +160,7 @@ fn a_malformed_description_costs_one_object() {
     assert_eq!(failed.len(), 1, "{failed:?}");
 }
 
+/// ETG.1000.6 clause 5.6.3: each description is a request of its own.
 #[test]
 fn an_unanswered_description_costs_one_object_and_a_silent_device_ends_the_list() {
     let (indices, failed) = read_dictionary(&[Mischief::Skip(4)]).expect("a list");

@@ -132,7 +132,10 @@ fn torque_limits_without_a_factory_value_are_the_peak() {
 fn following_error_window_has_its_factory_value() {
     for (path, expected) in [
         ("inovance/SV660_EOE_1Axis_V9.12.xml", 0x01a3_6ae7),
-        ("stepperonline/STEPPERONLINE_A6_Servo_V0.02.xml", 0x0010_0000),
+        (
+            "stepperonline/STEPPERONLINE_A6_Servo_V0.02.xml",
+            0x0010_0000,
+        ),
         ("synapticon/SOMANET_CiA_402_v4.xml", 0xffff_ffff),
         ("elmo/Elmo_ECAT_00010420_V11.xml", 0xffff_ffff),
     ] {

@@ -170,6 +170,7 @@ prop_compose! {
 proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(400) })]
 
+    /// CiA 402-2 permits any value of its optional objects, and any of them may be missing.
     #[test]
     fn files_for_odd_drives_are_accepted_by_check(drive in prop::option::weighted(0.97, any_drive())) {
         let text = written(drive);
