@@ -16,6 +16,7 @@ mod homing;
 mod long_segment;
 mod lrw;
 mod mailboxes;
+mod oddities;
 mod phase;
 mod probe;
 mod program;

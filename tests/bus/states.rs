@@ -29,8 +29,9 @@ pub fn run_changed(machine: Machine, change: impl FnOnce(&mut Segment)) -> (Outc
     (outcome, heard)
 }
 
-/// Returns a drive of `configs/esi` and a drive whose ESI has these time-outs.
-fn drives(bus: &str, timeouts: &str) -> Machine {
+/// Returns a drive of `configs/esi` and a drive whose ESI has these time-outs; it needs `ms` for each
+/// state change.
+fn drives(bus: &str, timeouts: &str, ms: u64) -> Machine {
     let bench = Bench::new();
     bench.write("own.xml", &bench.read("esi/EPOS4.xml"));
     bench.change("own.xml", |esi| {
@@ -40,25 +41,21 @@ fn drives(bus: &str, timeouts: &str) -> Machine {
         esi.replacen("<GroupType>", &info, 1)
     });
     let mut text = format!("[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n{bus}");
-    for (position, (name, file)) in [("x", "esi/EPOS4.xml"), ("y", "own.xml")]
-        .into_iter()
-        .enumerate()
-    {
+    let slow = format!("[device.sim]\nstate_change = \"{ms}ms\"\n");
+    let both = [("x", "esi/EPOS4.xml", ""), ("y", "own.xml", &*slow)];
+    for (position, (name, file, sim)) in both.into_iter().enumerate() {
         text += &format!(
             "[[device]]\nname = \"{name}\"\nesi = \"{file}\"\nposition = {position}\nmode = \"csp\"\n\
              [device.axis]\nunit = \"turn\"\nper_turn = 1.0\nencoder = 2000\n\
-             limits = {{ position = [-100.0, 100.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 1.0 }}\n"
+             limits = {{ position = [-100.0, 100.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 1.0 }}\n{sim}"
         );
     }
     bench.machine(&(text + "[[step]]\nmove = { x = 1.0, y = 1.0 }\n"))
 }
 
-/// Runs [`drives`]; `y` needs `ns` for each state change.
-fn run_slow(bus: &str, timeouts: &str, ns: u64) -> Result<(), String> {
-    let (outcome, _) = run_changed(drives(bus, timeouts), |segment| {
-        let slow = segment.device_mut(1).expect("two drives");
-        slow.set_state_change(ns);
-    });
+/// Runs [`drives`].
+fn run_slow(bus: &str, timeouts: &str, ms: u64) -> Result<(), String> {
+    let (outcome, _) = run(drives(bus, timeouts, ms), virtual_time());
     outcome.result.map_err(|error| error.to_string())
 }
 
@@ -67,13 +64,13 @@ fn run_slow(bus: &str, timeouts: &str, ns: u64) -> Result<(), String> {
 #[test]
 fn state_change_times_out_after_the_time_of_the_esi() {
     let short = "<SafeopOpTimeout>200</SafeopOpTimeout>";
-    let error = run_slow("", short, 300 * MS).expect_err("too slow");
+    let error = run_slow("", short, 300).expect_err("too slow");
     assert!(
         error.contains("`y`") && error.contains("did not reach SafeOp within 200 ms, is in PreOp"),
         "{error}"
     );
     let back = "<BackToSafeopTimeout>400</BackToSafeopTimeout>";
-    assert_eq!(run_slow("", back, 300 * MS), Ok(()));
+    assert_eq!(run_slow("", back, 300), Ok(()));
 }
 
 /// ETG.2000, `Info/StateMachine/Timeout`: longer times than the defaults of ETG.1020 (3 s to PreOp,
@@ -83,9 +80,9 @@ fn state_change_may_take_as_long_as_the_esi_says() {
     let long = "<PreopTimeout>30000</PreopTimeout><SafeopOpTimeout>30000</SafeopOpTimeout>\
                 <BackToInitTimeout>20000</BackToInitTimeout>\
                 <BackToSafeopTimeout>20000</BackToSafeopTimeout>";
-    assert_eq!(run_slow("", long, 12_000 * MS), Ok(()));
+    assert_eq!(run_slow("", long, 12_000), Ok(()));
     // The machine file's time-out replaces that of the ESI.
-    let error = run_slow("op_timeout = \"2s\"\n", long, 12_000 * MS).expect_err("too slow");
+    let error = run_slow("op_timeout = \"2s\"\n", long, 12_000).expect_err("too slow");
     assert!(
         error.contains("`y`") && error.contains("did not reach Op within 2000 ms, is in SafeOp"),
         "{error}"
@@ -95,7 +92,7 @@ fn state_change_may_take_as_long_as_the_esi_says() {
 /// ETG.1020: the default of 200 ms back to SafeOp.
 #[test]
 fn way_back_to_safe_op_has_its_own_time_out() {
-    let error = run_slow("", "<PreopTimeout>4000</PreopTimeout>", 300 * MS).expect_err("too slow");
+    let error = run_slow("", "<PreopTimeout>4000</PreopTimeout>", 300).expect_err("too slow");
     assert!(
         error.contains("`y`") && error.contains("did not reach SafeOp within 200 ms, is in Op"),
         "{error}"
@@ -359,12 +356,10 @@ fn explicit_identification_waits_for_a_slow_device() {
         });
         let machine = bench.machine(&format!(
             "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n\
-             [[device]]\nname = \"x\"\nesi = \"own.xml\"\nid = 7\n{DRIVE}"
+             [[device]]\nname = \"x\"\nesi = \"own.xml\"\nid = 7\n{DRIVE}\
+             [device.sim]\nstate_change = \"300ms\"\n"
         ));
-        let (outcome, _) = run_changed(machine, |segment| {
-            let slow = segment.device_mut(0).expect("a drive");
-            slow.set_state_change(300 * MS);
-        });
+        let (outcome, _) = run(machine, virtual_time());
         let result = outcome.result.map_err(|error| error.to_string());
         assert_eq!(result.is_ok(), comes_up, "{declared}: {result:?}");
         if let Err(error) = result {

@@ -27,6 +27,8 @@ pub struct SimSetup {
     pub offset_ns: u64,
     /// The maximum deviation of its clock reads in either direction.
     pub jitter_ns: u32,
+    /// The time from a request in AL control to the answer in AL status.
+    pub state_change_ns: Option<u64>,
     /// The network behind a gateway.
     pub gateway: Option<GatewayOptions>,
     /// The switches and ends along a drive's axis.
@@ -75,6 +77,7 @@ pub(crate) fn check(
             .value()
             .and_then(|ns| u32::try_from(ns).ok())
             .unwrap_or(0),
+        state_change_ns: raw.state_change.value(),
         gateway: gateway::setup(&raw, device, p),
         track: raw
             .track
@@ -307,7 +310,7 @@ mod tests {
                 "c",
                 "C",
                 0,
-                "drift_ppm = -20\noffset = \"3s\"\njitter = \"15ns\"",
+                "drift_ppm = -20\noffset = \"3s\"\njitter = \"15ns\"\nstate_change = \"2s\"",
             ),
             ("x", "B", 2, "after = \"c\"\nport = 2\ncable = \"150ns\""),
             ("t", "T", 1, "after = \"c\""),
@@ -321,6 +324,7 @@ mod tests {
         let coupler = &machine.devices[DeviceIndex(0)].sim;
         assert_eq!(coupler.drift_ppm, Some(-20.0));
         assert_eq!((coupler.offset_ns, coupler.jitter_ns), (3_000_000_000, 15));
+        assert_eq!(coupler.state_change_ns, Some(2_000_000_000));
         let bus = topology(&machine.devices).expect("good");
         let at = |device, port| Some(Uplink { device, port });
         assert_eq!([bus.uplink(1), bus.uplink(2)], [at(0, 1), at(0, 2)]);

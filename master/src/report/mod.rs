@@ -9,7 +9,7 @@
 mod diagnosis_message;
 mod emergencies;
 mod error;
-pub mod events;
+pub(crate) mod events;
 mod progress;
 pub(crate) mod summary;
 

@@ -204,6 +204,8 @@ fn sim_device(
     seed: u64,
 ) -> Result<SimDevice, Error> {
     let place = u32::try_from(position).unwrap_or(0);
+    let usual = DeviceOptions::default();
+    let state_change_ns = device.sim.state_change_ns;
     let mut options = DeviceOptions {
         serial: device.serial.unwrap_or(1000 + place),
         clock_drift_ppm: device
@@ -213,9 +215,12 @@ fn sim_device(
         clock_offset_ns: device.sim.offset_ns,
         clock_jitter_ns: device.sim.jitter_ns,
         jitter_seed: seed.wrapping_add(u64::from(place)),
+        state_change_ns: state_change_ns.unwrap_or(usual.state_change_ns),
+        // A slow device also reads AL control soon.
+        state_notice_ns: Some(usual.state_change_ns / 4),
         gateway: device.sim.gateway.clone(),
         firmware: (device.device.identity.vendor == DEMONSTRATION).then(FirmwareOptions::default),
-        ..DeviceOptions::default()
+        ..usual
     };
     match device.at {
         Locator::Position(_) => {}

@@ -94,6 +94,9 @@ pub struct PdoRules {
     /// The entries (direction, index << 8 | sub) of the ESI's PDOs. They are mappable regardless of
     /// flags.
     known_entries: Vec<(Direction, u32)>,
+    /// The assignments that OpModes and alternative mappings of the ESI name. Their PDOs do not
+    /// exclude each other.
+    named: Vec<Vec<u16>>,
 }
 
 impl PdoRules {
@@ -141,6 +144,10 @@ impl PdoRules {
             store.describe(index, ObjectCode::Array, &name);
             rules.fill(store, index, 16, &assigned, room, assign);
         }
+        let modes = device.dc_modes.iter().map(|mode| &mode.sync_managers);
+        let mappings = device.sm_mappings.iter().map(|m| &m.sync_managers);
+        let named = modes.chain(mappings).flatten();
+        rules.named = named.map(|(_, pdos)| pdos.clone()).collect();
         rules.plug_defaults(store, device);
         rules
     }
@@ -446,10 +453,11 @@ impl PdoRules {
         count: i64,
     ) -> Result<(), Abort> {
         let assigned: Vec<u16> = elements(store, index, count).map(|v| v as u16).collect();
-        for pdo in assigned.iter().filter_map(|index| self.pdo(*index)) {
-            if pdo.exclude.iter().any(|other| assigned.contains(other)) {
-                return Err(Abort::INCOMPATIBLE);
-            }
+        let in_one = |pdos: &Vec<u16>| assigned.iter().all(|pdo| pdos.contains(pdo));
+        let mut pdos = assigned.iter().filter_map(|index| self.pdo(*index));
+        let excluded = pdos.any(|pdo| pdo.exclude.iter().any(|other| assigned.contains(other)));
+        if excluded && !self.named.iter().any(in_one) {
+            return Err(Abort::INCOMPATIBLE);
         }
         let bits: usize = assigned.iter().map(|pdo| mapped_bits(store, *pdo)).sum();
         self.check_len(sm, bits)

@@ -285,11 +285,6 @@ impl SimDevice {
         self.esc.latch_input(n, level, local);
     }
 
-    /// Sets [`DeviceOptions::state_change_ns`]. The time to read AL control stays.
-    pub fn set_state_change(&mut self, ns: Nanos) {
-        self.state_change_ns = ns.max(self.state_notice_ns);
-    }
-
     /// Makes the device refuse SafeOp until SYNC0 has fired, as some do.
     pub fn require_sync0_in_safe_op(&mut self) {
         self.sync0_before_safe_op = true;

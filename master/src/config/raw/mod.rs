@@ -29,7 +29,6 @@ table! { "the machine file",
         devices: Vec<RawDevice> as "device" = "[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"",
         copies: Vec<RawCopy> as "copy",
         stop: RawStop,
-        server: RawServer,
         steps: Vec<RawStep> as "step",
     }
 }
@@ -232,6 +231,7 @@ table! { "[device.sim]",
         drift_ppm: Key<f64>,
         offset: Key<Ns>,
         jitter: Key<Ns> [0..=MS],
+        state_change: Key<Ns> [0..=60 * S],
         bit_rate: Key<u32>,
         sync: Key<Ns>,
         node: Vec<RawNode>,
@@ -270,13 +270,6 @@ table! { "[stop]",
         bus_lost: Key<StopMethod> [STOPS_BY_DRIVE],
         emergency: Option<Conditions>,
         groups: Vec<RawGroup> as "group",
-    }
-}
-
-table! { "[server]",
-    table RawServer {
-        stale_cycles: Key<u32> [1..=1000],
-        lease: Key<Ns> [100 * MS..=60 * S],
     }
 }
 
