@@ -67,6 +67,17 @@ impl DatagramClient {
         working_counter(answer.map(|_| ()), 0, 0, 0)
     }
 
+    /// Returns the AL status of all SubDevices, ORed (BRD 0x0130).
+    pub(crate) async fn any_status(&self) -> Result<u8, DatagramError> {
+        let _turn = self.turns.take().await;
+        let answer = Command::brd(registers::AL_STATUS)
+            .ignore_wkc()
+            .receive_slice(self.device, 1)
+            .await;
+        let status = answer.map(|pdu| pdu.first().copied().unwrap_or(0));
+        status.map_err(|error| failed(error, 0, registers::AL_STATUS))
+    }
+
     /// Reads by position in the segment (APRD), for use before station addresses are verified.
     /// Returns the working counter.
     ///

@@ -15,6 +15,7 @@ mod fsoe;
 mod homing;
 mod long_segment;
 mod lrw;
+mod mailbox_sizes;
 mod mailboxes;
 mod oddities;
 mod phase;

@@ -290,8 +290,12 @@ fn mailbox_sync_managers_are_enabled_whatever_the_esi_says() {
         own.replace("Enable=\"1\">MBoxIn", "Enable=\"0\">MBoxIn")
     });
     let datagrams = done.expect("comes up");
-    let enabled = written(&datagrams, 0x1000, &[(0x0806, 0), (0x080e, 0)]);
-    assert_eq!(enabled, [(0x0806, 1), (0x080e, 1)]);
+    // From the EEPROM, then as the device needs them.
+    let enabled = written(&datagrams, 0x1000, &[(0x0800, 6), (0x0808, 6)]);
+    assert_eq!(
+        enabled,
+        [(0x0800, 0), (0x0808, 0), (0x0800, 1), (0x0808, 1)]
+    );
 }
 
 /// ETG.2000: `Fmmu` elements are optional; the SyncManagers' texts say what they carry.

@@ -111,7 +111,7 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
             "the drive's firmware has another PDO mapping than the ESI file: use the ESI file of that firmware".to_owned()
         }
         Cause::MailboxMoved { .. } => {
-            "the device's EEPROM is not of this ESI file: use the ESI file of its firmware".to_owned()
+            "the EEPROM has no usable mailbox: write `mailbox = \"esi\"`, or use the ESI file of the device's firmware".to_owned()
         }
         Cause::Fmmus { .. } => {
             "choose fewer PDOs, so that fewer SyncManagers carry process data (`assignment`, `pdo`)".to_owned()

@@ -1,7 +1,10 @@
 //! EEPROM image contents → ESI device, for a device without an ESI file.
 
+use std::fmt;
+
 use ecaxis_ecat::data_type::DataType;
 
+use super::image::mailbox_areas;
 use super::{
     General, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiFmmuDetail, SiiPdo, SiiSyncManager,
 };
@@ -71,6 +74,48 @@ impl Sii {
     }
 }
 
+/// The mailboxes of one device, as its ESI and its EEPROM have them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MailboxDifference {
+    /// The SyncManagers of the ESI.
+    pub esi: MailboxAreas,
+    /// Words 0x18 to 0x1B of the EEPROM.
+    pub eeprom: MailboxAreas,
+}
+
+impl fmt::Display for MailboxDifference {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { esi, eeprom } = self;
+        write!(
+            f,
+            "the mailboxes differ: {esi} in the ESI, {eeprom} in the EEPROM"
+        )
+    }
+}
+
+impl fmt::Display for MailboxAreas {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "out 0x{:04x} ({} bytes), in 0x{:04x} ({} bytes)",
+            self.receive_offset, self.receive_size, self.send_offset, self.send_size
+        )
+    }
+}
+
+impl Sii {
+    /// Compares the mailboxes with those of an ESI device that has some.
+    #[must_use]
+    pub fn mailbox_difference(&self, device: &Device) -> Option<MailboxDifference> {
+        device.mailbox.as_ref()?;
+        let difference = MailboxDifference {
+            esi: mailbox_areas(device),
+            eeprom: self.mailbox,
+        };
+        (difference.esi != difference.eeprom).then_some(difference)
+    }
+}
+
 fn identification(general: &General) -> Identification {
     if general.flags & General::IDENTIFICATION_AL_STATUS != 0 {
         Identification::Reg134
@@ -131,10 +176,19 @@ fn has_mailbox(sii: &Sii) -> bool {
 /// Returns the SyncManagers of the category, or the standard mailboxes of the header without a
 /// category.
 fn sync_managers(sii: &Sii) -> Vec<SyncManager> {
-    if !sii.sync_managers.is_empty() {
-        return sii.sync_managers.iter().map(sync_manager).collect();
-    }
     let areas = sii.mailbox;
+    if !sii.sync_managers.is_empty() {
+        let mut all: Vec<_> = sii.sync_managers.iter().map(sync_manager).collect();
+        // The header is what other MainDevices use (SOEM, ethercrab).
+        for sm in &mut all {
+            match sm.usage {
+                SmUse::MBoxOut if areas.receive_size > 0 => sm.default_size = areas.receive_size,
+                SmUse::MBoxIn if areas.send_size > 0 => sm.default_size = areas.send_size,
+                _ => {}
+            }
+        }
+        return all;
+    }
     let standard = |usage, start_address, len, control| SiiSyncManager {
         start_address,
         len,

@@ -181,7 +181,7 @@ fn bootstrap(bytes: &[u8]) -> MailboxAreas {
     }
 }
 
-fn mailbox_areas(device: &Device) -> MailboxAreas {
+pub(super) fn mailbox_areas(device: &Device) -> MailboxAreas {
     let area = |usage| {
         let sm = device.sync_managers.iter().find(|sm| sm.usage == usage);
         sm.map_or((0, 0), |sm| (sm.start_address, sm.default_size))

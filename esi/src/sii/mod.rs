@@ -29,6 +29,7 @@ mod strings;
 mod warning;
 
 pub use compare::{Difference, DifferenceKind, compare};
+pub use device::MailboxDifference;
 pub use emit::checksum;
 pub use image::SiiOptions;
 pub use parse::SiiError;

@@ -1,5 +1,6 @@
-//! The positions of a device's mailboxes, as ethercrab has configured them from the EEPROM,
-//! compared with the ESI. A mailbox whose length differs from its SyncManager's never becomes full.
+//! The mailboxes of a device. ethercrab configures them from the EEPROM. If the ESI has others, the
+//! machine file says which ones are used: a mailbox whose length differs from its SyncManager's
+//! never becomes full.
 
 use std::future::{Future, poll_fn};
 use std::pin::pin;
@@ -7,150 +8,246 @@ use std::task::Poll;
 use std::time::Duration;
 
 use ecaxis_ecat::registers;
-use ecaxis_esi::model::SmUse;
+use ecaxis_esi::model::{SmUse, SyncManager};
 
-use super::device::read;
-use super::name_at;
-use crate::acyclic::enumerate::FIRST_STATION;
-use crate::acyclic::{AlState, DeviceRef, al};
-use crate::config::{DeviceConfig, Machine};
+use super::device::{read, write};
+use super::{Step, name_at};
+use crate::acyclic::enumerate::read_device;
+use crate::acyclic::{AlState, DeviceRef, StateTimeouts, al};
+use crate::config::{DeviceConfig, Locator, Machine, MailboxSource};
 use crate::datagram::DatagramClient;
 use crate::mailbox::{MailboxLayout, MailboxTransport};
 use crate::report::{Cause, Error};
 
-/// Returns `None` if the ESI declares no CoE mailbox.
+const STEP: &str = "configuring the mailbox";
+
+/// The mailbox SyncManagers of an ESI, with their numbers.
+#[derive(Debug, Clone, Copy)]
+struct EsiMailbox<'c> {
+    out: (u8, &'c SyncManager),
+    inp: (u8, &'c SyncManager),
+}
+
+impl<'c> EsiMailbox<'c> {
+    fn of(config: &'c DeviceConfig) -> Option<Self> {
+        config.device.mailbox.as_ref()?;
+        let find = |usage| {
+            let mut sms = (0..=u8::MAX).zip(&config.device.sync_managers);
+            sms.find(|(_, sm)| sm.usage == usage)
+        };
+        Some(Self {
+            out: find(SmUse::MBoxOut)?,
+            inp: find(SmUse::MBoxIn)?,
+        })
+    }
+
+    /// Writes both SyncManagers and enables them. No device with a mailbox reaches PreOp without it
+    /// (ETG.1000.6, 6.4), whatever the ESI's `Enable` says. The device must be in Init.
+    async fn configure(
+        &self,
+        wire: &impl MailboxTransport,
+        device: &DeviceRef,
+    ) -> Result<(), Error> {
+        for (number, sm) in [self.out, self.inp] {
+            let [a0, a1] = sm.start_address.to_le_bytes();
+            let [n0, n1] = sm.default_size.to_le_bytes();
+            let register = sync_manager(number);
+            let enabled = [a0, a1, n0, n1, sm.control_byte, 0, 1, 0];
+            // The other registers of an enabled SyncManager cannot be written (ETG.1000.4).
+            write(wire, device, STEP, register + ACTIVATE, &[0]).await?;
+            write(wire, device, STEP, register, &enabled).await?;
+        }
+        Ok(())
+    }
+}
+
+/// The offset of a SyncManager's activate register.
+const ACTIVATE: u16 = 6;
+
+fn sync_manager(number: u8) -> u16 {
+    registers::SYNC_MANAGER + registers::SYNC_MANAGER_LEN * u16::from(number)
+}
+
+/// Returns the mailbox that the device has from now on; `None` if the ESI declares no CoE. `device`
+/// is in PreOp before and afterwards.
 pub(super) async fn open(
     wire: &impl MailboxTransport,
     config: &DeviceConfig,
     device: &DeviceRef,
+    progress: &dyn Fn(Step),
 ) -> Result<Option<MailboxLayout>, Error> {
     let coe = config.device.mailbox.as_ref().and_then(|m| m.coe.as_ref());
-    let (true, Some((out_sm, out)), Some((in_sm, inp))) = (
-        coe.is_some(),
-        find(config, SmUse::MBoxOut),
-        find(config, SmUse::MBoxIn),
-    ) else {
+    let (Some(_), Some(esi)) = (coe, EsiMailbox::of(config)) else {
         return Ok(None);
     };
-    for (sm, expected) in [(out_sm, out), (in_sm, inp)] {
-        let register = registers::SYNC_MANAGER + registers::SYNC_MANAGER_LEN * u16::from(sm);
-        let step = "reading the mailbox SyncManagers";
-        let [a0, a1, l0, l1] = read(wire, device, step, register).await?;
-        let actual = (u16::from_le_bytes([a0, a1]), u16::from_le_bytes([l0, l1]));
-        if actual != expected {
-            let show = |(address, len): (u16, u16)| format!("0x{address:04x}, {len} bytes");
+    let area = |(_, sm): (u8, &SyncManager)| (sm.start_address, sm.default_size);
+    let expected = (area(esi.out), area(esi.inp));
+    let mut actual = configured(wire, device, &esi).await?;
+    if actual != expected {
+        let differs = format!(
+            "{device}: the mailboxes differ: {} in the ESI, {} by the EEPROM",
+            show(expected),
+            show(actual)
+        );
+        let used = match config.mailbox {
+            MailboxSource::Esi => {
+                reconfigure(wire, config, device, &esi).await?;
+                actual = configured(wire, device, &esi).await?;
+                "ESI"
+            }
+            MailboxSource::Eeprom => "EEPROM",
+        };
+        let empty = actual.0.1 == 0 || actual.1.1 == 0;
+        if empty || config.mailbox == MailboxSource::Esi && actual != expected {
             return Err(Cause::MailboxMoved {
                 expected: show(expected),
                 actual: show(actual),
             }
             .with_device(device));
         }
+        let warning = format!("{differs}; those of the {used} are used (`mailbox`)");
+        progress(Step::Warning(warning));
     }
+    let ((out_address, out_len), (in_address, in_len)) = actual;
     Ok(Some(MailboxLayout {
         station: device.station,
-        out_address: out.0,
-        out_len: out.1,
-        in_address: inp.0,
-        in_len: inp.1,
-        out_sm,
-        in_sm,
+        out_address,
+        out_len,
+        in_address,
+        in_len,
+        out_sm: esi.out.0,
+        in_sm: esi.inp.0,
     }))
 }
 
-/// Runs ethercrab's `scan` and enables mailbox SyncManagers meanwhile if an ESI does not
-/// (`Enable="0"`). ethercrab enables a SyncManager only if the EEPROM does, but no device with a
-/// mailbox reaches PreOp without it (ETG.1000.6, 6.4).
-pub(super) async fn enable_during<T>(
+/// Address and length of both mailboxes, out and in.
+type Areas = ((u16, u16), (u16, u16));
+
+fn show((out, inp): Areas) -> String {
+    format!(
+        "out 0x{:04x} ({} bytes), in 0x{:04x} ({} bytes)",
+        out.0, out.1, inp.0, inp.1
+    )
+}
+
+/// Reads the mailboxes that the device has now.
+async fn configured(
+    wire: &impl MailboxTransport,
+    device: &DeviceRef,
+    esi: &EsiMailbox<'_>,
+) -> Result<Areas, Error> {
+    let area = async |number| {
+        let [a0, a1, n0, n1] = read(wire, device, STEP, sync_manager(number)).await?;
+        Ok::<_, Error>((u16::from_le_bytes([a0, a1]), u16::from_le_bytes([n0, n1])))
+    };
+    Ok((area(esi.out.0).await?, area(esi.inp.0).await?))
+}
+
+/// Gives a device in PreOp the mailboxes of its ESI. They may change in Init only (ETG.1000.6, 6.4).
+async fn reconfigure(
+    wire: &impl MailboxTransport,
+    config: &DeviceConfig,
+    device: &DeviceRef,
+    esi: &EsiMailbox<'_>,
+) -> Result<(), Error> {
+    /// 0x0500: the PDI has access to the EEPROM, which some devices need for PreOp.
+    const PDI: [u8; 1] = [1];
+    let timeouts = StateTimeouts::new(&config.device.info);
+    let one = std::slice::from_ref(device);
+    al::change_state(wire, one, AlState::Init, timeouts.back_to_init).await?;
+    esi.configure(wire, device).await?;
+    write(wire, device, STEP, registers::EEPROM_CONFIGURATION, &PDI).await?;
+    let done = al::change_state(wire, one, AlState::PreOp, timeouts.pre_op).await;
+    write(wire, device, STEP, registers::EEPROM_CONFIGURATION, &[0]).await?;
+    done.map_err(|error| error.with_action(STEP))
+}
+
+/// Runs ethercrab's `scan`. Meanwhile, a device that refuses PreOp because of its mailbox gets that
+/// of its ESI, and is asked again: ethercrab enables only what the EEPROM enables, and an EEPROM
+/// may have a mailbox that its device refuses, or none.
+pub(super) async fn repair_during<T>(
     wire: &DatagramClient,
     machine: &Machine,
     scan: impl Future<Output = T>,
 ) -> T {
-    let disabled = disabled(machine);
-    if disabled.is_empty() {
+    if machine
+        .devices
+        .iter()
+        .all(|config| EsiMailbox::of(config).is_none())
+    {
         return scan.await;
     }
     let mut scan = pin!(scan);
-    let mut enabling = pin!(enable(wire, machine, &disabled));
+    let mut repairs = pin!(repair(wire, machine));
     poll_fn(|context| {
         if let Poll::Ready(done) = scan.as_mut().poll(context) {
             return Poll::Ready(done);
         }
         // It never ends.
-        let _ = enabling.as_mut().poll(context);
+        let _ = repairs.as_mut().poll(context);
         Poll::Pending
     })
     .await
 }
 
-/// A mailbox SyncManager: its number and its start address.
-type MailboxSm = (u8, u16);
-
-/// Returns the mailbox SyncManagers that ESI files do not enable.
-fn disabled(machine: &Machine) -> Vec<MailboxSm> {
-    let mut all = Vec::new();
-    for config in &machine.devices {
-        if config.device.mailbox.is_none() {
+async fn repair(wire: &DatagramClient, machine: &Machine) {
+    const PERIOD: Duration = Duration::from_millis(5);
+    let mut repaired = vec![false; machine.devices.len()];
+    loop {
+        wire.delay(PERIOD).await;
+        // One datagram asks all devices.
+        let Ok(status) = wire.any_status().await else {
+            continue;
+        };
+        if !AlState::has_error(status) {
             continue;
         }
-        for (number, sm) in (0..=u8::MAX).zip(&config.device.sync_managers) {
-            let mailbox = matches!(sm.usage, SmUse::MBoxOut | SmUse::MBoxIn);
-            if mailbox && !sm.enable && !all.contains(&(number, sm.start_address)) {
-                all.push((number, sm.start_address));
+        for (position, repaired) in (0..).zip(&mut repaired) {
+            if !*repaired {
+                *repaired = repair_one(wire, machine, position).await == Some(());
             }
         }
     }
-    all
 }
 
-/// Enables these SyncManagers wherever they are configured and disabled. A device that has refused
-/// PreOp meanwhile is asked again.
-async fn enable(wire: &DatagramClient, machine: &Machine, disabled: &[MailboxSm]) {
-    const PERIOD: Duration = Duration::from_millis(1);
+/// Returns `None` if the device does not need a repair, or none is known.
+async fn repair_one(wire: &DatagramClient, machine: &Machine, position: u16) -> Option<()> {
     /// Invalid mailbox configuration in PreOp.
     const INVALID_MAILBOX: u16 = 0x0016;
-    let count = u16::try_from(machine.devices.len()).unwrap_or(u16::MAX);
-    loop {
-        for position in 0..count {
-            let station = FIRST_STATION.saturating_add(position);
-            let mut enabled = false;
-            for &(number, start) in disabled {
-                let register =
-                    registers::SYNC_MANAGER + registers::SYNC_MANAGER_LEN * u16::from(number);
-                let mut sm = [0; registers::SYNC_MANAGER_LEN as usize];
-                let read = wire.read(station, register, &mut sm).await;
-                let [a0, a1, n0, n1, _, _, activate, _] = sm;
-                let configured = u16::from_le_bytes([a0, a1]) == start && (n0, n1) != (0, 0);
-                if read == Ok(1) && configured {
-                    if activate & 1 == 0 {
-                        let _ = wire.write(station, register + 6, &[1]).await;
-                    }
-                    enabled = true;
-                }
-            }
-            let status = al::read_status(wire, station).await;
-            if enabled
-                && let Ok(Some((status, INVALID_MAILBOX))) = status
-                && AlState::from_status(status) == AlState::Init
-            {
-                let device = DeviceRef {
-                    name: name_at(machine, position),
-                    position,
-                    station,
-                };
-                tracing::debug!(%device, "its mailbox is enabled, requesting PreOp again");
-                let _ = al::request(wire, &device, AlState::PreOp).await;
-            }
-        }
-        wire.delay(PERIOD).await;
+    let found = read_device(wire, position).await.ok()?;
+    if found.code != INVALID_MAILBOX || found.state != AlState::Init {
+        return None;
     }
+    let device = found.named(name_at(machine, position));
+    let here = |config: &&DeviceConfig| match config.at {
+        Locator::Position(at) => at == position,
+        Locator::Alias(at) => at == found.alias,
+        Locator::Id(_) => false,
+    };
+    let config = machine.devices.iter().find(here);
+    match config.and_then(|config| Some((config.mailbox, EsiMailbox::of(config)?))) {
+        Some((MailboxSource::Esi, esi)) => esi.configure(wire, &device).await.ok()?,
+        // Which mailbox it should have is not known: enable those that it has.
+        _ => enable(wire, device.station).await?,
+    }
+    tracing::debug!(%device, "its mailbox is configured again, requesting PreOp");
+    al::request(wire, &device, AlState::PreOp).await.ok()
 }
 
-/// Returns number, address and length of the first SyncManager with this use.
-fn find(config: &DeviceConfig, usage: SmUse) -> Option<(u8, (u16, u16))> {
-    let sms = &config.device.sync_managers;
-    let (number, sm) = sms.iter().enumerate().find(|(_, sm)| sm.usage == usage)?;
-    Some((
-        u8::try_from(number).ok()?,
-        (sm.start_address, sm.default_size),
-    ))
+/// Enables the configured mailboxes of a device.
+async fn enable(wire: &DatagramClient, station: u16) -> Option<()> {
+    /// ETG.1000.4, table 58: the mode of mailboxes.
+    const MAILBOX: u8 = 2;
+    for number in 0..2 {
+        let mut sm = [0; registers::SYNC_MANAGER_LEN as usize];
+        wire.read(station, sync_manager(number), &mut sm)
+            .await
+            .ok()?;
+        let [_, _, n0, n1, control, _, activate, _] = sm;
+        if (n0, n1) != (0, 0) && control & 3 == MAILBOX && activate & 1 == 0 {
+            let register = sync_manager(number) + ACTIVATE;
+            wire.write(station, register, &[1]).await.ok()?;
+        }
+    }
+    Some(())
 }

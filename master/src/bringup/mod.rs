@@ -193,7 +193,7 @@ pub async fn bring_up(
         al::acknowledge_errors_in_init(&wire).await;
         // ethercrab's tables are large, and futures hold them by value.
         let scan = Box::pin(main_device.init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now));
-        match mailbox::enable_during(&wire, machine, scan).await {
+        match mailbox::repair_during(&wire, machine, scan).await {
             Ok(group) => Ok(group),
             Err(error) => Err(identify::explain_scan(&wire, machine, error).await),
         }
@@ -211,7 +211,7 @@ pub async fn bring_up(
         .iter()
         .zip(&order)
         .map(|(config, &position)| {
-            let device = describe(&wire, main_device, &group, config, position);
+            let device = describe(&wire, main_device, &group, config, position, progress);
             times.measure("mailbox", Some(&config.name), device)
         });
     let found = try_join_all(found).await?;
@@ -249,6 +249,7 @@ async fn describe(
     group: &Group,
     config: &DeviceConfig,
     position: u16,
+    progress: &dyn Fn(Step),
 ) -> Result<BusDevice, Error> {
     let sub_device = group
         .subdevice(main_device, usize::from(position))
@@ -268,7 +269,7 @@ async fn describe(
     let receive_times = !matches!(sub_device.dc_support(), DcSupport::None);
     let dc = receive_times && clocks::has_system_time(wire, &at).await?;
     let info = &config.device.info;
-    let coe = mailbox::open(wire, config, &at).await?;
+    let coe = mailbox::open(wire, config, &at, progress).await?;
     Ok(BusDevice {
         coe: coe.map(|layout| CoeClient::new(layout).with_timeouts(mailbox_timeouts(info))),
         timeouts: StateTimeouts::new(info),

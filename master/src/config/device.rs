@@ -10,8 +10,8 @@ use toml::Spanned;
 use super::fields::{Key, KeyExt};
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawDevice, RawEntry};
-use super::{DeviceConfig, Locator, Startup, sdo, sim};
-use crate::esi_library::RevisionMatch;
+use super::{DeviceConfig, Locator, MailboxSource, Startup, sdo, sim};
+use crate::esi_library::{RevisionMatch, SiiImage};
 use crate::rt::config::ProcessDataCopy;
 
 mod axes;
@@ -54,8 +54,12 @@ pub(crate) fn check(
         }
         _ => None,
     };
+    let mailbox = raw.mailbox.value().unwrap_or_default();
     let axes = axes::check(&raw, &numbers, mode.ok().flatten(), chosen.as_mut(), p);
     if let Some(chosen) = chosen.as_mut() {
+        chosen
+            .notes
+            .extend(mailbox_note(device, image.as_deref(), mailbox));
         further_axes(chosen);
         repeated_outputs(chosen);
     }
@@ -79,6 +83,7 @@ pub(crate) fn check(
             device: device?,
             esi: file,
             sii: image,
+            mailbox,
             selection: chosen?,
             startup,
             identity: identity?,
@@ -102,6 +107,21 @@ pub(super) fn repeats(devices: &IndexVec<DeviceIndex, DeviceConfig>) -> Vec<Proc
         }));
     }
     repeats
+}
+
+/// Reports mailboxes that differ between the ESI and a known EEPROM.
+fn mailbox_note(
+    device: Option<&esi::Device>,
+    image: Option<&SiiImage>,
+    source: MailboxSource,
+) -> Option<String> {
+    let difference = image?.sii.mailbox_difference(device?)?;
+    Some(match source {
+        MailboxSource::Esi => {
+            format!("{difference}; those of the ESI are used (`mailbox = \"eeprom\"`: the others)")
+        }
+        MailboxSource::Eeprom => format!("{difference}; those of the EEPROM are used (`mailbox`)"),
+    })
 }
 
 /// Reports outputs that several PDOs map.

@@ -225,6 +225,7 @@ pub struct DeviceConfig {
     pub esi: Arc<esi::EsiFile>,
     /// The EEPROM image that the file names.
     pub sii: Option<Arc<SiiImage>>,
+    pub mailbox: MailboxSource,
     pub device: Arc<esi::Device>,
     pub selection: esi::Selection,
     pub startup: Startup,
@@ -249,6 +250,16 @@ impl DeviceConfig {
     fn is_op_only(&self, sms: &[esi::layout::SmLayout]) -> bool {
         !sms.is_empty() && sms.iter().all(|sm| self.device.op_only(sm).fmmu)
     }
+}
+
+/// The source of a device's mailbox addresses and sizes if its ESI and its EEPROM differ.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum MailboxSource {
+    /// As configuration tools do (ETG.2100: an ENI has the mailboxes of the ESI).
+    #[default]
+    Esi,
+    /// As SOEM, the IgH master and ethercrab do.
+    Eeprom,
 }
 
 /// How a device is located on the bus.

@@ -219,7 +219,7 @@ pub enum Cause {
         "its process data need {needed} FMMUs, the controller has {available} (register 0x0004)"
     )]
     Fmmus { needed: usize, available: usize },
-    #[error("the mailbox is at {actual}, the ESI says {expected}")]
+    #[error("the device has mailboxes {actual}, the ESI {expected}")]
     MailboxMoved { expected: String, actual: String },
     #[error("no process data comes back in SafeOp: {}", al_note(*al_status))]
     NoProcessData { al_status: Option<(u8, u16)> },

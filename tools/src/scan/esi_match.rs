@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use ecaxis_esi as esi;
+use ecaxis_esi::sii::MailboxDifference;
 
 use super::{Device, Scan};
 use ecaxis_master::esi_library::{self, Entry, Library, LoadError, RevisionMatch};
@@ -37,6 +38,13 @@ impl EsiMatch {
             device,
             rule: RevisionMatch::Equal,
         })
+    }
+
+    /// Compares the mailboxes of the ESI with those of the device's EEPROM.
+    #[must_use]
+    pub fn mailbox_difference(&self, device: &Device) -> Option<MailboxDifference> {
+        self.path.as_ref()?;
+        device.sii.as_ref().ok()?.mailbox_difference(&self.device)
     }
 
     /// True if the ESI declares a drive by its profile or modes.

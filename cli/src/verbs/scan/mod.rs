@@ -171,7 +171,7 @@ impl ScanResult {
                 "note: states and mailboxes were left alone; `--intrude` asks the devices all the same"
             });
         }
-        for device in &self.scan.devices {
+        for (device, described) in self.devices() {
             let position = device.position();
             match &device.sii {
                 Err(problem) => bus::warn(problem),
@@ -180,6 +180,10 @@ impl ScanResult {
                         bus::warn(format_args!("position {position}: its EEPROM: {damage}"));
                     }
                 }
+            }
+            if let Some(difference) = described.and_then(|d| d.mailbox_difference(device)) {
+                bus::warn(format_args!("position {position}: {difference}"));
+                note("  = help: `mailbox` in the machine file selects which ones a run uses");
             }
             if let Some(Err(problem)) = &device.answers {
                 bus::warn(problem);

@@ -10,7 +10,7 @@ use super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Writte
 use super::gateway::RawNode;
 use super::problem::{Problems, Span};
 use super::travel::RawTrack;
-use super::{ExchangeMode, GroupStopScope, SocketKind, Spin};
+use super::{ExchangeMode, GroupStopScope, MailboxSource, SocketKind, Spin};
 
 mod axis;
 mod step;
@@ -56,6 +56,11 @@ const LINKS: [(&str, SocketKind); 2] = [
     (SocketKind::Packet.name(), SocketKind::Packet),
 ];
 
+const MAILBOXES: [(&str, MailboxSource); 2] = [
+    ("esi", MailboxSource::Esi),
+    ("eeprom", MailboxSource::Eeprom),
+];
+
 table! { "[bus]",
     table RawBus {
         nic: Key<String>,
@@ -94,6 +99,7 @@ table! { "[[device]]",
         name: Key<String> = "\"x\"",
         esi: Key<String>,
         sii: Key<String>,
+        mailbox: Key<MailboxSource> [MAILBOXES],
         position: Key<u16>,
         alias: Key<u16> [1..=u16::MAX],
         id: Key<u16> [1..=u16::MAX],

@@ -294,6 +294,10 @@ fn esi_keys(
     let path = described.path.as_deref().unwrap_or(Path::new(""));
     let path = relative(path, place.folder);
     lines.add("esi", &quoted(&path.display().to_string()), "");
+    if let Some(difference) = described.mailbox_difference(device) {
+        let comment = format!("{MARK} {difference}; or \"eeprom\"");
+        lines.add("mailbox", &quoted("esi"), &comment);
+    }
     let ours = described.device.identity;
     let mut others = described
         .file
