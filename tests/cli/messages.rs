@@ -459,16 +459,18 @@ fn reports_overwrite_only_with_force() {
 fn packages_depend_in_one_direction() {
     let below_master = ["ecaxis-ecat", "ecaxis-esi", "ecaxis-axis", "ecaxis-sim"];
     let below_tools = [&below_master[..], &["ecaxis-master"]].concat();
-    let below_cli = [&below_tools[..], &["ecaxis-tools"]].concat();
-    let allowed: [(&str, &[&str]); 8] = [
+    let below_support = [&below_tools[..], &["ecaxis-tools"]].concat();
+    let below_cli = [&below_support[..], &["ecaxis-server"]].concat();
+    let allowed: [(&str, &[&str]); 9] = [
         ("ecat", &[]),
         ("esi", &["ecaxis-ecat"]),
         ("axis", &[]),
         ("sim", &["ecaxis-esi"]),
         ("master", &below_master),
+        ("server", &below_tools),
         ("tools", &below_tools),
         ("cli", &below_cli),
-        ("tests/support", &below_cli),
+        ("tests/support", &below_support),
     ];
     let root = root();
     let read = |path: &str| -> toml::Table {

@@ -133,6 +133,9 @@ pub(crate) fn check_corner(
     steep((after - before) / dt_s, acceleration)
 }
 
+/// The rounding of velocities, as a fraction of the change of velocity in one cycle.
+const ROUNDING: f64 = 1e-9;
+
 /// Checks that the axis can stand at the end of a piece that ends with `velocity`.
 pub(crate) fn check_end(
     interpolation: Interpolation,
@@ -142,8 +145,9 @@ pub(crate) fn check_end(
 ) -> Result<(), SetpointError> {
     match interpolation {
         Interpolation::Linear => check_corner(velocity, 0.0, acceleration, dt_s),
-        // A cubic may end with full deceleration, which leaves no room for a velocity step.
-        Interpolation::Cubic if velocity == 0.0 => Ok(()),
+        // A cubic may end with full deceleration, which leaves no room for a velocity step, except
+        // for the rounding of calculated points.
+        Interpolation::Cubic if velocity.abs() <= ROUNDING * acceleration * dt_s => Ok(()),
         Interpolation::Cubic => Err(SetpointError::NotAtRest { velocity }),
     }
 }

@@ -20,11 +20,13 @@ mod man;
 mod run;
 mod scan;
 mod sdo;
+mod serve;
 mod sim;
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Verb {
     Run(run::Args),
+    Serve(serve::Args),
     Check(check::Args),
     Explain(explain::Args),
     Scan(scan::Args),
@@ -47,6 +49,7 @@ impl Verb {
     pub fn verbosity(&self) -> Option<&Verbosity> {
         match self {
             Self::Run(args) => Some(&args.verbosity),
+            Self::Serve(args) => Some(&args.verbosity),
             Self::Scan(args) => Some(&args.verbosity),
             Self::Compare(args) => Some(&args.verbosity),
             Self::Sdo(args) => Some(&args.verbosity),
@@ -61,6 +64,7 @@ impl Verb {
     pub fn run(self) -> Result<(), Failure> {
         match self {
             Self::Run(args) => run::run(&args),
+            Self::Serve(args) => serve::run(&args),
             Self::Check(args) => check::run(&args),
             Self::Explain(args) => explain::run(&args),
             Self::Scan(args) => scan::run(&args),

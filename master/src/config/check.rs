@@ -15,7 +15,9 @@ use super::raw::{RawBus, RawDevice, RawMachine};
 use super::sim;
 use super::steps::{self, Resolved, ResolvedAxis, ResolvedDevice};
 
-use super::{AxisSetup, Bus, Locator, MAX_SUBDEVICES, Machine, Nic, Signal, Spin, signal};
+use super::{
+    AxisSetup, Bus, Locator, MAX_SUBDEVICES, Machine, Nic, ServerSetup, Signal, Spin, signal,
+};
 
 /// Returns `None` only if a problem has been reported.
 pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Option<Machine> {
@@ -127,6 +129,10 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         tables: program.tables,
         repeat,
         enable: raw.enable.value().unwrap_or(true),
+        server: ServerSetup {
+            stale_cycles: raw.server.stale_cycles.value().unwrap_or(10),
+            lease_ns: raw.server.lease.value().unwrap_or(500_000_000),
+        },
     })
 }
 

@@ -103,6 +103,17 @@ pub struct Machine {
     pub repeat: u32,
     /// `true` if the axes get power. Otherwise the bus goes to Op and the axes stay disabled.
     pub enable: bool,
+    pub server: ServerSetup,
+}
+
+/// Settings of the server for clients that command the machine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ServerSetup {
+    /// The number of cycles without a new set-point of a real-time client, after which its axes
+    /// stop.
+    pub stale_cycles: u32,
+    /// The longest silence of the owner of the motion in ns, unless it asks for another.
+    pub lease_ns: u64,
 }
 
 /// Settings of the bus. Times are in ns.

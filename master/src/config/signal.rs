@@ -84,6 +84,20 @@ struct Candidates<'d> {
 }
 
 impl<'d> Candidates<'d> {
+    fn new(device: &'d DeviceConfig, direction: SignalDirection) -> Self {
+        let selection = &device.selection;
+        match direction {
+            SignalDirection::In => Self {
+                fields: &selection.layout.tx,
+                pdos: &selection.tx,
+            },
+            SignalDirection::Out => Self {
+                fields: &selection.layout.rx,
+                pdos: &selection.rx,
+            },
+        }
+    }
+
     /// Returns the names of a field besides its address: its own, `PDO/entry`, and the PDO's name
     /// if it has one entry.
     fn names(&self, field: &Field) -> Vec<String> {
@@ -238,16 +252,7 @@ pub(super) fn field<'d>(
     device: &'d DeviceConfig,
 ) -> Result<(&'d Field, String), NameError> {
     let what = way.noun();
-    let candidates = match way {
-        SignalDirection::In => Candidates {
-            fields: &device.selection.layout.tx,
-            pdos: &device.selection.tx,
-        },
-        SignalDirection::Out => Candidates {
-            fields: &device.selection.layout.rx,
-            pdos: &device.selection.rx,
-        },
-    };
+    let candidates = Candidates::new(device, way);
     let found = candidates.find(wanted);
     let names = |fields: &[&Field]| -> Vec<String> {
         let names = fields.iter().map(|field| candidates.name(field));
@@ -384,6 +389,36 @@ impl Machine {
             ));
         }
         Ok(OutputRef(known(&mut self.outputs, signal)))
+    }
+
+    /// Makes all inputs readable, and all outputs settable that nothing else writes. Leaves out
+    /// fields of more than 64 bits. `inputs` then has one signal for each input.
+    pub fn use_all_signals(&mut self) -> Vec<(OutputRef, Signal)> {
+        let mut names = Vec::new();
+        for device in &self.devices {
+            let candidates = Candidates::new(device, SignalDirection::In);
+            let inputs = candidates.fields.iter().map(|field| candidates.name(field));
+            names.extend(inputs.map(|name| (device.name.clone(), name, SignalDirection::In)));
+            let candidates = Candidates::new(device, SignalDirection::Out);
+            let outputs = candidates.fields.iter().map(|field| candidates.name(field));
+            names.extend(outputs.map(|name| (device.name.clone(), name, SignalDirection::Out)));
+        }
+        let mut outputs = Vec::new();
+        for (device, name, direction) in names {
+            match direction {
+                SignalDirection::In => {
+                    let _ = self.input(&device, &name);
+                }
+                SignalDirection::Out => {
+                    if let Ok(output) = self.output(&device, &name)
+                        && !outputs.iter().any(|(known, _)| *known == output)
+                    {
+                        outputs.push((output, self.outputs[output.0].clone()));
+                    }
+                }
+            }
+        }
+        outputs
     }
 
     fn signal(&self, device: &str, name: &str, way: SignalDirection) -> Result<Signal, NameError> {

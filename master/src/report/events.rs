@@ -102,6 +102,15 @@ fn describe_event(event: Event, machine: &Machine) -> String {
     }
 }
 
+/// Returns why the machine or a group stopped, in words.
+#[must_use]
+pub fn describe_stop(cause: StopCause, machine: &Machine) -> String {
+    describe_cause(cause, &|axis: AxisIndex| {
+        let axis = machine.axes.get(axis);
+        axis.map_or("?", |axis| axis.name.as_str())
+    })
+}
+
 fn describe_cause<'m>(cause: StopCause, axis: &impl Fn(AxisIndex) -> &'m str) -> String {
     match cause {
         StopCause::Requested => "stop: asked for".to_owned(),

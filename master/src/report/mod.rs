@@ -9,7 +9,7 @@
 mod diagnosis_message;
 mod emergencies;
 mod error;
-pub(crate) mod events;
+pub mod events;
 mod progress;
 pub(crate) mod summary;
 

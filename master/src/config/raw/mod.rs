@@ -29,6 +29,7 @@ table! { "the machine file",
         devices: Vec<RawDevice> as "device" = "[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"",
         copies: Vec<RawCopy> as "copy",
         stop: RawStop,
+        server: RawServer,
         steps: Vec<RawStep> as "step",
     }
 }
@@ -276,6 +277,13 @@ table! { "[stop]",
         bus_lost: Key<StopMethod> [STOPS_BY_DRIVE],
         emergency: Option<Conditions>,
         groups: Vec<RawGroup> as "group",
+    }
+}
+
+table! { "[server]",
+    table RawServer {
+        stale_cycles: Key<u32> [1..=1000],
+        lease: Key<Ns> [100 * MS..=60 * S],
     }
 }
 

@@ -1,0 +1,229 @@
+//! `ecaxis serve`: keeps a machine up for other programs and for people with a browser.
+
+use std::io::Write as _;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use ecaxis_master::cancel::CancelToken;
+use ecaxis_master::clock::Clock;
+use ecaxis_master::config::{Nic, duration};
+use ecaxis_master::session::Options;
+use ecaxis_server::http::HttpOptions;
+use ecaxis_server::serve::{ServeError, ServerOptions, new_token, serve};
+
+use crate::access::signals;
+use crate::args::Verbosity;
+use crate::hints::{self, Failure};
+use crate::render::note;
+use crate::verbs::run;
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis serve m.toml                            commands over a Unix socket
+  ecaxis serve m.toml --http 127.0.0.1:8080      the page, read only
+  ecaxis serve m.toml --sim --http 127.0.0.1:0 --control
+                                                 the page, with commands
+  ecaxis serve m.toml --sim --virtual --socket t.sock
+                                                 for tests: time advances on
+                                                 request
+
+docs/server.md describes the protocol. Ctrl-C, SIGTERM, or a terminal that
+closes: the axes decelerate within their limits, lose power, and the bus goes
+back to Init.";
+
+/// Keep a machine up, commanded and watched by other programs and in a browser
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// Machine file
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+    /// Use this network interface instead of the file's
+    #[arg(long, value_name = "IF", conflicts_with = "sim")]
+    nic: Option<String>,
+    /// Use the simulated bus instead of the file's interface
+    #[arg(long)]
+    sim: bool,
+    /// Let time advance only as clients ask (simulated bus only)
+    #[arg(long = "virtual")]
+    virtual_time: bool,
+    /// Seed of the simulated bus
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Fault script for the simulated bus
+    #[arg(long, value_name = "FILE")]
+    faults: Option<PathBuf>,
+    /// Control socket [default: NAME.sock in /run/ecaxis or $XDG_RUNTIME_DIR/ecaxis]
+    #[arg(long, value_name = "PATH")]
+    socket: Option<PathBuf>,
+    /// File mode of the socket, octal: who may write to it may command the machine
+    #[arg(long, value_name = "MODE", default_value = "660", value_parser = mode)]
+    socket_mode: u32,
+    /// Serve the page, HTTP and WebSocket at this address; port 0: a free one
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    http: Option<SocketAddr>,
+    /// Let HTTP clients with the token command the machine
+    #[arg(long, requires = "http")]
+    control: bool,
+    /// File with the token; without it, a new token at each start
+    #[arg(long, value_name = "FILE", requires = "http")]
+    token_file: Option<PathBuf>,
+    /// A further name by which clients reach the server
+    #[arg(long, value_name = "NAME", requires = "http")]
+    allow_host: Vec<String>,
+    /// Folder with the recordings that the page lists
+    #[arg(long, value_name = "FOLDER", requires = "http")]
+    recordings: Option<PathBuf>,
+    /// Keep the samples of every cycle for this time
+    #[arg(long, value_name = "DURATION", default_value = "60s", value_parser = duration::parse)]
+    keep: u64,
+    #[command(flatten)]
+    pub verbosity: Verbosity,
+}
+
+fn mode(text: &str) -> Result<u32, String> {
+    match u32::from_str_radix(text, 8) {
+        Ok(mode) if mode <= 0o777 => Ok(mode),
+        _ => Err("write an octal mode such as 660".to_owned()),
+    }
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let machine = run::load(&args.file, args.nic.as_deref(), args.sim)
+        .map_err(|error| hints::config(&args.file, &error))?;
+    let nic = machine.bus.nic.clone();
+    if let Nic::Interface(name) = &nic {
+        let needs_sim = [
+            (args.virtual_time, "--virtual"),
+            (args.faults.is_some(), "--faults"),
+            (args.seed.is_some(), "--seed"),
+        ];
+        if let Some((_, option)) = needs_sim.iter().find(|(given, _)| *given) {
+            let message = format!("{option} needs the simulated bus, the machine is on `{name}`");
+            return Err(Failure::new(hints::WRONG, message).hint("add --sim"));
+        }
+    }
+    let script = args.faults.as_deref();
+    let faults = script
+        .map(|path| run::faults(path, &machine, None))
+        .transpose()?;
+    let http = args.http.map(|address| http(args, address)).transpose()?;
+    let options = ServerOptions {
+        socket: Some((socket(args)?, args.socket_mode)),
+        http,
+        keep_ns: args.keep,
+    };
+    let defaults = Options::default();
+    let run_options = Options {
+        clock: match args.virtual_time {
+            true => Clock::Virtual,
+            false => Clock::Real,
+        },
+        seed: args
+            .seed
+            .or(faults.as_ref().and_then(|faults| faults.seed))
+            .unwrap_or(defaults.seed),
+        faults,
+        ..defaults
+    };
+    let stop = Arc::<CancelToken>::default();
+    signals::stop_on_interrupt(&stop);
+    let describe = Box::new(move |error: &_| {
+        let failure = hints::failure(error, &nic);
+        (failure.message, failure.hints.into_iter().next())
+    });
+    let served = serve(
+        machine,
+        run_options,
+        options,
+        &stop,
+        describe,
+        |listening| {
+            if let Some(path) = &listening.socket {
+                note(&format!("socket: {}", path.display()));
+            }
+            if let Some(url) = &listening.url {
+                // Ignored: without a reader of the address, the server still serves.
+                let mut out = std::io::stdout().lock();
+                let _ = writeln!(out, "{url}").and_then(|()| out.flush());
+            }
+        },
+    );
+    served.map_err(|error| {
+        let hint = match &error {
+            ServeError::Socket { .. } => "name another file with --socket",
+            ServeError::Http { .. } => "name another address with --http, or port 0",
+            ServeError::Memory(_) => "keep fewer samples with --keep",
+            ServeError::Thread(_) => "end other programs",
+        };
+        Failure::new(hints::WRONG, error.to_string()).hint(hint)
+    })
+}
+
+/// Returns the settings of the HTTP server.
+fn http(args: &Args, address: SocketAddr) -> Result<HttpOptions, Failure> {
+    let token = match &args.token_file {
+        Some(path) => token(path)?,
+        None if !address.ip().is_loopback() => {
+            let message = format!("{address} is reachable by other computers without a token");
+            return Err(Failure::new(hints::WRONG, message).hint(
+                "write a secret of 16 characters or more to a file, and name it with --token-file",
+            ));
+        }
+        None => new_token().map_err(|error| {
+            Failure::new(
+                hints::FAILED,
+                format!("the system has no random numbers: {error}"),
+            )
+        })?,
+    };
+    Ok(HttpOptions {
+        address,
+        control: args.control,
+        token,
+        hosts: args.allow_host.clone(),
+        recordings: args.recordings.clone(),
+    })
+}
+
+fn token(path: &Path) -> Result<String, Failure> {
+    const MAX_BYTES: u64 = 4096;
+    let wrong = |why: String| {
+        Failure::new(hints::WRONG, format!("{}: {why}", path.display()))
+            .hint("write one line with 16 or more letters and digits")
+    };
+    let text = ecaxis_master::file::read_text(path, MAX_BYTES).map_err(|e| wrong(e.to_string()))?;
+    let token = text.trim();
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.~".contains(c);
+    if token.len() < 16 || !token.chars().all(plain) {
+        return Err(wrong("is not a token".to_owned()));
+    }
+    Ok(token.to_owned())
+}
+
+/// Returns the path of the socket. Its folder exists then.
+fn socket(args: &Args) -> Result<PathBuf, Failure> {
+    if let Some(path) = &args.socket {
+        return Ok(path.clone());
+    }
+    let folder = match rustix::process::geteuid().is_root() {
+        true => PathBuf::from("/run"),
+        false => std::env::var_os("XDG_RUNTIME_DIR")
+            .map(PathBuf::from)
+            .ok_or_else(|| {
+                Failure::new(hints::WRONG, "XDG_RUNTIME_DIR is not set")
+                    .hint("name the socket with --socket")
+            })?,
+    };
+    let folder = folder.join("ecaxis");
+    std::fs::create_dir_all(&folder).map_err(|error| {
+        Failure::new(
+            hints::WRONG,
+            format!("cannot create {}: {error}", folder.display()),
+        )
+        .hint("name the socket with --socket")
+    })?;
+    let name = args.file.file_stem().unwrap_or_default();
+    Ok(folder.join(name).with_extension("sock"))
+}

@@ -1,0 +1,404 @@
+//! A connection that stays: requests in, answers, events, states and samples out.
+
+use std::collections::HashSet;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecaxis_master::samples::Samples;
+use serde_json::{Map, Value, json};
+use tokio::sync::broadcast::error::RecvError;
+use tokio::sync::mpsc;
+use tokio::time::{Interval, MissedTickBehavior, interval};
+
+use crate::client::{Answer, Client};
+use crate::command::{Op, Request, Topic};
+use crate::error::{ErrorCode, OpError};
+use crate::state;
+
+/// The messages that may wait for a slow reader.
+const OUTGOING: usize = 256;
+/// The rows of one batch.
+const BATCH: u64 = 4096;
+/// The values of one batch.
+const BATCH_VALUES: u64 = 1 << 20;
+
+/// A message to the client.
+#[derive(Debug)]
+pub enum Outgoing {
+    Answer(Answer),
+    Object(Map<String, Value>),
+    Samples(Batch),
+}
+
+/// Rows of some signals.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Batch {
+    pub first: u64,
+    /// Rows missed since the last batch.
+    pub missed: u64,
+    pub rows: Vec<u64>,
+    pub times_ns: Vec<u64>,
+    /// The values of each signal.
+    pub signals: Vec<Vec<f64>>,
+}
+
+impl Batch {
+    /// Reads at most `count` rows from `next` on.
+    #[must_use]
+    pub fn read(samples: &Samples, words: &[usize], next: &mut u64, count: u64) -> Self {
+        let mut batch = Self {
+            first: *next,
+            signals: vec![Vec::new(); words.len()],
+            ..Self::default()
+        };
+        let end = samples.written().min(next.saturating_add(count));
+        let mut row = Vec::new();
+        while *next < end {
+            let oldest = samples.written().saturating_sub(samples.capacity());
+            if *next < oldest {
+                batch.missed += oldest - *next;
+                *next = oldest;
+                continue;
+            }
+            if samples.read(*next, &mut row) {
+                batch.rows.push(*next);
+                batch.times_ns.push(row[1]);
+                for (values, word) in batch.signals.iter_mut().zip(words) {
+                    let bits = row.get(*word).copied().unwrap_or_default();
+                    values.push(f64::from_bits(bits));
+                }
+            } else {
+                batch.missed += 1;
+            }
+            *next += 1;
+        }
+        batch.first = batch.rows.first().copied().unwrap_or(*next);
+        batch
+    }
+
+    /// Returns the binary frame, see docs/server.md.
+    #[must_use]
+    pub fn frame(&self) -> Vec<u8> {
+        let (rows, signals) = (self.rows.len(), self.signals.len());
+        let mut frame = Vec::with_capacity(32 + 8 * rows * (signals + 2));
+        let count = |n: usize| u32::try_from(n).unwrap_or(u32::MAX).to_le_bytes();
+        frame.extend([1, 0, 0, 0]);
+        frame.extend(count(rows));
+        frame.extend(count(signals));
+        frame.extend([0; 4]);
+        frame.extend(self.first.to_le_bytes());
+        frame.extend(self.missed.to_le_bytes());
+        for number in self.rows.iter().chain(&self.times_ns) {
+            frame.extend(number.to_le_bytes());
+        }
+        for value in self.signals.iter().flatten() {
+            frame.extend(value.to_le_bytes());
+        }
+        frame
+    }
+
+    /// Returns the batch as an object with one array for each row.
+    #[must_use]
+    pub fn object(&self) -> Map<String, Value> {
+        let row = |row: usize| -> Vec<Value> {
+            // A number that does not exist becomes null.
+            let values = self.signals.iter().map(|values| json!(values.get(row)));
+            values.collect()
+        };
+        let rows: Vec<_> = (0..self.rows.len()).map(row).collect();
+        let mut object = Map::new();
+        object.insert("event".to_owned(), json!("samples"));
+        object.insert("first".to_owned(), json!(self.first));
+        object.insert("missed".to_owned(), json!(self.missed));
+        object.insert("time_ns".to_owned(), json!(self.times_ns));
+        object.insert("rows".to_owned(), json!(rows));
+        object
+    }
+}
+
+/// Returns the words of signals; all without names.
+///
+/// # Errors
+/// Fails if a name is unknown.
+pub fn signal_words(samples: &Samples, names: Option<&[String]>) -> Result<Vec<usize>, OpError> {
+    let layout = samples.layout();
+    let Some(names) = names else {
+        return Ok(layout.signals.iter().map(|signal| signal.word).collect());
+    };
+    let word = |name: &String| {
+        layout
+            .signal(name)
+            .map(|signal| signal.word)
+            .ok_or_else(|| {
+                let message = format!("no signal is called `{name}`");
+                OpError::new(ErrorCode::UnknownName, message)
+                    .help("`machine` lists them under `samples`")
+            })
+    };
+    names.iter().map(word).collect()
+}
+
+#[derive(Debug)]
+struct SampleSubscription {
+    words: Vec<usize>,
+    next: u64,
+    timer: Interval,
+}
+
+#[derive(Debug)]
+enum Change {
+    Subscribe {
+        topics: Vec<Topic>,
+        interval: Duration,
+        words: Vec<usize>,
+    },
+    Unsubscribe(Vec<Topic>),
+}
+
+/// The end that takes requests. Dropping it ends the connection.
+#[derive(Debug)]
+pub struct Connection {
+    client: Arc<Client>,
+    changes: mpsc::UnboundedSender<Change>,
+    outgoing: mpsc::Sender<Outgoing>,
+    /// The token, and why commands stay forbidden with it.
+    token: Option<(Arc<str>, Option<OpError>)>,
+}
+
+impl Connection {
+    /// Starts a connection. `token` allows reading and, without an error, commands.
+    #[must_use]
+    pub fn start(
+        client: Arc<Client>,
+        token: Option<(Arc<str>, Option<OpError>)>,
+    ) -> (Self, mpsc::Receiver<Outgoing>) {
+        let (outgoing, receiver) = mpsc::channel(OUTGOING);
+        let (changes, changed) = mpsc::unbounded_channel();
+        tokio::spawn(publish(Arc::clone(&client), changed, outgoing.clone()));
+        let connection = Self {
+            client,
+            changes,
+            outgoing,
+            token,
+        };
+        (connection, receiver)
+    }
+
+    /// Takes one message of the client. The answer follows over the receiver.
+    pub async fn take(&self, text: &[u8]) {
+        self.take_request(Request::parse(text)).await;
+    }
+
+    /// Answers that a message was too long.
+    pub async fn refuse(&self, error: OpError) {
+        let op = Err(error);
+        let (id, wait) = (None, None);
+        self.take_request(Request { id, wait, op }).await;
+    }
+
+    async fn take_request(&self, request: Request) {
+        let Request { id, wait, op } = request;
+        let op = match op {
+            Ok(Op::Token { token }) => self.check_token(&token).map(|()| Op::Hello { name: None }),
+            Ok(Op::Subscribe {
+                topics,
+                interval_ms,
+                signals,
+            }) => self
+                .subscribe(topics, interval_ms, signals.as_deref())
+                .map(|()| Op::Hello { name: None }),
+            Ok(Op::Unsubscribe { topics }) => {
+                let _ = self.changes.send(Change::Unsubscribe(topics));
+                Ok(Op::Hello { name: None })
+            }
+            other => other,
+        };
+        let request = Request { id, wait, op };
+        let waits = request.wait == Some(true)
+            || matches!(
+                request.op,
+                Ok(Op::Await { .. }
+                    | Op::SdoRead { .. }
+                    | Op::SdoWrite { .. }
+                    | Op::Advance { .. }
+                    | Op::StreamOpen { .. }
+                    | Op::StreamPush { .. }
+                    | Op::StreamClose { .. })
+            );
+        if !waits {
+            let answer = self.client.answer(request).await;
+            let _ = self.outgoing.send(Outgoing::Answer(answer)).await;
+            return;
+        }
+        // Polled once at once, so that commands keep their order.
+        let (client, outgoing) = (Arc::clone(&self.client), self.outgoing.clone());
+        let mut work = Box::pin(async move {
+            let answer = client.answer(request).await;
+            let _ = outgoing.send(Outgoing::Answer(answer)).await;
+        });
+        let first =
+            std::future::poll_fn(|context| std::task::Poll::Ready(work.as_mut().poll(context)));
+        if first.await.is_pending() {
+            tokio::spawn(work);
+        }
+    }
+
+    fn check_token(&self, token: &str) -> Result<(), OpError> {
+        if let Some((known, refusal)) = &self.token
+            && same(known, token)
+        {
+            self.client.set_blind(false);
+            self.client.set_refusal(refusal.clone());
+            return Ok(());
+        }
+        Err(OpError::new(ErrorCode::NoToken, "the token is wrong")
+            .help("use the address that the server printed"))
+    }
+
+    fn subscribe(
+        &self,
+        topics: Vec<Topic>,
+        interval_ms: u64,
+        signals: Option<&[String]>,
+    ) -> Result<(), OpError> {
+        if !(10..=10_000).contains(&interval_ms) {
+            let message = format!("`interval_ms` is {interval_ms}: it must be 10 to 10000");
+            return Err(OpError::new(ErrorCode::BadRequest, message));
+        }
+        self.client.check_read()?;
+        let words = signal_words(&self.client.hub.samples, signals)?;
+        let _ = self.changes.send(Change::Subscribe {
+            topics,
+            interval: Duration::from_millis(interval_ms),
+            words,
+        });
+        Ok(())
+    }
+}
+
+/// Compares in a time that does not depend on the place of the first difference.
+#[must_use]
+pub fn same(known: &str, given: &str) -> bool {
+    let (known, given) = (known.as_bytes(), given.as_bytes());
+    let difference = known
+        .iter()
+        .zip(given)
+        .fold(0, |difference, (a, b)| difference | (a ^ b));
+    known.len() == given.len() && difference == 0
+}
+
+/// Sends what the client has subscribed to.
+async fn publish(
+    client: Arc<Client>,
+    mut changes: mpsc::UnboundedReceiver<Change>,
+    outgoing: mpsc::Sender<Outgoing>,
+) {
+    let hub = Arc::clone(&client.hub);
+    drop(client);
+    let mut events = hub.subscribe();
+    let mut topics: HashSet<u8> = HashSet::new();
+    let mut states: Option<Interval> = None;
+    let mut samples: Option<SampleSubscription> = None;
+    loop {
+        let message = tokio::select! {
+            biased;
+            change = changes.recv() => {
+                match change {
+                    None => return,
+                    Some(Change::Unsubscribe(ended)) => for topic in ended {
+                        topics.remove(&(topic as u8));
+                        match topic {
+                            Topic::State => states = None,
+                            Topic::Samples => samples = None,
+                            Topic::Events => {}
+                        }
+                    },
+                    Some(Change::Subscribe { topics: begun, interval, words }) => {
+                        for topic in begun {
+                            topics.insert(topic as u8);
+                            match topic {
+                                Topic::State => states = Some(timer(interval)),
+                                Topic::Samples => samples = Some(SampleSubscription {
+                                    words: words.clone(),
+                                    next: hub.samples.written(),
+                                    timer: timer(interval),
+                                }),
+                                Topic::Events => {}
+                            }
+                        }
+                    }
+                }
+                continue;
+            }
+            event = events.recv() => match event {
+                Ok(event) if topics.contains(&(Topic::Events as u8)) => {
+                    Outgoing::Object(event.body.clone())
+                }
+                Err(RecvError::Lagged(missed)) if topics.contains(&(Topic::Events as u8)) => {
+                    let mut object = Map::new();
+                    object.insert("event".to_owned(), json!("missed"));
+                    object.insert("count".to_owned(), json!(missed));
+                    Outgoing::Object(object)
+                }
+                Err(RecvError::Closed) => return,
+                _ => continue,
+            },
+            () = tick(&mut states) => {
+                let mut object = match state::state(&hub) {
+                    Value::Object(object) => object,
+                    _ => Map::new(),
+                };
+                object.insert("event".to_owned(), json!("state"));
+                Outgoing::Object(object)
+            }
+            () = tick(&mut samples) => {
+                let Some(subscription) = &mut samples else { continue };
+                let columns = subscription.words.len().max(1) as u64;
+                let rows = (BATCH_VALUES / columns).clamp(1, BATCH);
+                let batch = Batch::read(
+                    &hub.samples, &subscription.words, &mut subscription.next, rows,
+                );
+                if hub.samples.written() > subscription.next {
+                    // More than a batch waits.
+                    subscription.timer.reset_immediately();
+                }
+                Outgoing::Samples(batch)
+            }
+        };
+        if outgoing.send(message).await.is_err() {
+            return;
+        }
+    }
+}
+
+fn timer(period: Duration) -> Interval {
+    let mut timer = interval(period);
+    timer.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    timer
+}
+
+trait Timer {
+    fn timer(&mut self) -> &mut Interval;
+}
+
+impl Timer for Interval {
+    fn timer(&mut self) -> &mut Interval {
+        self
+    }
+}
+
+impl Timer for SampleSubscription {
+    fn timer(&mut self) -> &mut Interval {
+        &mut self.timer
+    }
+}
+
+/// Ends at the next tick; never without a timer.
+async fn tick<T: Timer>(timer: &mut Option<T>) {
+    match timer {
+        Some(timer) => {
+            timer.timer().tick().await;
+        }
+        None => std::future::pending().await,
+    }
+}

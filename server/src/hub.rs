@@ -1,0 +1,745 @@
+//! The state that the machine and its clients share.
+//!
+//! Clients put commands into a queue. The machine takes them about every millisecond, and finishes
+//! each with an outcome. Nothing here runs in the cycle.
+
+use std::collections::{HashMap, VecDeque};
+use std::pin::Pin;
+use std::sync::atomic::AtomicU64;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use ecaxis_axis::setpoint::{Knot, StreamConfig};
+use ecaxis_ecat::index::{AxisIndex, IndexVec};
+use ecaxis_master::clock::{self, Nanos};
+use ecaxis_master::config::{Machine, OutputRef, Signal};
+use ecaxis_master::mailbox::Mailboxes;
+use ecaxis_master::report::Error;
+use ecaxis_master::rt::channel::Snapshot;
+use ecaxis_master::samples::Samples;
+use ecaxis_master::supervise::operator::{AxisActivity, ProgramRequest, ProgramStatus, Request};
+use ecaxis_master::sys::shared_memory::SharedMemory;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
+use tokio::sync::{broadcast, oneshot, watch};
+
+use crate::error::{ErrorCode, OpError};
+use crate::external::AreaCounters;
+use crate::lease::{ClientId, Lease, Owner};
+use crate::sampler::Sampler;
+
+/// The number of events that the server keeps.
+const EVENTS: usize = 1000;
+/// The number of commands that may wait for the machine.
+const QUEUE: usize = 4096;
+
+/// The state of the bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum BusState {
+    /// In Init, as a client has asked for.
+    Down,
+    Starting,
+    Op,
+    Stopping,
+    /// An error has ended the run. The server tries again.
+    Failed,
+}
+
+/// The bus, and why it is not in Op.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct BusStatus {
+    pub state: BusState,
+    pub error: Option<String>,
+    pub help: Option<String>,
+    /// The time until the next attempt.
+    pub retry_s: Option<f64>,
+    pub up_since_ns: Option<Nanos>,
+}
+
+/// An event.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Event {
+    pub number: u64,
+    /// The JSON object.
+    pub body: Map<String, Value>,
+}
+
+/// A transfer that the operator polls until it ends. In virtual time, it ends at the same moment
+/// every time.
+pub struct Transfer(pub Pin<Box<dyn Future<Output = Outcome> + Send>>);
+
+impl std::fmt::Debug for Transfer {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Transfer")
+    }
+}
+
+/// What the machine must do for a client.
+#[derive(Debug)]
+pub enum Work {
+    Request(Request),
+    Open {
+        axis: usize,
+        config: StreamConfig,
+    },
+    Push {
+        axis: usize,
+        points: Box<[Knot]>,
+    },
+    Close {
+        axis: usize,
+    },
+    Attach(Arc<SharedMemory>),
+    Detach,
+    /// A transfer with a mailbox.
+    Transfer(Transfer),
+    /// The bus goes to Init.
+    Leave,
+}
+
+impl Work {
+    /// Returns true if nothing may drop it.
+    fn stops(&self) -> bool {
+        matches!(self, Self::Leave | Self::Detach)
+            || matches!(self, Self::Request(request) if request.stops())
+    }
+}
+
+#[derive(Debug)]
+pub struct QueuedWork {
+    /// The number of the command; 0: no client waits for an outcome.
+    pub ticket: u64,
+    pub work: Work,
+}
+
+/// The end of a command: more keys of the answer, or the error.
+pub type Outcome = Result<Map<String, Value>, OpError>;
+
+/// A command whose outcome is not known yet.
+#[derive(Debug)]
+struct PendingCommand {
+    /// The number of parts, such as axes, without an outcome.
+    left: usize,
+    failure: Option<OpError>,
+    reply: Option<oneshot::Sender<Outcome>>,
+    /// The client waits for the outcome.
+    waits: bool,
+}
+
+impl PendingCommand {
+    /// Returns true while a client that still exists waits.
+    fn is_awaited(&self) -> bool {
+        self.waits && self.reply.as_ref().is_some_and(|reply| !reply.is_closed())
+    }
+}
+
+/// The machine at one moment.
+#[derive(Debug)]
+pub struct Latest {
+    pub snapshot: Snapshot,
+    pub hands: IndexVec<AxisIndex, AxisActivity>,
+    pub program: ProgramStatus,
+}
+
+/// The step of the program that runs.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Default)]
+pub struct RunningStep {
+    pub step: Option<String>,
+    pub run: u32,
+}
+
+/// Turns an error of the master into a message and advice.
+pub type Describe = dyn Fn(&Error) -> (String, Option<String>) + Send + Sync;
+
+/// Settings of the server.
+#[derive(Debug, Clone, Copy)]
+pub struct HubOptions {
+    /// HTTP clients may command.
+    pub control: bool,
+    /// The bus runs in virtual time, which clients advance.
+    pub virtual_time: bool,
+}
+
+#[derive(Debug)]
+struct Inner {
+    lease: Lease,
+    queue: VecDeque<QueuedWork>,
+    tickets: u64,
+    clients: ClientId,
+    pending: HashMap<u64, PendingCommand>,
+    wanted_up: bool,
+    /// A client has asked for the bus while the server waits for its next attempt.
+    retry_now: bool,
+    shutdown: bool,
+    latest: Option<Arc<Latest>>,
+    mailboxes: Option<Mailboxes>,
+    step: RunningStep,
+    speed_override: f64,
+    outputs: Vec<Option<f64>>,
+    events: VecDeque<Arc<Event>>,
+    next_event: u64,
+    /// The time to which virtual time may advance.
+    advance_to: Nanos,
+    /// The present virtual time.
+    now: Nanos,
+}
+
+/// The state that all threads of the server share.
+pub struct Hub {
+    pub machine: Arc<Machine>,
+    /// The outputs that clients may set.
+    pub outputs: Vec<(OutputRef, Signal)>,
+    pub samples: Samples,
+    pub sampler: Sampler,
+    pub options: HubOptions,
+    pub area: Arc<AreaCounters>,
+    /// Clients connected so far over each transport, for the metrics.
+    pub connections: AtomicU64,
+    inner: Mutex<Inner>,
+    /// The queue, the time or the wanted state has changed.
+    work: Condvar,
+    events: broadcast::Sender<Arc<Event>>,
+    bus: watch::Sender<BusStatus>,
+    time: watch::Sender<Nanos>,
+}
+
+impl Hub {
+    #[must_use]
+    pub fn new(
+        machine: Machine,
+        outputs: Vec<(OutputRef, Signal)>,
+        samples: Samples,
+        options: HubOptions,
+    ) -> Self {
+        let down = BusStatus {
+            state: BusState::Down,
+            error: None,
+            help: None,
+            retry_s: None,
+            up_since_ns: None,
+        };
+        Self {
+            sampler: Sampler::new(samples.layout().signals.len(), machine.bus.cycle_ns),
+            machine: Arc::new(machine),
+            inner: Mutex::new(Inner {
+                lease: Lease::default(),
+                queue: VecDeque::new(),
+                tickets: 0,
+                clients: 1,
+                pending: HashMap::new(),
+                wanted_up: true,
+                retry_now: false,
+                shutdown: false,
+                latest: None,
+                mailboxes: None,
+                step: RunningStep::default(),
+                speed_override: 1.0,
+                outputs: vec![None; outputs.len()],
+                events: VecDeque::new(),
+                next_event: 1,
+                advance_to: 0,
+                now: 0,
+            }),
+            outputs,
+            samples,
+            options,
+            area: Arc::default(),
+            connections: AtomicU64::new(0),
+            work: Condvar::new(),
+            events: broadcast::channel(EVENTS).0,
+            bus: watch::channel(down).0,
+            time: watch::channel(0).0,
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    // Clients.
+
+    /// Returns the number of a new client.
+    pub fn new_client(&self) -> ClientId {
+        let mut inner = self.lock();
+        inner.clients += 1;
+        inner.clients
+    }
+
+    /// Ends whatever a client owned.
+    pub fn disconnect(&self, client: ClientId) {
+        let mut inner = self.lock();
+        if let Some(owner) = inner.lease.release(client) {
+            self.end_lease(&mut inner, &owner, None, "disconnected");
+        }
+    }
+
+    /// Renews the lease if the client holds it.
+    pub fn renew(&self, client: ClientId) {
+        self.lock().lease.renew(client, Instant::now());
+    }
+
+    /// Gives the lease to a client.
+    ///
+    /// # Errors
+    /// Fails if another client holds it and `force` is not set.
+    pub fn take(
+        &self,
+        client: ClientId,
+        name: String,
+        ttl: Duration,
+        force: bool,
+    ) -> Result<(), OpError> {
+        let owner = Owner { client, name };
+        let ttl = (!self.options.virtual_time).then_some(ttl);
+        let mut inner = self.lock();
+        let previous = inner
+            .lease
+            .take(owner.clone(), ttl, force, Instant::now())?;
+        match previous {
+            Some(previous) => self.end_lease(&mut inner, &previous, Some(&owner), "taken over"),
+            None => self.report_lease(&mut inner, None, Some(&owner), "taken"),
+        }
+        Ok(())
+    }
+
+    /// Ends the lease of a client.
+    ///
+    /// # Errors
+    /// Fails if the client does not hold it.
+    pub fn release(&self, client: ClientId) -> Result<(), OpError> {
+        let mut inner = self.lock();
+        inner.lease.check(client)?;
+        if let Some(owner) = inner.lease.release(client) {
+            self.end_lease(&mut inner, &owner, None, "released");
+        }
+        Ok(())
+    }
+
+    /// Ends the lease of a silent owner.
+    pub fn expire_lease(&self) {
+        let mut inner = self.lock();
+        if let Some(owner) = inner.lease.expire(Instant::now()) {
+            self.end_lease(&mut inner, &owner, None, "expired");
+        }
+    }
+
+    /// Stops everything that the owner moved, before any command of the next owner.
+    fn end_lease(&self, inner: &mut Inner, owner: &Owner, next: Option<&Owner>, why: &str) {
+        inner.queue.clear();
+        let message = format!("`{}` no longer owns the motion: {why}", owner.name);
+        let error = OpError::new(ErrorCode::Replaced, message);
+        let all: Vec<u64> = inner.pending.keys().copied().collect();
+        for ticket in all {
+            abandon(inner, ticket, &error);
+        }
+        stop_all(inner);
+        self.report_lease(inner, Some(owner), next, why);
+        self.work.notify_all();
+    }
+
+    fn report_lease(
+        &self,
+        inner: &mut Inner,
+        previous: Option<&Owner>,
+        owner: Option<&Owner>,
+        why: &str,
+    ) {
+        tracing::info!(?previous, ?owner, why, "lease");
+        let body = json!({"event": "lease", "owner": owner, "previous": previous, "why": why});
+        self.push_event(inner, body);
+    }
+
+    /// Checks that the client holds the lease.
+    ///
+    /// # Errors
+    /// Says who holds it.
+    pub fn check_owner(&self, client: ClientId) -> Result<(), OpError> {
+        Ok(self.lock().lease.check(client)?)
+    }
+
+    // Commands.
+
+    /// Puts the parts of one command into the queue. Returns its number, and the receiver of its
+    /// outcome. Virtual time advances while a client waits (`waits`).
+    ///
+    /// # Errors
+    /// Fails if the bus is not in Op or the queue is full.
+    pub fn submit(
+        &self,
+        client: Option<ClientId>,
+        parts: Vec<Work>,
+        waits: bool,
+    ) -> Result<(u64, oneshot::Receiver<Outcome>), OpError> {
+        let mut inner = self.lock();
+        // Again, under the lock: the lease may have ended since.
+        if let Some(client) = client {
+            inner.lease.check(client)?;
+        }
+        if self.bus_state() != BusState::Op {
+            let bus = self.bus.borrow();
+            let state = format!("{:?}", bus.state).to_lowercase();
+            let error = bus
+                .error
+                .as_ref()
+                .map_or_else(String::new, |e| format!(": {e}"));
+            let message = format!("the bus is not in Op, but {state}{error}");
+            return Err(OpError::new(ErrorCode::NotUp, message)
+                .help("wait for it with `await`, or bring it up with `bus`"));
+        }
+        if inner.queue.len() + parts.len() > QUEUE && !parts.iter().all(Work::stops) {
+            let error = OpError::new(ErrorCode::Busy, "too many commands wait");
+            return Err(error.help("wait for the outcome of earlier commands"));
+        }
+        inner.tickets += 1;
+        let ticket = inner.tickets;
+        let (reply, outcome) = oneshot::channel();
+        let pending = PendingCommand {
+            left: parts.len(),
+            failure: None,
+            reply: Some(reply),
+            waits,
+        };
+        inner.pending.insert(ticket, pending);
+        let parts = parts.into_iter().map(|work| QueuedWork { ticket, work });
+        inner.queue.extend(parts);
+        self.work.notify_all();
+        Ok((ticket, outcome))
+    }
+
+    /// Stops everything at once, before all commands that wait.
+    pub fn stop_everything(&self, emergency: bool) {
+        let mut inner = self.lock();
+        let waiting: Vec<u64> = inner.queue.drain(..).map(|queued| queued.ticket).collect();
+        let error = OpError::new(ErrorCode::Replaced, "all axes were stopped");
+        for ticket in waiting {
+            abandon(&mut inner, ticket, &error);
+        }
+        stop_all(&mut inner);
+        if emergency {
+            inner.queue.push_back(QueuedWork {
+                ticket: 0,
+                work: Work::Request(Request::EmergencyStop),
+            });
+        }
+        self.work.notify_all();
+    }
+
+    /// Finishes one part of a command.
+    pub fn finish(&self, ticket: u64, outcome: Outcome) {
+        finish(&mut self.lock(), ticket, outcome);
+    }
+
+    /// Takes up to `count` pieces of work, in order.
+    pub fn take_work(&self, count: usize) -> Vec<QueuedWork> {
+        let mut inner = self.lock();
+        let count = count.min(inner.queue.len());
+        inner.queue.drain(..count).collect()
+    }
+
+    /// Ends all commands: the bus has left Op.
+    pub fn fail_all(&self, why: &str) {
+        let mut inner = self.lock();
+        inner.queue.clear();
+        let all: Vec<u64> = inner.pending.keys().copied().collect();
+        let error = OpError::new(ErrorCode::NotUp, format!("the bus left Op: {why}"));
+        for ticket in all {
+            abandon(&mut inner, ticket, &error);
+        }
+        inner.latest = None;
+        inner.mailboxes = None;
+        inner.step = RunningStep::default();
+        // A new run begins with these.
+        inner.speed_override = 1.0;
+        inner.outputs.fill(None);
+    }
+
+    // The bus.
+
+    #[must_use]
+    pub fn bus_state(&self) -> BusState {
+        self.bus.borrow().state
+    }
+
+    #[must_use]
+    pub fn bus(&self) -> watch::Receiver<BusStatus> {
+        self.bus.subscribe()
+    }
+
+    /// Sets the state of the bus and reports it.
+    pub fn set_bus(&self, status: BusStatus) {
+        let mut body = json!(status);
+        if let Some(body) = body.as_object_mut() {
+            body.insert("event".to_owned(), json!("bus"));
+            body.remove("up_since_ns");
+        }
+        self.bus.send_replace(status);
+        self.event(body);
+        self.work.notify_all();
+    }
+
+    /// Sets whether the bus is to be up.
+    pub fn want(&self, up: bool) {
+        let mut inner = self.lock();
+        inner.wanted_up = up;
+        inner.retry_now |= up;
+        if !up {
+            inner.queue.push_back(QueuedWork {
+                ticket: 0,
+                work: Work::Leave,
+            });
+        }
+        self.work.notify_all();
+    }
+
+    /// Ends the server.
+    pub fn shut_down(&self) {
+        self.lock().shutdown = true;
+        self.work.notify_all();
+    }
+
+    #[must_use]
+    pub fn is_shut_down(&self) -> bool {
+        self.lock().shutdown
+    }
+
+    /// Blocks until the bus is to be up. Returns false if the server ends.
+    pub fn await_wanted(&self) -> bool {
+        let mut inner = self.lock();
+        while !inner.wanted_up && !inner.shutdown {
+            inner = self
+                .work
+                .wait(inner)
+                .unwrap_or_else(PoisonError::into_inner);
+        }
+        !inner.shutdown
+    }
+
+    /// Blocks until the time is over, or a client wants the bus up at once, or down.
+    pub fn await_retry(&self, time: Duration) {
+        let end = Instant::now() + time;
+        let mut inner = self.lock();
+        inner.retry_now = false;
+        while inner.wanted_up && !inner.shutdown && !inner.retry_now {
+            let left = end.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                break;
+            }
+            let waited = self.work.wait_timeout(inner, left);
+            inner = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
+    // What the machine publishes.
+
+    /// Publishes the machine's present state.
+    pub fn publish(&self, latest: Latest) {
+        self.lock().latest = Some(Arc::new(latest));
+    }
+
+    #[must_use]
+    pub fn latest(&self) -> Option<Arc<Latest>> {
+        self.lock().latest.clone()
+    }
+
+    pub fn set_mailboxes(&self, mailboxes: Mailboxes) {
+        self.lock().mailboxes = Some(mailboxes);
+    }
+
+    /// Returns access to the mailboxes of the devices.
+    ///
+    /// # Errors
+    /// Fails if the bus is not up.
+    pub fn mailboxes(&self) -> Result<Mailboxes, OpError> {
+        self.lock().mailboxes.clone().ok_or_else(|| {
+            OpError::new(ErrorCode::NotUp, "the bus is not up")
+                .help("wait for it with `await`, or bring it up with `bus`")
+        })
+    }
+
+    pub fn set_step(&self, step: RunningStep) {
+        self.lock().step = step;
+    }
+
+    #[must_use]
+    pub fn step(&self) -> RunningStep {
+        self.lock().step.clone()
+    }
+
+    pub fn set_override(&self, factor: f64) {
+        self.lock().speed_override = factor;
+    }
+
+    #[must_use]
+    pub fn speed_override(&self) -> f64 {
+        self.lock().speed_override
+    }
+
+    /// Remembers the value of an output.
+    pub fn set_output(&self, index: usize, value: f64) {
+        if let Some(output) = self.lock().outputs.get_mut(index) {
+            *output = Some(value);
+        }
+    }
+
+    /// Returns the values of the outputs that clients have set.
+    #[must_use]
+    pub fn output_values(&self) -> Vec<Option<f64>> {
+        self.lock().outputs.clone()
+    }
+
+    /// Returns the owner of the motion and the rest of its time in ms.
+    #[must_use]
+    pub fn owner(&self) -> Option<(Owner, Option<u64>)> {
+        let inner = self.lock();
+        let (owner, rest) = inner.lease.holder(Instant::now())?;
+        let rest = rest.map(|rest| u64::try_from(rest.as_millis()).unwrap_or(u64::MAX));
+        Some((owner.clone(), rest))
+    }
+
+    // Events.
+
+    /// Reports an event; `body` is an object.
+    pub fn event(&self, body: Value) {
+        self.push_event(&mut self.lock(), body);
+    }
+
+    fn push_event(&self, inner: &mut Inner, body: Value) {
+        let Value::Object(mut body) = body else {
+            return;
+        };
+        let number = inner.next_event;
+        inner.next_event += 1;
+        let time = match self.options.virtual_time {
+            true => inner.now,
+            false => clock::now(),
+        };
+        body.insert("number".to_owned(), json!(number));
+        body.insert("time_ns".to_owned(), json!(time));
+        let event = Arc::new(Event { number, body });
+        inner.events.push_back(Arc::clone(&event));
+        if inner.events.len() > EVENTS {
+            inner.events.pop_front();
+        }
+        // Without a subscriber, the event is only kept.
+        let _ = self.events.send(event);
+    }
+
+    /// Returns the kept events with a number above `after`.
+    #[must_use]
+    pub fn events_after(&self, after: u64) -> Vec<Arc<Event>> {
+        let inner = self.lock();
+        let later = inner.events.iter().filter(|event| event.number > after);
+        later.cloned().collect()
+    }
+
+    /// Returns the number of the last event.
+    #[must_use]
+    pub fn last_event(&self) -> u64 {
+        self.lock().next_event - 1
+    }
+
+    /// Returns a receiver of all events from now on.
+    #[must_use]
+    pub fn subscribe(&self) -> broadcast::Receiver<Arc<Event>> {
+        self.events.subscribe()
+    }
+
+    // Virtual time.
+
+    /// Blocks while virtual time must stand: no client has asked for more, and none waits for an
+    /// outcome.
+    pub fn hold_virtual_time(&self, now: Nanos) {
+        let mut inner = self.lock();
+        inner.now = now;
+        self.time.send_replace(now);
+        while !inner.pending.values().any(PendingCommand::is_awaited)
+            && inner.now >= inner.advance_to
+            && !inner.shutdown
+            && inner.wanted_up
+        {
+            inner = self
+                .work
+                .wait(inner)
+                .unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    /// Lets virtual time advance by `time`. Returns the time at its end.
+    pub fn advance(&self, time: Nanos) -> Nanos {
+        let mut inner = self.lock();
+        inner.advance_to = inner.now.max(inner.advance_to).saturating_add(time);
+        self.work.notify_all();
+        inner.advance_to
+    }
+
+    /// Returns the virtual time as it advances.
+    #[must_use]
+    pub fn virtual_time(&self) -> watch::Receiver<Nanos> {
+        self.time.subscribe()
+    }
+
+    /// Returns the time of the run's clock.
+    #[must_use]
+    pub fn now(&self) -> Nanos {
+        match self.options.virtual_time {
+            true => self.lock().now,
+            false => clock::now(),
+        }
+    }
+}
+
+/// Ends one part of a command. The last part gives the answer.
+fn finish(inner: &mut Inner, ticket: u64, outcome: Outcome) {
+    let Some(pending) = inner.pending.get_mut(&ticket) else {
+        return;
+    };
+    pending.left = pending.left.saturating_sub(1);
+    let done = match outcome {
+        Ok(keys) => keys,
+        Err(error) => {
+            pending.failure.get_or_insert(error);
+            Map::new()
+        }
+    };
+    if pending.left > 0 {
+        return;
+    }
+    let Some(mut pending) = inner.pending.remove(&ticket) else {
+        return;
+    };
+    let outcome = pending.failure.take().map_or(Ok(done), Err);
+    if let Some(reply) = pending.reply.take() {
+        // The client may have gone.
+        let _ = reply.send(outcome);
+    }
+}
+
+/// Ends all parts of a command.
+fn abandon(inner: &mut Inner, ticket: u64, error: &OpError) {
+    if let Some(pending) = inner.pending.get_mut(&ticket) {
+        pending.left = 1;
+    }
+    finish(inner, ticket, Err(error.clone()));
+}
+
+/// Queues the stop of everything that clients moved.
+fn stop_all(inner: &mut Inner) {
+    let stops = [
+        Work::Detach,
+        Work::Request(Request::Program(ProgramRequest::Stop)),
+        Work::Request(Request::StopAll),
+    ];
+    let stops = stops.map(|work| QueuedWork { ticket: 0, work });
+    inner.queue.extend(stops);
+}
+
+impl std::fmt::Debug for Hub {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Hub")
+            .field("machine", &self.machine.path)
+            .field("options", &self.options)
+            .finish_non_exhaustive()
+    }
+}

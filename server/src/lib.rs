@@ -1,0 +1,31 @@
+//! Serves a machine to other programs and to people.
+//!
+//! - [`hub`]: the state that the machine and its clients share;
+//! - [`machine`]: the thread that keeps the machine up;
+//! - [`operator`]: carries commands to the machine and outcomes back;
+//! - [`external`]: set-points of clients in the cycle;
+//! - [`lease`]: who owns the motion;
+//! - [`command`], [`error`]: the protocol;
+//! - [`sampler`]: history and distribution of times.
+
+#![deny(unsafe_code)]
+
+pub mod client;
+pub mod command;
+pub mod connection;
+pub mod error;
+pub mod export;
+pub mod external;
+pub mod foxglove;
+pub mod http;
+pub mod hub;
+pub mod lease;
+pub mod machine;
+pub mod metrics;
+pub mod openapi;
+pub mod operator;
+pub mod page;
+pub mod sampler;
+pub mod serve;
+pub mod socket;
+pub mod state;

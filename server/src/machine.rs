@@ -1,0 +1,146 @@
+//! The thread that keeps the machine up: one run after another, until the server ends.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecaxis_master::cancel::CancelToken;
+use ecaxis_master::clock;
+use ecaxis_master::report::{Observer, Progress};
+use ecaxis_master::session::{self, Attachments, Options};
+use serde_json::json;
+
+use crate::external::{Hold, external};
+use crate::hub::{BusState, BusStatus, Describe, Hub, RunningStep};
+use crate::operator::ServerOperator;
+
+/// The first and the longest time until the next attempt to bring the bus up.
+const RETRY_S: [u64; 2] = [1, 10];
+/// A run that lasted as long ends the series of failed attempts.
+const LASTED_NS: u64 = 10_000_000_000;
+
+/// Runs the machine until the server ends. Blocks.
+pub fn keep_up(hub: &Arc<Hub>, options: &Options, stop: &Arc<CancelToken>, describe: &Describe) {
+    let mut retry_s = RETRY_S[0];
+    while hub.await_wanted() && !stop.is_cancelled() {
+        hub.set_bus(status(BusState::Starting));
+        let hold = hub.options.virtual_time.then(|| {
+            let hub = Arc::clone(hub);
+            Box::new(move || hub.hold_virtual_time(clock::now())) as Hold
+        });
+        let (controller, client) = external(&hub.machine, &hub.area, hold);
+        let attachments = Attachments {
+            controller: Some(Box::new(controller)),
+            operator: Some(Box::new(ServerOperator::new(Arc::clone(hub), client))),
+            samples: hub.samples.writer(),
+            link: None,
+        };
+        let machine = (*hub.machine).clone();
+        let mut observer = Reporter {
+            hub,
+            up_since: None,
+        };
+        let stop_run = Arc::clone(stop);
+        let outcome = session::run_attached(
+            machine,
+            options.clone(),
+            stop_run,
+            &mut observer,
+            attachments,
+        );
+        let up_since = observer.up_since;
+        let Err(error) = outcome.result else {
+            hub.fail_all("a client or the end of the server has stopped it");
+            hub.set_bus(status(BusState::Down));
+            continue;
+        };
+        let (message, help) = describe(&error);
+        tracing::error!(%message, "the run has ended");
+        hub.fail_all(&message);
+        if up_since.is_some_and(|since| clock::now().saturating_sub(since) > LASTED_NS) {
+            retry_s = RETRY_S[0];
+        }
+        hub.set_bus(BusStatus {
+            error: Some(message),
+            help,
+            retry_s: Some(retry_s as f64),
+            ..status(BusState::Failed)
+        });
+        if stop.is_cancelled() {
+            break;
+        }
+        hub.await_retry(Duration::from_secs(retry_s));
+        retry_s = (retry_s * 2).min(RETRY_S[1]);
+    }
+}
+
+fn status(state: BusState) -> BusStatus {
+    BusStatus {
+        state,
+        error: None,
+        help: None,
+        retry_s: None,
+        up_since_ns: None,
+    }
+}
+
+/// Turns the progress of a run into events.
+struct Reporter<'h> {
+    hub: &'h Hub,
+    up_since: Option<u64>,
+}
+
+impl Observer for Reporter<'_> {
+    fn progress(&mut self, progress: &Progress) {
+        let hub = self.hub;
+        match progress {
+            Progress::Mailboxes(mailboxes) => hub.set_mailboxes(mailboxes.clone()),
+            Progress::Step(ecaxis_master::bringup::Step::State(
+                ecaxis_master::acyclic::AlState::Op,
+            )) => {
+                let now = hub.now();
+                self.up_since = Some(clock::now());
+                hub.set_bus(BusStatus {
+                    up_since_ns: Some(now),
+                    ..status(BusState::Op)
+                });
+            }
+            Progress::Stopping => hub.set_bus(status(BusState::Stopping)),
+            Progress::Program { run, step, what } => {
+                hub.set_step(RunningStep {
+                    step: Some(step.number.clone()),
+                    run: *run,
+                });
+                hub.event(json!({
+                    "event": "program", "step": step.number, "line": step.line,
+                    "what": what, "run": run,
+                }));
+            }
+            Progress::Captured { capture, .. } => hub.event(json!({
+                "event": "captured", "axis": capture.axis, "input": capture.input,
+                "position": capture.position,
+            })),
+            Progress::Emergency(report) => hub.event(json!({
+                "event": "emergency", "device": report.device, "text": report.to_string(),
+            })),
+            Progress::GroupStopped { group, cause } => hub.event(json!({
+                "event": "group_stopped", "group": group, "why": cause.to_string(),
+            })),
+            Progress::GroupReleased { group } => {
+                hub.event(json!({"event": "group_released", "group": group}));
+            }
+            Progress::Warning(text) => warning(hub, text),
+            Progress::Denied(denied) => warning(hub, &denied.to_string()),
+            Progress::Overload(risk) => warning(hub, &risk.to_string()),
+            Progress::Concern(concern) => warning(hub, &concern.to_string()),
+            Progress::Step(_)
+            | Progress::PhaseLocked
+            | Progress::BringUpTimes(_)
+            | Progress::Enabled { .. }
+            | Progress::Status(_) => {}
+        }
+    }
+}
+
+fn warning(hub: &Hub, text: &str) {
+    hub.event(json!({"event": "warning", "text": text}));
+}

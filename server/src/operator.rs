@@ -1,0 +1,386 @@
+//! The operator of a run: carries the clients' commands to the machine and the outcomes back.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::task::{Context, Poll, Waker};
+use std::time::{Duration, Instant};
+
+use ecaxis_ecat::index::{AxisIndex, IndexVec};
+use ecaxis_master::supervise::operator::{
+    Activity, LimitShares, Operator, OperatorInput, Presence, ProgramRequest, Request,
+    RequestEvent, View,
+};
+use serde_json::{Map, Value, json};
+
+use crate::error::{ErrorCode, OpError};
+use crate::external::{AreaStop, ExternalClient, Message, Report, StreamEnd};
+use crate::hub::{Hub, Latest, QueuedWork, RunningStep, Transfer, Work};
+
+/// The pieces of work that one call takes; the machine accepts 64 requests.
+const WORK_PER_CALL: usize = 60;
+/// The period at which the state is published without a reason.
+const PUBLISH: Duration = Duration::from_millis(10);
+
+/// The operator of one run.
+#[derive(Debug)]
+pub struct ServerOperator {
+    hub: Arc<Hub>,
+    cycle: ExternalClient,
+    /// The number of requests of this run.
+    requests: u64,
+    /// The commands behind the requests that have no outcome yet.
+    commands: HashMap<u64, Command>,
+    /// The last jog of each axis: only it has an outcome.
+    jogs: IndexVec<AxisIndex, u64>,
+    /// Faults and trips that were reported.
+    troubles: IndexVec<AxisIndex, Option<String>>,
+    /// Jogs of the last call. They are accepted unless they are refused before the next call.
+    new_jogs: Vec<u64>,
+    transfers: Vec<(u64, Transfer)>,
+    published: Option<Instant>,
+    leaves: bool,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Command {
+    ticket: u64,
+    /// The command asks for standstill.
+    stops: bool,
+}
+
+impl ServerOperator {
+    #[must_use]
+    pub fn new(hub: Arc<Hub>, cycle: ExternalClient) -> Self {
+        let axes = hub.machine.axes.len();
+        Self {
+            cycle,
+            requests: 0,
+            commands: HashMap::new(),
+            jogs: IndexVec::from(vec![0; axes]),
+            troubles: IndexVec::from(vec![None; axes]),
+            new_jogs: Vec::new(),
+            transfers: Vec::new(),
+            published: None,
+            leaves: false,
+            hub,
+        }
+    }
+
+    fn axis_name(&self, axis: AxisIndex) -> &str {
+        let axis = self.hub.machine.axes.get(axis);
+        axis.map_or("?", |axis| axis.name.as_str())
+    }
+
+    /// Gives the outcome of a request to its client.
+    fn take_event(&mut self, news: &RequestEvent) {
+        let request = news.request();
+        let command = self.commands.remove(&request);
+        let ticket = command.map_or(0, |command| command.ticket);
+        let stopped = matches!(
+            news,
+            RequestEvent::Done {
+                what: Activity::Stopping,
+                ..
+            }
+        );
+        // A stop takes over the number of the motion that it ends.
+        let interrupted = stopped && command.is_some_and(|command| !command.stops);
+        let text = news.to_string();
+        let (kind, error) = match news {
+            RequestEvent::Done { .. } if interrupted => (
+                "replaced",
+                Some(OpError::new(
+                    ErrorCode::Replaced,
+                    "stopped by another command",
+                )),
+            ),
+            RequestEvent::Done { .. } => ("done", None),
+            RequestEvent::Refused { why, .. } => {
+                ("refused", Some(OpError::new(ErrorCode::Refused, why)))
+            }
+            RequestEvent::LetGo { .. } => ("let_go", None),
+            RequestEvent::Failed { why, .. } => {
+                ("failed", Some(OpError::new(ErrorCode::Failed, why)))
+            }
+            RequestEvent::Replaced { .. } => (
+                "replaced",
+                Some(OpError::new(
+                    ErrorCode::Replaced,
+                    "replaced by another command",
+                )),
+            ),
+            RequestEvent::Program { result, .. } => {
+                self.hub.set_step(RunningStep::default());
+                if ticket == 0 {
+                    return;
+                }
+                let why = result.as_ref().err();
+                self.hub.event(json!({
+                    "event": "program", "request": ticket, "ok": why.is_none(), "why": why,
+                }));
+                let outcome = result.clone().map(|()| Map::new());
+                let outcome = outcome.map_err(|why| OpError::new(ErrorCode::Failed, why));
+                self.hub.finish(ticket, outcome);
+                return;
+            }
+        };
+        let Some(axis) = news.axis() else {
+            return;
+        };
+        if ticket != 0 {
+            let axis = self.axis_name(axis);
+            let why = error.as_ref().map(|error| error.message.clone());
+            self.hub.event(json!({
+                "event": kind, "request": ticket, "axis": axis, "what": text, "why": why,
+            }));
+            let error = error.map(|error| OpError {
+                message: format!("`{axis}`: {}", error.message),
+                ..error
+            });
+            self.hub.finish(ticket, error.map_or(Ok(Map::new()), Err));
+        }
+    }
+
+    /// Takes the reports of the cycle.
+    fn take_reports(&mut self) {
+        while let Ok(report) = self.cycle.reports.pop() {
+            let (ticket, outcome) = match report {
+                Report::Opened { ticket, result } | Report::Closed { ticket, result } => {
+                    let refused = |e: crate::external::StreamError| {
+                        OpError::new(ErrorCode::Refused, e.to_string())
+                    };
+                    (ticket, result.map(|()| Map::new()).map_err(refused))
+                }
+                Report::Pushed {
+                    ticket,
+                    accepted,
+                    free,
+                    error,
+                    points: _,
+                } => {
+                    let keys = |map: &mut Map<String, Value>| {
+                        map.insert("accepted".to_owned(), json!(accepted));
+                        map.insert("free".to_owned(), json!(free));
+                    };
+                    let outcome = match error {
+                        None => {
+                            let mut map = Map::new();
+                            keys(&mut map);
+                            Ok(map)
+                        }
+                        Some(error) => {
+                            let message = format!("point {}: {error}", accepted + 1);
+                            let mut error = OpError::new(ErrorCode::Refused, message);
+                            keys(&mut error.more);
+                            Err(error)
+                        }
+                    };
+                    (ticket, outcome)
+                }
+                Report::StreamEnded { axis, end } => {
+                    self.report_stream(AxisIndex(axis), end);
+                    continue;
+                }
+                Report::AreaStopped { axis, cause } => {
+                    self.report_area(AxisIndex(axis), cause);
+                    continue;
+                }
+                Report::Detached(_) => continue,
+            };
+            self.hub.finish(ticket, outcome);
+        }
+    }
+
+    fn poll_transfers(&mut self) {
+        let mut context = Context::from_waker(Waker::noop());
+        let hub = &self.hub;
+        self.transfers.retain_mut(|(ticket, transfer)| {
+            match transfer.0.as_mut().poll(&mut context) {
+                Poll::Ready(outcome) => {
+                    hub.finish(*ticket, outcome);
+                    false
+                }
+                Poll::Pending => true,
+            }
+        });
+    }
+
+    fn report_stream(&self, axis: AxisIndex, end: StreamEnd) {
+        let (state, why) = match end {
+            StreamEnd::Done => ("done", None),
+            StreamEnd::Underrun => ("underrun", Some("the points ran out".to_owned())),
+            StreamEnd::Refused(error) => ("refused", Some(error.to_string())),
+        };
+        let axis = self.axis_name(axis);
+        self.hub
+            .event(json!({"event": "stream", "axis": axis, "state": state, "why": why}));
+    }
+
+    fn report_area(&self, axis: AxisIndex, cause: AreaStop) {
+        let axis = self.axis_name(axis);
+        let owner = self.hub.owner().map(|(owner, _)| owner);
+        let why = cause.to_string();
+        self.hub
+            .event(json!({"event": "area", "axis": axis, "owner": owner, "why": why}));
+    }
+
+    /// Reports each fault and trip once.
+    fn report_troubles(&mut self, view: &View<'_>) {
+        for (axis, status) in view.snapshot.axes.enumerate() {
+            let fault = status.fault.map(|fault| fault.to_string());
+            let trouble = fault.or_else(|| status.trip.map(|trip| trip.to_string()));
+            let Some(known) = self.troubles.get_mut(axis) else {
+                continue;
+            };
+            if *known == trouble {
+                continue;
+            }
+            (*known).clone_from(&trouble);
+            if let Some(why) = trouble {
+                let axis = view.name(axis);
+                self.hub
+                    .event(json!({"event": "fault", "axis": axis, "why": why}));
+            }
+        }
+    }
+
+    fn take_work(&mut self) -> Vec<Request> {
+        let mut requests = Vec::new();
+        for QueuedWork { ticket, work } in self.hub.take_work(WORK_PER_CALL) {
+            match work {
+                Work::Request(request) => {
+                    self.release(&request);
+                    self.take_request(ticket, request);
+                    requests.push(request);
+                }
+                Work::Open { axis, config } => self.send(
+                    ticket,
+                    Message::Open {
+                        ticket,
+                        axis,
+                        config,
+                    },
+                ),
+                Work::Push { axis, points } => self.send(
+                    ticket,
+                    Message::Push {
+                        ticket,
+                        axis,
+                        points,
+                    },
+                ),
+                Work::Close { axis } => self.send(ticket, Message::Close { ticket, axis }),
+                Work::Attach(memory) => {
+                    self.send(ticket, Message::Attach(memory));
+                    self.hub.finish(ticket, Ok(Map::new()));
+                }
+                Work::Transfer(transfer) => self.transfers.push((ticket, transfer)),
+                Work::Detach => self.send(ticket, Message::Detach),
+                Work::Leave => self.leaves = true,
+            }
+        }
+        requests
+    }
+
+    /// From the cycle on that takes the request, the axis follows no set-points of a client.
+    fn release(&mut self, request: &Request) {
+        let message = match request {
+            Request::SetOutput { .. } | Request::Override { .. } => return,
+            Request::Program(ProgramRequest::Pause | ProgramRequest::Resume) => return,
+            request => Message::Release(request.axis().map(|axis| axis.0)),
+        };
+        self.send(0, message);
+    }
+
+    fn send(&mut self, ticket: u64, message: Message) {
+        // The cycle takes 16 messages each time, so there is room unless it stands still.
+        if self.cycle.messages.push(message).is_err() {
+            let error = OpError::new(ErrorCode::Busy, "the cycle takes no more messages");
+            self.hub.finish(ticket, Err(error));
+        }
+    }
+
+    /// Numbers a request as the machine does, and remembers whom its outcome concerns.
+    fn take_request(&mut self, ticket: u64, request: Request) {
+        self.requests += 1;
+        let mut outcome = true;
+        match request {
+            Request::SetOutput { output, value } => {
+                let mut outputs = self.hub.outputs.iter();
+                if let Some(index) = outputs.position(|(known, _)| *known == output) {
+                    self.hub.set_output(index, value);
+                }
+                outcome = false;
+            }
+            Request::Override { factor } => {
+                self.hub.set_override(factor);
+                outcome = false;
+            }
+            Request::StopAll | Request::EmergencyStop => outcome = false,
+            Request::Jog { axis, .. } => {
+                if let Some(last) = self.jogs.get_mut(axis) {
+                    let last = std::mem::replace(last, self.requests);
+                    self.commands.remove(&last);
+                }
+                self.new_jogs.push(self.requests);
+            }
+            _ => {}
+        }
+        if outcome {
+            let stops = request.stops() || matches!(request, Request::Jog { .. });
+            self.commands
+                .insert(self.requests, Command { ticket, stops });
+        } else {
+            self.hub.finish(ticket, Ok(Map::new()));
+        }
+    }
+
+    fn publish(&mut self, view: &View<'_>, at_once: bool) {
+        let due = self.published.is_none_or(|at| at.elapsed() >= PUBLISH);
+        if due || at_once {
+            self.published = Some(Instant::now());
+            self.hub.publish(Latest {
+                snapshot: view.snapshot.clone(),
+                hands: view.hands.clone(),
+                program: view.program.clone(),
+            });
+        }
+    }
+}
+
+impl Operator for ServerOperator {
+    fn turn(&mut self, view: &View<'_>) -> OperatorInput {
+        // The state is newer than the outcomes that clients see.
+        let at_once = self.hub.options.virtual_time || !view.news.is_empty();
+        self.publish(view, at_once);
+        for news in view.news {
+            self.take_event(news);
+        }
+        for request in std::mem::take(&mut self.new_jogs) {
+            if let Some(command) = self.commands.get(&request) {
+                self.hub.finish(command.ticket, Ok(Map::new()));
+            }
+        }
+        self.take_reports();
+        self.poll_transfers();
+        self.report_troubles(view);
+        self.hub.expire_lease();
+        let requests = self.take_work();
+        let gone = self.leaves || self.hub.is_shut_down();
+        OperatorInput {
+            presence: if gone { Presence::Gone } else { Presence::Here },
+            requests,
+        }
+    }
+
+    fn shares(&self) -> LimitShares {
+        LimitShares::WHOLE
+    }
+}
+
+impl Drop for ServerOperator {
+    fn drop(&mut self) {
+        self.hub.area.attached.store(0, Ordering::Relaxed);
+    }
+}

@@ -1,0 +1,173 @@
+//! The server: its threads, from the start to the end.
+
+use std::io;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::thread;
+use std::time::Duration;
+
+use ecaxis_master::cancel::CancelToken;
+use ecaxis_master::clock::{Clock, Nanos};
+use ecaxis_master::config::Machine;
+use ecaxis_master::samples::{SampleLayout, Samples};
+use ecaxis_master::session::Options;
+use ecaxis_master::supervise::operator::for_manual_mode;
+
+use crate::http::{HttpOptions, HttpServer};
+use crate::hub::{Describe, Hub, HubOptions};
+use crate::machine::keep_up;
+use crate::socket::Socket;
+
+/// The period at which samples are taken over, and at which the end is noticed.
+const PERIOD: Duration = Duration::from_millis(5);
+/// The threads that serve clients.
+const WORKERS: usize = 2;
+/// The size in bits of a new token.
+const TOKEN_BYTES: usize = 16;
+
+/// Settings of the server.
+#[derive(Debug, Clone)]
+pub struct ServerOptions {
+    /// The control socket and its file mode.
+    pub socket: Option<(PathBuf, u32)>,
+    pub http: Option<HttpOptions>,
+    /// The time for which every cycle's samples are kept.
+    pub keep_ns: Nanos,
+}
+
+/// The addresses at which the server listens.
+#[derive(Debug, Clone)]
+pub struct Listening {
+    pub socket: Option<PathBuf>,
+    /// With the token.
+    pub url: Option<String>,
+}
+
+/// The server cannot start or go on.
+#[derive(Debug, thiserror::Error)]
+pub enum ServeError {
+    #[error("cannot listen at {}: {source}", path.display())]
+    Socket { path: PathBuf, source: io::Error },
+    #[error("cannot listen at {address}: {source}")]
+    Http {
+        address: SocketAddr,
+        source: io::Error,
+    },
+    #[error("the system gives no memory for the samples: {0}")]
+    Memory(io::Error),
+    #[error("starting a thread: {0}")]
+    Thread(io::Error),
+}
+
+/// Returns a new random token.
+///
+/// # Errors
+/// Fails if the system has no random numbers.
+pub fn new_token() -> io::Result<String> {
+    let mut bytes = [0; TOKEN_BYTES];
+    getrandom::fill(&mut bytes).map_err(io::Error::other)?;
+    Ok(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
+}
+
+/// Serves the machine until `stop` is cancelled. Blocks.
+///
+/// # Errors
+/// Fails if the server cannot listen. A failure of the machine is reported to the clients instead.
+pub fn serve(
+    mut machine: Machine,
+    run: Options,
+    options: ServerOptions,
+    stop: &Arc<CancelToken>,
+    describe: Box<Describe>,
+    ready: impl FnOnce(&Listening),
+) -> Result<(), ServeError> {
+    machine = for_manual_mode(machine);
+    let outputs = machine.use_all_signals();
+    let layout = SampleLayout::new(&machine);
+    let samples = Samples::create(layout, options.keep_ns).map_err(ServeError::Memory)?;
+    let hub_options = HubOptions {
+        control: options.http.as_ref().is_some_and(|http| http.control),
+        virtual_time: run.clock == Clock::Virtual,
+    };
+    let hub = Arc::new(Hub::new(machine, outputs, samples, hub_options));
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(WORKERS)
+        .thread_name("ecaxis-clients")
+        .enable_all()
+        .build()
+        .map_err(ServeError::Thread)?;
+    let (socket, http) = runtime.block_on(bind(&hub, &options))?;
+    ready(&Listening {
+        socket: options.socket.map(|(path, _)| path),
+        url: http.as_ref().map(HttpServer::url),
+    });
+    let keeper = {
+        let (hub, stop) = (Arc::clone(&hub), Arc::clone(stop));
+        let work = move || keep_up(&hub, &run, &stop, &describe);
+        let thread = thread::Builder::new().name("ecaxis-machine".to_owned());
+        thread.spawn(work).map_err(ServeError::Thread)?
+    };
+    let sampler = {
+        let hub = Arc::clone(&hub);
+        let work = move || {
+            while !hub.is_shut_down() {
+                hub.sampler.take_new(&hub.samples);
+                thread::sleep(PERIOD);
+            }
+        };
+        let thread = thread::Builder::new().name("ecaxis-samples".to_owned());
+        thread.spawn(work).map_err(ServeError::Thread)?
+    };
+    if let Some(http) = http {
+        runtime.spawn(async move {
+            if let Err(error) = http.serve().await {
+                tracing::error!(%error, "the HTTP server has ended");
+            }
+        });
+    }
+    let clients = Arc::clone(&hub);
+    runtime.spawn(async move {
+        match socket {
+            Some(socket) => socket.serve(&clients).await,
+            None => std::future::pending().await,
+        }
+    });
+    while !stop.is_cancelled() && !keeper.is_finished() {
+        thread::sleep(PERIOD);
+        // Also while no run calls the operator.
+        hub.expire_lease();
+    }
+    hub.shut_down();
+    let kept = keeper.join();
+    let _ = sampler.join();
+    runtime.shutdown_timeout(Duration::from_secs(1));
+    match kept {
+        Ok(()) => Ok(()),
+        Err(panic) => std::panic::resume_unwind(panic),
+    }
+}
+
+async fn bind(
+    hub: &Arc<Hub>,
+    options: &ServerOptions,
+) -> Result<(Option<Socket>, Option<HttpServer>), ServeError> {
+    let socket = match &options.socket {
+        None => None,
+        Some((path, mode)) => Some(Socket::bind(path, *mode).map_err(|source| {
+            let path = path.clone();
+            ServeError::Socket { path, source }
+        })?),
+    };
+    let http = match &options.http {
+        None => None,
+        Some(http) => {
+            let bound = HttpServer::bind(hub, http.clone()).await;
+            Some(bound.map_err(|source| {
+                let address = http.address;
+                ServeError::Http { address, source }
+            })?)
+        }
+    };
+    Ok((socket, http))
+}

@@ -1,0 +1,196 @@
+//! The control socket: JSON lines over a Unix socket.
+
+use std::io::{self, IoSlice};
+use std::mem::MaybeUninit;
+use std::os::fd::{AsFd, BorrowedFd};
+use std::os::unix::fs::{FileTypeExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
+use serde_json::{Map, Value, json};
+use tokio::io::Interest;
+use tokio::net::{UnixListener, UnixStream};
+use tokio::sync::mpsc;
+
+use crate::client::{Answer, Client};
+use crate::connection::{Connection, Outgoing};
+use crate::error::{ErrorCode, OpError};
+use crate::hub::Hub;
+
+/// The longest line of a client.
+pub const LINE: usize = 64 * 1024;
+
+/// The time for the answers to a client that sends no more.
+const LAST_ANSWERS: Duration = Duration::from_secs(5);
+
+/// A socket file that is removed in the end.
+#[derive(Debug)]
+pub struct Socket {
+    listener: UnixListener,
+    path: PathBuf,
+}
+
+impl Socket {
+    /// Binds the socket. A file of a server that has died is replaced.
+    ///
+    /// # Errors
+    /// Fails if another server listens there, another file has the name, or the system refuses.
+    pub fn bind(path: &Path, mode: u32) -> io::Result<Self> {
+        if let Ok(there) = std::fs::symlink_metadata(path) {
+            if !there.file_type().is_socket() {
+                let message = "another file has this name";
+                return Err(io::Error::new(io::ErrorKind::AlreadyExists, message));
+            }
+            if std::os::unix::net::UnixStream::connect(path).is_ok() {
+                let message = "another server listens there";
+                return Err(io::Error::new(io::ErrorKind::AddrInUse, message));
+            }
+            std::fs::remove_file(path)?;
+        }
+        // No client connects before the mode is set.
+        let mask = rustix::process::umask(rustix::fs::Mode::from_raw_mode(0o177));
+        let listener = UnixListener::bind(path);
+        rustix::process::umask(mask);
+        let listener = listener?;
+        std::fs::set_permissions(path, std::fs::Permissions::from_mode(mode))?;
+        Ok(Self {
+            listener,
+            path: path.to_owned(),
+        })
+    }
+
+    /// Accepts clients until the task ends.
+    pub async fn serve(&self, hub: &Arc<Hub>) {
+        loop {
+            match self.listener.accept().await {
+                Ok((stream, _)) => {
+                    tokio::spawn(serve_client(stream, Arc::clone(hub)));
+                }
+                Err(error) => {
+                    // Too many open files: wait until clients have left.
+                    tracing::warn!(%error, "a client was not accepted");
+                    tokio::time::sleep(Duration::from_millis(100)).await;
+                }
+            }
+        }
+    }
+}
+
+impl Drop for Socket {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.path);
+    }
+}
+
+async fn serve_client(stream: UnixStream, hub: Arc<Hub>) {
+    let peer = stream.peer_cred().ok();
+    let pid = peer.and_then(|peer| peer.pid());
+    let uid = peer.map(|peer| peer.uid());
+    let client = Arc::new(Client::new(Arc::clone(&hub), "socket", None, false).with_memory());
+    let id = client.id;
+    tracing::info!(client = id, ?pid, ?uid, "client connected");
+    hub.event(json!({"event": "client", "client": id, "connected": true, "pid": pid, "uid": uid}));
+    let stream = Arc::new(stream);
+    let (connection, outgoing) = Connection::start(Arc::clone(&client), None);
+    let writer = tokio::spawn(write(Arc::clone(&stream), outgoing, Arc::clone(&hub)));
+    read(&stream, &connection).await;
+    drop(connection);
+    client.leave();
+    tracing::info!(client = id, "client disconnected");
+    hub.event(json!({"event": "client", "client": id, "connected": false}));
+    // A client that has sent its last request still reads the answers.
+    let _ = tokio::time::timeout(LAST_ANSWERS, writer).await;
+}
+
+async fn read(stream: &UnixStream, connection: &Connection) {
+    let mut line = Vec::new();
+    let mut buffer = vec![0; 8192];
+    let mut skips = false;
+    loop {
+        let count = match stream
+            .readable()
+            .await
+            .and_then(|()| stream.try_read(&mut buffer))
+        {
+            Ok(0) => return,
+            Ok(count) => count,
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => continue,
+            Err(_) => return,
+        };
+        for part in buffer[..count].split_inclusive(|byte| *byte == b'\n') {
+            let ends = part.ends_with(b"\n");
+            if skips {
+                skips = !ends;
+                continue;
+            }
+            line.extend_from_slice(part);
+            if line.len() > LINE {
+                let error = OpError::new(ErrorCode::TooLarge, "a line is longer than 64 KiB");
+                connection.refuse(error).await;
+                line.clear();
+                skips = !ends;
+            } else if ends {
+                if !line.trim_ascii().is_empty() {
+                    connection.take(&line).await;
+                }
+                line.clear();
+            }
+        }
+    }
+}
+
+async fn write(stream: Arc<UnixStream>, mut outgoing: mpsc::Receiver<Outgoing>, hub: Arc<Hub>) {
+    while let Some(message) = outgoing.recv().await {
+        let sent = match message {
+            Outgoing::Answer(Answer {
+                body,
+                area: Some(area),
+                ..
+            }) => {
+                let memories = [hub.samples.as_fd(), area.as_fd()];
+                send_with(&stream, &line(&body), &memories).await
+            }
+            Outgoing::Answer(Answer { body, .. }) | Outgoing::Object(body) => {
+                send(&stream, &line(&body)).await
+            }
+            Outgoing::Samples(batch) => send(&stream, &line(&batch.object())).await,
+        };
+        if sent.is_err() {
+            return;
+        }
+    }
+}
+
+fn line(body: &Map<String, Value>) -> Vec<u8> {
+    let mut line = serde_json::to_vec(body).unwrap_or_default();
+    line.push(b'\n');
+    line
+}
+
+async fn send(stream: &UnixStream, mut bytes: &[u8]) -> io::Result<()> {
+    while !bytes.is_empty() {
+        stream.writable().await?;
+        match stream.try_write(bytes) {
+            Ok(count) => bytes = &bytes[count..],
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(())
+}
+
+/// Sends bytes, with file descriptors at the first of them (SCM_RIGHTS, unix(7)).
+async fn send_with(stream: &UnixStream, bytes: &[u8], fds: &[BorrowedFd<'_>]) -> io::Result<()> {
+    let sent = stream
+        .async_io(Interest::WRITABLE, || {
+            let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(2))];
+            let mut control = SendAncillaryBuffer::new(&mut space);
+            control.push(SendAncillaryMessage::ScmRights(fds));
+            let bytes = [IoSlice::new(bytes)];
+            Ok(sendmsg(stream, &bytes, &mut control, SendFlags::NOSIGNAL)?)
+        })
+        .await?;
+    send(stream, &bytes[sent..]).await
+}

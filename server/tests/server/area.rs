@@ -1,0 +1,290 @@
+//! Set-points in shared memory, from a client that knows docs/server.md only.
+
+use std::io::IoSliceMut;
+use std::mem::MaybeUninit;
+use std::os::fd::OwnedFd;
+use std::time::{Duration, Instant};
+
+use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
+use rustix::net::{RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, recvmsg};
+use serde_json::{Value, json};
+
+use crate::harness::{Client, Server, demo};
+
+/// Words that another process shares.
+struct Words {
+    base: *mut u64,
+    count: usize,
+}
+
+impl Words {
+    fn map(fd: &OwnedFd, protection: ProtFlags) -> Self {
+        let bytes = usize::try_from(rustix::fs::fstat(fd).unwrap().st_size).unwrap();
+        // SAFETY: a new mapping at an address that the kernel chooses.
+        let base = unsafe {
+            mmap(
+                std::ptr::null_mut(),
+                bytes,
+                protection,
+                MapFlags::SHARED,
+                fd,
+                0,
+            )
+            .unwrap()
+        };
+        Self {
+            base: base.cast(),
+            count: bytes / 8,
+        }
+    }
+
+    fn get(&self, at: usize) -> u64 {
+        assert!(at < self.count);
+        // SAFETY: inside the mapping.
+        unsafe { self.base.add(at).read_volatile() }
+    }
+
+    fn set(&self, at: usize, value: u64) {
+        assert!(at < self.count);
+        // SAFETY: inside the mapping, which is writable.
+        unsafe { self.base.add(at).write_volatile(value) }
+        std::sync::atomic::fence(std::sync::atomic::Ordering::SeqCst);
+    }
+}
+
+impl Drop for Words {
+    fn drop(&mut self) {
+        // SAFETY: the mapping of this value.
+        unsafe { munmap(self.base.cast(), self.count * 8).unwrap() };
+    }
+}
+
+struct Area {
+    samples: Words,
+    commands: Words,
+}
+
+/// Asks for the area, and takes its file descriptors.
+fn attach(client: &mut Client) -> Area {
+    client.send("area", json!({}));
+    let mut bytes = [0; 4096];
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(2))];
+    let mut control = RecvAncillaryBuffer::new(&mut space);
+    let mut buffers = [IoSliceMut::new(&mut bytes)];
+    let got = recvmsg(
+        &client.stream,
+        &mut buffers,
+        &mut control,
+        RecvFlags::empty(),
+    )
+    .unwrap();
+    let fds: Vec<OwnedFd> = control
+        .drain()
+        .filter_map(|message| match message {
+            RecvAncillaryMessage::ScmRights(fds) => Some(fds),
+            _ => None,
+        })
+        .flatten()
+        .collect();
+    let answer: Value = serde_json::from_slice(&bytes[..got.bytes]).unwrap();
+    assert_eq!(answer["ok"], json!(true), "{answer}");
+    let [samples, commands] = fds.try_into().expect("two file descriptors");
+    Area {
+        samples: Words::map(&samples, ProtFlags::READ),
+        commands: Words::map(&commands, ProtFlags::READ | ProtFlags::WRITE),
+    }
+}
+
+impl Area {
+    /// Writes a set: kind and value of each axis.
+    fn write(&self, counter: u64, axes: &[(u64, f64)]) {
+        let commands = &self.commands;
+        let sequence = commands.get(5);
+        commands.set(5, sequence + 1);
+        commands.set(6, counter);
+        for (axis, (kind, value)) in axes.iter().enumerate() {
+            let at = usize::try_from(commands.get(2)).unwrap() + axis * 4;
+            commands.set(at, *kind);
+            commands.set(at + 1, value.to_bits());
+        }
+        commands.set(5, sequence + 2);
+    }
+
+    fn used(&self) -> u64 {
+        self.commands.get(9)
+    }
+}
+
+/// The position of a sine of 5 mm and 1 Hz, from rest.
+fn sine(t: f64) -> f64 {
+    5.0 * (1.0 - (std::f64::consts::TAU * t).cos())
+}
+
+/// Runs the sine from `*cycle` on, for `cycles`, in virtual time.
+fn follow(client: &mut Client, area: &Area, cycle: &mut u64, cycles: u64) {
+    for _ in 0..cycles {
+        *cycle += 1;
+        area.write(*cycle, &[(1, sine(*cycle as f64 * 1e-3)), (0, 0.0)]);
+        client.ok("advance", json!({"cycles": 1}));
+    }
+}
+
+#[test]
+fn an_axis_follows_the_area_exactly() {
+    let server = Server::in_virtual_time(demo());
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "x"}));
+    let area = attach(&mut client);
+    let word = |words: &Words, at: usize| words.get(at).to_ne_bytes();
+    assert_eq!(&word(&area.samples, 0), b"ECAXSMPL");
+    assert_eq!(&word(&area.commands, 0), b"ECAXCMDS");
+    assert_eq!((area.commands.get(1), area.commands.get(4)), (1, 2));
+    let mut cycle = 0;
+    follow(&mut client, &area, &mut cycle, 500);
+    assert!((client.position("x") - sine(0.5)).abs() < 0.2);
+    assert_eq!(area.commands.get(8), 500);
+    assert!(area.used() >= 499);
+    assert_eq!(area.commands.get(11), 0, "nothing was refused");
+    // Kind 0 ends it: the axis decelerates and holds.
+    area.write(cycle + 1, &[(0, 0.0), (0, 0.0)]);
+    client.advance(1.0);
+    assert_eq!(client.axis("x")["at_rest"], json!(true));
+    assert_eq!(client.kept_events("area"), Vec::<Value>::new());
+}
+
+#[test]
+fn stale_set_points_stop_the_axis() {
+    let server = Server::in_virtual_time(demo());
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "x"}));
+    let area = attach(&mut client);
+    let mut cycle = 0;
+    follow(&mut client, &area, &mut cycle, 250);
+    client.advance(1.0);
+    let axis = client.axis("x");
+    assert_eq!(axis["at_rest"], json!(true));
+    assert_eq!(axis["enabled"], json!(true));
+    let events = client.kept_events("area");
+    assert_eq!(events.len(), 1, "{events:?}");
+    assert_eq!(
+        (&events[0]["axis"], &events[0]["owner"]["name"]),
+        (&json!("x"), &json!("test"))
+    );
+    // It follows again only from kind 0 on.
+    let at = client.position("x");
+    area.write(1000, &[(1, at), (0, 0.0)]);
+    client.advance(0.01);
+    assert_eq!(area.commands.get(12), 1);
+    area.write(1001, &[(0, 0.0), (0, 0.0)]);
+    client.advance(0.002);
+    area.write(1002, &[(1, at), (0, 0.0)]);
+    client.advance(0.002);
+    assert_eq!(area.commands.get(12), 0);
+}
+
+#[test]
+fn late_set_points_are_bridged() {
+    let server = Server::in_virtual_time(demo());
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "x"}));
+    let area = attach(&mut client);
+    let mut cycle = 0;
+    for _ in 0..40 {
+        follow(&mut client, &area, &mut cycle, 20);
+        // Five cycles without a set; the client's time goes on.
+        client.ok("advance", json!({"cycles": 5}));
+        cycle += 5;
+    }
+    assert_eq!(client.kept_events("area"), Vec::<Value>::new());
+    assert_eq!(area.commands.get(11), 0);
+    follow(&mut client, &area, &mut cycle, 100);
+    let error = client.position("x") - sine(cycle as f64 * 1e-3);
+    assert!(error.abs() < 0.1, "{error}");
+}
+
+#[test]
+fn nothing_in_the_area_is_trusted() {
+    let server = Server::in_virtual_time(demo());
+    for (kind, value, text) in [
+        (1, f64::NAN, "finite"),
+        (1, f64::INFINITY, "finite"),
+        (1, 30.0, "step"),
+        (1, -1e300, "step"),
+        (2, 1e6, "velocity"),
+        (3, 10.0, "CST"),
+        (77, 0.0, "77"),
+    ] {
+        let mut client = server.owner("test");
+        client.done("enable", json!({"axis": "x"}));
+        let area = attach(&mut client);
+        area.write(1, &[(1, client.position("x")), (0, 0.0)]);
+        client.advance(0.003);
+        let before = client.position("x");
+        area.write(2, &[(0, 0.0), (0, 0.0)]);
+        client.advance(0.003);
+        area.write(3, &[(kind, value), (0, 0.0)]);
+        client.advance(0.5);
+        assert_eq!(client.position("x"), before, "kind {kind}, {value}");
+        let event = client.kept_events("area").last().unwrap().clone();
+        let why = event["why"].as_str().unwrap();
+        assert!(
+            why.to_lowercase().contains(&text.to_lowercase()),
+            "{kind} {value}: {why}"
+        );
+        client.ok("release", json!({}));
+    }
+}
+
+#[test]
+fn the_area_of_a_former_owner_has_no_effect() {
+    let server = Server::in_virtual_time(demo());
+    let mut first = server.owner("first");
+    first.done("enable", json!({"axis": "x"}));
+    let old = attach(&mut first);
+    let mut cycle = 0;
+    follow(&mut first, &old, &mut cycle, 100);
+    let mut second = server.client();
+    second.ok("take", json!({"force": true}));
+    second.advance(1.0);
+    let at = second.position("x");
+    old.write(5000, &[(0, 0.0), (0, 0.0)]);
+    second.advance(0.01);
+    old.write(5001, &[(2, 5.0), (0, 0.0)]);
+    second.advance(0.5);
+    assert_eq!(second.position("x"), at);
+    let new = attach(&mut second);
+    new.write(1, &[(2, 5.0), (0, 0.0)]);
+    second.advance(0.005);
+    assert!(second.position("x") > at);
+    let error = first.refused("area", json!({}));
+    assert_eq!(error["code"], json!("not_owner"));
+}
+
+/// In real time, a client that reads the samples answers each cycle before the next.
+#[test]
+fn a_real_time_client_misses_few_cycles() {
+    let server = Server::in_real_time(demo());
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "x"}));
+    let area = attach(&mut client);
+    let (mut row, start) = (area.samples.get(6), Instant::now());
+    let mut cycle = 0;
+    while start.elapsed() < Duration::from_secs(2) {
+        let now = area.samples.get(6);
+        if now == row {
+            std::thread::sleep(Duration::from_micros(200));
+            continue;
+        }
+        row = now;
+        cycle += 1;
+        area.write(cycle, &[(1, client_sine(cycle)), (0, 0.0)]);
+    }
+    // How many are late depends on the computer; that they are used does not.
+    assert!(area.used() > 0 && area.used() <= cycle);
+    assert_eq!(client.kept_events("area"), Vec::<Value>::new());
+}
+
+/// Slow enough that a stall of many cycles stays within the limits.
+fn client_sine(cycle: u64) -> f64 {
+    0.5 * (1.0 - (std::f64::consts::TAU * cycle as f64 * 1e-3).cos())
+}

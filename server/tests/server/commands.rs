@@ -1,0 +1,234 @@
+//! Commands and their outcomes.
+
+use serde_json::json;
+
+use crate::harness::{Server, demo};
+
+#[test]
+fn a_client_enables_moves_and_disables() {
+    let server = Server::in_virtual_time(demo());
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "*"}));
+    assert_eq!(client.axis("x")["state"], json!("Operation enabled"));
+    let answer = client.done("move", json!({"axis": "x", "to": 20.0, "speed": 0.5}));
+    assert!(answer["request"].as_u64().is_some());
+    let axis = client.axis("x");
+    assert_eq!(axis["target_position"], json!(20.0));
+    assert_eq!(axis["in_target"], json!(true));
+    client.done("move", json!({"axis": "x", "by": -5.0}));
+    assert_eq!(client.position("x"), 15.0);
+    client.done("disable", json!({"axis": "*"}));
+    assert_eq!(client.axis("x")["enabled"], json!(false));
+}
+
+#[test]
+fn time_stands_still_between_requests() {
+    let server = Server::in_virtual_time(demo());
+    let mut client = server.owner("test");
+    let time = |client: &mut crate::harness::Client| {
+        client.ok("state", json!({}))["time_ns"].as_u64().unwrap()
+    };
+    client.advance(0.1);
+    let before = time(&mut client);
+    std::thread::sleep(std::time::Duration::from_millis(50));
+    assert_eq!(time(&mut client), before);
+    client.ok("advance", json!({"cycles": 500}));
+    let passed = time(&mut client) - before;
+    // The machine's other side works once a millisecond.
+    assert!((500_000_000..=502_000_000).contains(&passed), "{passed}");
+}
+
+#[test]
+fn refusals_say_why() {
+    let server = Server::in_virtual_time(demo());
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "x"}));
+    for (op, keys, code, part) in [
+        ("move", json!({"axis": "z", "to": 1}), "unknown_name", "`z`"),
+        ("move", json!({"axis": "x"}), "bad_request", "`to` or `by`"),
+        (
+            "move",
+            json!({"axis": "x", "to": 1000, "wait": true}),
+            "refused",
+            "range",
+        ),
+        (
+            "move",
+            json!({"axis": "x", "to": 1, "speed": 2, "wait": true}),
+            "refused",
+            "%",
+        ),
+        (
+            "velocity",
+            json!({"axis": "x", "velocity": 1e9, "wait": true}),
+            "refused",
+            "velocity",
+        ),
+        (
+            "torque",
+            json!({"axis": "x", "torque": 1, "wait": true}),
+            "refused",
+            "CST",
+        ),
+        (
+            "mode",
+            json!({"axis": "x", "mode": "hm"}),
+            "unknown_name",
+            "hm",
+        ),
+        (
+            "home",
+            json!({"axis": "x", "wait": true}),
+            "refused",
+            "homing",
+        ),
+        ("override", json!({"factor": 0}), "bad_request", "factor"),
+        (
+            "output",
+            json!({"device": "x", "output": "Controlword", "value": 1}),
+            "unknown_name",
+            "Controlword",
+        ),
+        (
+            "sdo_read",
+            json!({"device": "x", "index": "0x9999"}),
+            "aborted",
+            "0x9999",
+        ),
+        (
+            "sdo_read",
+            json!({"device": "z", "index": 1}),
+            "unknown_name",
+            "z",
+        ),
+        (
+            "sdo_write",
+            json!({"device": "x", "index": "0x6060", "value": 300}),
+            "bad_request",
+            "fit",
+        ),
+        (
+            "stream_push",
+            json!({"axis": "x", "points": [[1]]}),
+            "refused",
+            "stream",
+        ),
+        ("area", json!({"x": 1}), "bad_request", "x"),
+        ("advance", json!({"seconds": -1}), "bad_request", "seconds"),
+        ("token", json!({"token": "x"}), "no_token", "token"),
+        (
+            "program",
+            json!({"action": "pause", "wait": true}),
+            "failed",
+            "program",
+        ),
+    ] {
+        let error = client.refused(op, keys.clone());
+        let message = error["message"].as_str().unwrap();
+        assert_eq!(error["code"], json!(code), "{op} {keys}: {error}");
+        assert!(message.contains(part), "{op} {keys}: {error}");
+    }
+    assert_eq!(client.position("x"), 0.0);
+}
+
+#[test]
+fn objects_are_read_and_written() {
+    let server = Server::in_virtual_time(demo());
+    let mut client = server.owner("test");
+    let read = client.ok("sdo_read", json!({"device": "x", "index": "0x6061"}));
+    assert_eq!((&read["data"], &read["value"]), (&json!("08"), &json!(8)));
+    client.ok(
+        "sdo_write",
+        json!({"device": "x", "index": "0x6065", "value": 4000}),
+    );
+    let read = client.ok("sdo_read", json!({"device": "x", "index": 0x6065}));
+    assert_eq!(read["value"], json!(4000));
+    client.ok(
+        "sdo_write",
+        json!({"device": "x", "index": "0x6065", "data": "d0070000"}),
+    );
+    let read = client.ok("sdo_read", json!({"device": "x", "index": 0x6065}));
+    assert_eq!(read["value"], json!(2000));
+}
+
+#[test]
+fn a_later_command_replaces_a_motion() {
+    let server = Server::in_virtual_time(demo());
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "x"}));
+    let first = client.ok("move", json!({"axis": "x", "to": 50}))["request"].clone();
+    client.advance(0.05);
+    client.done("move", json!({"axis": "x", "to": 10}));
+    assert_eq!(client.position("x"), 10.0);
+    let second = client.ok("move", json!({"axis": "x", "to": 50}))["request"].clone();
+    client.advance(0.05);
+    client.ok("stop", json!({}));
+    client.advance(1.0);
+    let axis = client.axis("x");
+    assert_eq!(axis["at_rest"], json!(true));
+    assert_eq!(axis["enabled"], json!(true));
+    let replaced = client.kept_events("replaced");
+    let replaced: Vec<_> = replaced.iter().map(|event| &event["request"]).collect();
+    assert_eq!(replaced, [&first, &second]);
+}
+
+#[test]
+fn the_program_of_the_file_runs_pauses_and_ends() {
+    let server = Server::in_virtual_time(demo());
+    let mut client = server.owner("test");
+    let run = client.send("program", json!({"action": "start", "wait": true}));
+    let refused = client.refused("move", json!({"axis": "x", "to": 1, "wait": true}));
+    assert!(refused["message"].as_str().unwrap().contains("program"));
+    assert_eq!(client.answer(run)["ok"], json!(true));
+    let steps = client.kept_events("program");
+    let began = steps
+        .iter()
+        .filter(|event| event["step"].is_string())
+        .count();
+    assert_eq!(began, 8, "four steps, twice");
+    // One step alone, then the end.
+    client.done("program", json!({"action": "step"}));
+    client.advance(2.0);
+    let state = client.ok("state", json!({}));
+    assert_eq!(state["program"]["paused"], json!(true));
+    assert_eq!(client.position("x"), 50.0);
+    client.done("program", json!({"action": "stop"}));
+    client.advance(0.1);
+    assert_eq!(
+        client.ok("state", json!({}))["program"]["running"],
+        json!(false)
+    );
+}
+
+#[test]
+fn an_override_scales_a_running_move() {
+    let server = Server::in_virtual_time(demo());
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "x"}));
+    client.ok("move", json!({"axis": "x", "to": 50.0, "speed": 0.2}));
+    client.advance(0.2);
+    let fast = client.axis("x")["target_velocity"].as_f64().unwrap();
+    client.done("override", json!({"factor": 0.5}));
+    client.advance(0.2);
+    let slow = client.axis("x")["target_velocity"].as_f64().unwrap();
+    assert!(
+        (fast - 50.0).abs() < 1e-6 && (slow - 25.0).abs() < 1e-6,
+        "{fast} {slow}"
+    );
+    assert_eq!(client.ok("state", json!({}))["override"], json!(0.5));
+}
+
+#[test]
+fn the_bus_goes_down_and_comes_up() {
+    let server = Server::in_virtual_time(demo());
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "x"}));
+    client.ok("bus", json!({"action": "down"}));
+    client.ok("await", json!({"bus": "down"}));
+    let error = client.refused("enable", json!({"axis": "x"}));
+    assert_eq!(error["code"], json!("not_up"));
+    client.ok("bus", json!({"action": "up"}));
+    client.ok("await", json!({"bus": "op"}));
+    client.done("enable", json!({"axis": "x"}));
+    client.done("move", json!({"axis": "x", "to": 3.0}));
+}

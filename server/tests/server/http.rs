@@ -1,0 +1,172 @@
+//! HTTP: who may read and who may command.
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+
+use serde_json::{Value, json};
+
+use crate::harness::{Server, TOKEN, demo};
+
+struct Reply {
+    status: u16,
+    head: String,
+    body: Vec<u8>,
+}
+
+impl Reply {
+    fn json(&self) -> Value {
+        serde_json::from_slice(&self.body).expect("JSON")
+    }
+}
+
+fn request(
+    server: &Server,
+    method: &str,
+    path: &str,
+    headers: &[(&str, &str)],
+    body: &str,
+) -> Reply {
+    let url = server.url.as_ref().unwrap();
+    let address = url
+        .strip_prefix("http://")
+        .unwrap()
+        .split('/')
+        .next()
+        .unwrap();
+    let mut stream = TcpStream::connect(address).unwrap();
+    let mut text = format!("{method} {path} HTTP/1.1\r\nConnection: close\r\n");
+    if !headers.iter().any(|(name, _)| *name == "Host") {
+        text += &format!("Host: {address}\r\n");
+    }
+    for (name, value) in headers {
+        text += &format!("{name}: {value}\r\n");
+    }
+    text += &format!("Content-Length: {}\r\n\r\n{body}", body.len());
+    stream.write_all(text.as_bytes()).unwrap();
+    let mut bytes = Vec::new();
+    stream.read_to_end(&mut bytes).unwrap();
+    let end = bytes
+        .windows(4)
+        .position(|four| four == b"\r\n\r\n")
+        .unwrap();
+    let head = String::from_utf8(bytes[..end].to_vec()).unwrap();
+    let status = head.split(' ').nth(1).unwrap().parse().unwrap();
+    Reply {
+        status,
+        head: head.to_lowercase(),
+        body: bytes[end + 4..].to_vec(),
+    }
+}
+
+fn with_token(token: &str) -> [(&'static str, &str); 1] {
+    [("Authorization", token)]
+}
+
+#[test]
+fn commands_need_the_token_and_control() {
+    let bearer = format!("Bearer {TOKEN}");
+    for control in [true, false] {
+        let server = Server::with_http(demo(), control);
+        server.client();
+        let post = |path: &str, headers: &[(&str, &str)], body: &str| {
+            let reply = request(&server, "POST", path, headers, body);
+            (reply.status, reply.json())
+        };
+        let (status, answer) = post("/api/take", &[], "{}");
+        assert_eq!(
+            (status, &answer["error"]["code"]),
+            (401, &json!("no_token"))
+        );
+        let (status, _) = post("/api/stop", &with_token("Bearer wrong"), "");
+        assert_eq!(status, 401);
+        let (status, answer) = post("/api/take", &with_token(&bearer), r#"{"ttl_ms": 60000}"#);
+        let (stop, _) = post("/api/stop", &with_token(&bearer), "");
+        if control {
+            assert_eq!((status, stop), (200, 200), "{answer}");
+            let (status, answer) = post("/api/enable", &with_token(&bearer), r#"{"axis": "x"}"#);
+            assert_eq!(status, 200, "{answer}");
+            let state = request(&server, "GET", "/api/state", &[], "").json();
+            assert_eq!(state["axes"][0]["enabled"], json!(true));
+        } else {
+            assert_eq!((status, stop), (403, 403));
+            assert_eq!(answer["error"]["code"], json!("read_only"));
+        }
+        let (status, _) = post("/api/fly", &with_token(&bearer), "");
+        assert_eq!(status, 404);
+        let (status, _) = post("/api/stop", &with_token(&bearer), "[");
+        assert_eq!(status, 400);
+        let (status, _) = post("/api/area", &with_token(&bearer), "");
+        assert!([400, 403].contains(&status));
+    }
+}
+
+#[test]
+fn pages_of_other_servers_can_neither_read_nor_command() {
+    let server = Server::with_http(demo(), true);
+    for headers in [
+        [("Origin", "http://example.com"), ("X", "")],
+        [("Host", "example.com"), ("X", "")],
+        [("Host", "127.0.0.1.example.com:80"), ("X", "")],
+        [("Host", "localhost"), ("Origin", "http://localhost:1")],
+        [("Origin", "null"), ("X", "")],
+    ] {
+        for path in ["/", "/api/state", "/metrics"] {
+            let reply = request(&server, "GET", path, &headers, "");
+            assert_eq!(reply.status, 403, "{headers:?} {path}");
+        }
+    }
+    let reply = request(&server, "GET", "/api/state", &[("Host", "localhost")], "");
+    assert_eq!(reply.status, 200);
+    assert!(
+        reply
+            .head
+            .contains("content-security-policy: default-src 'self'")
+    );
+    assert!(!reply.head.contains("access-control-allow"));
+}
+
+#[test]
+fn samples_and_history_are_exact() {
+    let server = Server::with_http(demo(), false);
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "x"}));
+    client.done("move", json!({"axis": "x", "to": 2.0, "speed": 0.05}));
+    std::thread::sleep(std::time::Duration::from_millis(300));
+    let path = "/api/samples?signals=x.target_position&count=400";
+    let frame = request(&server, "GET", path, &[], "").body;
+    let u32_at = |at: usize| u32::from_le_bytes(frame[at..at + 4].try_into().unwrap());
+    let f64_at = |at: usize| f64::from_le_bytes(frame[at..at + 8].try_into().unwrap());
+    assert_eq!((frame[0], u32_at(4), u32_at(8)), (1, 400, 1));
+    let (times, values) = (32 + 400 * 8, 32 + 800 * 8);
+    assert_eq!(frame.len(), values + 400 * 8);
+    let values: Vec<f64> = (0..400).map(|n| f64_at(values + n * 8)).collect();
+    assert!(
+        values.windows(2).all(|pair| pair[0] <= pair[1]),
+        "{values:?}"
+    );
+    assert_eq!(values[399], 2.0);
+    let time = u64::from_le_bytes(frame[times..times + 8].try_into().unwrap());
+    let path = format!("/api/history?signals=x.target_position&from_ns={time}&buckets=4");
+    let history = request(&server, "GET", &path, &[], "").body;
+    assert_eq!(history[0], 2);
+    let buckets = u32::from_le_bytes(history[4..8].try_into().unwrap()) as usize;
+    assert!((1..=4).contains(&buckets));
+    let at = |n: usize| f64::from_le_bytes(history[n..n + 8].try_into().unwrap());
+    assert_eq!(
+        at(16 + buckets * 8),
+        values[0],
+        "the least value of the first bucket"
+    );
+    assert_eq!(
+        at(16 + buckets * 8 * 3 - 8),
+        2.0,
+        "the greatest of the last"
+    );
+    let path = format!("/api/export.csv?signals=x.target_position&from_ns={time}");
+    let csv = String::from_utf8(request(&server, "GET", &path, &[], "").body).unwrap();
+    assert!(csv.starts_with("row,time_ns,\"x.target_position [mm]\"\r\n"));
+    let reply = request(&server, "GET", "/api/samples?signals=z", &[], "");
+    assert_eq!(reply.status, 404);
+    let reply = request(&server, "GET", "/api/recordings/..%2Fs.sock", &[], "");
+    assert_eq!(reply.status, 404);
+}

@@ -1,0 +1,9 @@
+//! The server as its clients see it, on the simulated bus.
+
+mod area;
+mod commands;
+mod fuzz;
+mod harness;
+mod http;
+mod lease;
+mod streams;
