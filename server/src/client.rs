@@ -187,6 +187,7 @@ impl Client {
                 let events: Vec<_> = events.iter().map(|event| &event.body).collect();
                 Ok(object(json!({"events": events})))
             }
+            Op::FaultReports {} => Ok(object(json!({"reports": hub.fault_reports()}))),
             Op::Await { bus, timeout_ms } => self.await_bus(bus, timeout_ms).await,
             Op::SdoRead {
                 device,

@@ -34,6 +34,8 @@ pub enum Op {
         #[serde(default)]
         after: u64,
     },
+    /// Returns the last 20 fault reports.
+    FaultReports {},
     /// Subscribes to topics.
     Subscribe {
         topics: Vec<Topic>,
@@ -273,6 +275,7 @@ impl Op {
             | Self::Machine {}
             | Self::State {}
             | Self::Events { .. }
+            | Self::FaultReports {}
             | Self::Subscribe { .. }
             | Self::Unsubscribe { .. }
             | Self::Await { .. } => Access::Read,

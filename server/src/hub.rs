@@ -14,6 +14,7 @@ use ecaxis_ecat::index::{AxisIndex, IndexVec};
 use ecaxis_master::clock::{self, Nanos};
 use ecaxis_master::config::{Machine, OutputRef, Signal};
 use ecaxis_master::mailbox::Mailboxes;
+use ecaxis_master::post_mortem::FaultReport;
 use ecaxis_master::report::Error;
 use ecaxis_master::rt::channel::Snapshot;
 use ecaxis_master::samples::Samples;
@@ -31,6 +32,8 @@ use crate::sampler::Sampler;
 
 /// The number of events that the server keeps.
 const EVENTS: usize = 1000;
+/// The number of fault reports that the server keeps.
+const FAULT_REPORTS: usize = 20;
 /// The number of commands that may wait for the machine.
 const QUEUE: usize = 4096;
 
@@ -179,6 +182,7 @@ struct Inner {
     speed_override: f64,
     outputs: Vec<Option<f64>>,
     events: VecDeque<Arc<Event>>,
+    fault_reports: VecDeque<Value>,
     next_event: u64,
     /// The time to which virtual time may advance.
     advance_to: Nanos,
@@ -238,6 +242,7 @@ impl Hub {
                 speed_override: 1.0,
                 outputs: vec![None; outputs.len()],
                 events: VecDeque::new(),
+                fault_reports: VecDeque::new(),
                 next_event: 1,
                 advance_to: 0,
                 now: 0,
@@ -450,6 +455,9 @@ impl Hub {
         inner.latest = None;
         inner.mailboxes = None;
         inner.step = RunningStep::default();
+        // The next run has a virtual time of its own.
+        inner.advance_to = 0;
+        inner.now = 0;
         // A new run begins with these.
         inner.speed_override = 1.0;
         inner.outputs.fill(None);
@@ -624,6 +632,25 @@ impl Hub {
         }
         // Without a subscriber, the event is only kept.
         let _ = self.events.send(event);
+    }
+
+    /// Keeps the fault report of a run, and reports it.
+    pub fn keep_fault_report(&self, report: &FaultReport) {
+        let mut inner = self.lock();
+        let body = json!({"event": "fault_report", "headline": report.headline});
+        let event = inner.next_event;
+        self.push_event(&mut inner, body);
+        let kept = json!({"event": event, "report": report});
+        inner.fault_reports.push_back(kept);
+        if inner.fault_reports.len() > FAULT_REPORTS {
+            inner.fault_reports.pop_front();
+        }
+    }
+
+    /// Returns the kept fault reports, each with the number of its event.
+    #[must_use]
+    pub fn fault_reports(&self) -> Vec<Value> {
+        self.lock().fault_reports.iter().cloned().collect()
     }
 
     /// Returns the kept events with a number above `after`.

@@ -48,6 +48,9 @@ pub fn keep_up(hub: &Arc<Hub>, options: &Options, stop: &Arc<CancelToken>, descr
             attachments,
         );
         let up_since = observer.up_since;
+        if let Some(report) = &outcome.fault_report {
+            hub.keep_fault_report(report);
+        }
         let Err(error) = outcome.result else {
             hub.fail_all("a client or the end of the server has stopped it");
             hub.set_bus(status(BusState::Down));

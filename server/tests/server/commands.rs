@@ -25,17 +25,20 @@ fn a_client_enables_moves_and_disables() {
 fn time_stands_still_between_requests() {
     let server = Server::in_virtual_time(demo());
     let mut client = server.owner("test");
-    let time = |client: &mut crate::harness::Client| {
-        client.ok("state", json!({}))["time_ns"].as_u64().unwrap()
-    };
-    client.advance(0.1);
-    let before = time(&mut client);
+    let start = client.ok("advance", json!({"cycles": 1}))["time_ns"]
+        .as_u64()
+        .unwrap();
     std::thread::sleep(std::time::Duration::from_millis(50));
-    assert_eq!(time(&mut client), before);
-    client.ok("advance", json!({"cycles": 500}));
-    let passed = time(&mut client) - before;
-    // The machine's other side works once a millisecond.
-    assert!((500_000_000..=502_000_000).contains(&passed), "{passed}");
+    let end = client.ok("advance", json!({"cycles": 500}))["time_ns"]
+        .as_u64()
+        .unwrap();
+    // A cycle begins up to one cycle time after the end.
+    assert!(
+        (500_000_000..501_000_000).contains(&(end - start)),
+        "{start} {end}"
+    );
+    let state = client.ok("state", json!({}))["time_ns"].as_u64().unwrap();
+    assert!((end - 3_000_000..=end).contains(&state), "{state} {end}");
 }
 
 #[test]

@@ -13,6 +13,7 @@ use ecaxis_master::config::{self, Machine};
 use ecaxis_master::session::Options;
 use ecaxis_server::http::HttpOptions;
 use ecaxis_server::serve::{Listening, ServeError, ServerOptions, serve};
+use ecaxis_sim::FaultScript;
 use serde_json::{Value, json};
 
 pub const TOKEN: &str = "0123456789abcdef";
@@ -36,6 +37,16 @@ impl Server {
     pub fn in_virtual_time(machine: Machine) -> Self {
         let options = Options {
             clock: Clock::Virtual,
+            ..Options::default()
+        };
+        Self::start(machine, options, None)
+    }
+
+    /// Like [`Server::in_virtual_time`], with a fault script.
+    pub fn with_faults(machine: Machine, script: &str) -> Self {
+        let options = Options {
+            clock: Clock::Virtual,
+            faults: Some(FaultScript::parse(script).unwrap()),
             ..Options::default()
         };
         Self::start(machine, options, None)

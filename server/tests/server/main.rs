@@ -2,6 +2,7 @@
 
 mod area;
 mod commands;
+mod faults;
 mod fuzz;
 mod harness;
 mod http;

@@ -1,0 +1,94 @@
+//! The server stays when the bus or a drive fails, says so, and takes commands again.
+
+use serde_json::{Value, json};
+
+use crate::harness::{Client, Server, demo};
+
+fn states(client: &mut Client) -> Vec<Value> {
+    let events = client.kept_events("bus");
+    events.iter().map(|event| event["state"].clone()).collect()
+}
+
+#[test]
+fn a_drive_fault_is_reported_and_reset() {
+    let script = "[[fault]]\nkind = 'drive-fault'\nat = '2s'\ndevice = 0\ncode = 0x3210\n";
+    let server = Server::with_faults(demo(), script);
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "*"}));
+    client.ok("velocity", json!({"axis": "x", "velocity": 5}));
+    client.advance(2.0);
+    let fault = client.kept_events("fault");
+    assert_eq!(fault[0]["axis"], json!("x"));
+    // The code is read after the fault.
+    let last = fault.last().unwrap()["why"].as_str().unwrap();
+    assert!(last.contains("0x3210"), "{fault:?}");
+    assert_eq!(client.kept_events("group_stopped").len(), 1);
+    // The other axis has stopped with it, within its limits.
+    let other = client.axis("y");
+    assert_eq!(other["at_rest"], json!(true));
+    assert!(
+        other["stopped"].as_str().unwrap().contains("`x`"),
+        "{other}"
+    );
+    let error = client.refused("move", json!({"axis": "y", "to": 1, "wait": true}));
+    assert!(
+        ["refused", "failed"].contains(&error["code"].as_str().unwrap()),
+        "{error}"
+    );
+    client.done("reset", json!({"axis": "x"}));
+    client.done("enable", json!({"axis": "*"}));
+    client.done("move", json!({"axis": "x", "to": 1.0}));
+    assert_eq!(client.kept_events("group_released").len(), 1);
+}
+
+#[test]
+fn a_cable_that_breaks_and_returns_needs_no_person() {
+    let script = "[[fault]]\nkind = 'silent'\nat = '2s'\nfor = '3s'\n";
+    let server = Server::with_faults(demo(), script);
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "*"}));
+    client.ok("velocity", json!({"axis": "x", "velocity": 5}));
+    let id = client.send("advance", json!({"seconds": 10.0}));
+    let answer = client.answer(id);
+    assert_eq!(answer["error"]["code"], json!("not_up"), "{answer}");
+    client.ok("await", json!({"bus": "op"}));
+    let states = states(&mut client);
+    let failed = states.iter().position(|state| *state == json!("failed"));
+    assert!(
+        failed.is_some() && states.last() == Some(&json!("op")),
+        "{states:?}"
+    );
+    let bus = client.kept_events("bus");
+    let failure = bus
+        .iter()
+        .find(|event| event["state"] == json!("failed"))
+        .unwrap();
+    assert_eq!(failure["retry_s"], json!(1.0));
+    // Nothing has power until a client says so.
+    client.advance(0.1);
+    assert_eq!(client.axis("x")["enabled"], json!(false));
+    client.done("enable", json!({"axis": "*"}));
+    let at = client.position("x");
+    client.done("move", json!({"axis": "x", "by": 1.0}));
+    assert_eq!(client.position("x"), at + 1.0);
+    let reports = client.ok("fault_reports", json!({}))["reports"].clone();
+    let headline = reports[0]["report"]["headline"].as_str().unwrap();
+    assert!(headline.contains("cable"), "{headline}");
+}
+
+#[test]
+fn a_device_that_is_missing_is_named() {
+    let script = "[[fault]]\nkind = 'absent'\ndevice = 1\n";
+    let server = Server::with_faults(demo(), script);
+    let mut client = Client::new(&server.socket());
+    client.ok("await", json!({"bus": "failed"}));
+    let state = client.ok("state", json!({}))["bus"].clone();
+    assert!(state["error"].as_str().unwrap().contains("`y`"), "{state}");
+    let error = client.refused("await", json!({"bus": "op", "timeout_ms": 10}));
+    assert!(
+        error["message"].as_str().unwrap().contains("`y`"),
+        "{error}"
+    );
+    let error = client.refused("sdo_read", json!({"device": "x", "index": 0x6061}));
+    assert_eq!(error["code"], json!("not_up"));
+}
