@@ -116,6 +116,8 @@ pub struct Axis {
     interrupted: bool,
     /// External set-point of this cycle.
     external_setpoint: Option<Motion>,
+    /// Torque feed-forward of this cycle from outside, percent of rated torque.
+    torque_feedforward: f64,
     fault: Option<DriveFault>,
     trip: Option<Trip>,
 }
@@ -163,6 +165,7 @@ impl Axis {
             unfollowed_cycles: 0,
             interrupted: false,
             external_setpoint: None,
+            torque_feedforward: 0.0,
             fault: None,
             trip: None,
             config,
@@ -200,6 +203,16 @@ impl Axis {
     /// limit. After a rejected position the axis decelerates. RT: O(1), never blocks or allocates.
     pub fn set_point(&mut self, position: f64) -> Result<(), CommandError> {
         self.take_set_point(position)
+    }
+
+    /// Adds a torque feed-forward to the external set-point of this cycle, in percent of rated
+    /// torque: 0x60B2 in CSP, within the torque limit. Call it after [`Axis::set_point`].
+    ///
+    /// Has no effect without an accepted set-point. RT: O(1), never blocks or allocates.
+    pub fn set_torque_feedforward(&mut self, percent: f64) {
+        if percent.is_finite() && self.external_setpoint.is_some() {
+            self.torque_feedforward = percent;
+        }
     }
 
     /// Runs one cycle of `dt_s` seconds, the nominal cycle time (1 µs to 0.1 s). A longer time is
@@ -263,7 +276,9 @@ impl Axis {
         self.external_setpoint = None;
         self.previous_target = sent;
         self.update_settling_times(dt_s);
-        self.outputs()
+        let outputs = self.outputs();
+        self.torque_feedforward = 0.0;
+        outputs
     }
 
     fn read(&mut self, inputs: &Inputs) {

@@ -19,7 +19,7 @@ use crate::command::{
     ALL, Access, BusAction, Index, InterpolationName, Op, Point, ProgramAction, Request,
 };
 use crate::error::{ErrorCode, OpError};
-use crate::external::{STREAM_POINTS, command_area};
+use crate::external::{STREAM_POINTS, StreamPoint, command_area};
 use crate::hub::{BusState, Hub, Outcome, Transfer, Work};
 use crate::lease::ClientId;
 use crate::state;
@@ -28,6 +28,8 @@ use crate::state;
 const WAITING: usize = 256;
 /// The age in ns of a state from which no client may jog.
 const OLD_NS: u64 = 500_000_000;
+/// The torque offset (CiA 402).
+const TORQUE_OFFSET: u16 = 0x60b2;
 /// The longest name of a client.
 const NAME_LENGTH: usize = 64;
 
@@ -410,15 +412,25 @@ impl Client {
                 Ok(vec![Work::Open { axis, config }])
             }
             Op::StreamPush { axis, points } if points.len() <= STREAM_POINTS => {
-                let axis = self.axis(&axis)?.0;
-                let points = points.iter().map(|point| match *point {
-                    Point::Position([position]) => Knot {
-                        position,
-                        velocity: 0.0,
-                    },
-                    Point::WithVelocity([position, velocity]) => Knot { position, velocity },
+                let axis = self.axis(&axis)?;
+                if points
+                    .iter()
+                    .any(|point| matches!(point, Point::WithTorque(_)))
+                {
+                    self.check_torque_offset(axis)?;
+                }
+                let points = points.iter().map(|point| {
+                    let (position, velocity, torque) = match *point {
+                        Point::Position([position]) => (position, 0.0, 0.0),
+                        Point::WithVelocity([position, velocity]) => (position, velocity, 0.0),
+                        Point::WithTorque([position, velocity, torque]) => {
+                            (position, velocity, torque)
+                        }
+                    };
+                    let knot = Knot { position, velocity };
+                    StreamPoint { knot, torque }
                 });
-                let points = points.collect();
+                let (axis, points) = (axis.0, points.collect());
                 Ok(vec![Work::Push { axis, points }])
             }
             Op::StreamPush { points, .. } => {
@@ -430,6 +442,20 @@ impl Client {
             }]),
             _ => Err(OpError::new(ErrorCode::BadRequest, "not a command")),
         }
+    }
+
+    fn check_torque_offset(&self, axis: AxisIndex) -> Result<(), OpError> {
+        let machine = &self.hub.machine;
+        let mapped = machine.axes.get(axis).is_some_and(|setup| {
+            let object = ecaxis_esi::axis::object(TORQUE_OFFSET, setup.number);
+            let device = machine.devices.get(setup.device);
+            device.is_some_and(|d| d.selection.layout.rx_field(object, 0).is_some())
+        });
+        mapped.then_some(()).ok_or_else(|| {
+            let message = "a torque feed-forward needs 0x60B2 in the process data";
+            OpError::new(ErrorCode::Refused, message)
+                .help("add it with `pdo.rx` in the machine file")
+        })
     }
 
     fn is_old(&self, seen_ns: u64) -> bool {

@@ -157,7 +157,8 @@ pub enum Op {
         #[serde(default = "prefill")]
         prefill: usize,
     },
-    /// Adds points to a stream: `[position]` or `[position, velocity]`.
+    /// Adds points to a stream: `[position]`, `[position, velocity]` or `[position, velocity,
+    /// torque]`.
     StreamPush { axis: String, points: Vec<Point> },
     /// Ends a stream: the axis stands at the last point.
     StreamClose { axis: String },
@@ -219,12 +220,13 @@ pub enum InterpolationName {
     Linear,
 }
 
-/// A point of a stream: a position, and the velocity there.
+/// A point of a stream: a position, the velocity there, and the torque feed-forward in percent.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize, JsonSchema)]
 #[serde(untagged)]
 pub enum Point {
     Position([f64; 1]),
     WithVelocity([f64; 2]),
+    WithTorque([f64; 3]),
 }
 
 /// The index of an object: a number, or a text such as `"0x6061"`.

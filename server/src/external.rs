@@ -50,6 +50,14 @@ pub mod words {
     pub const OF_AXIS: usize = 4;
 }
 
+/// A point of a stream.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StreamPoint {
+    pub knot: Knot,
+    /// Torque feed-forward in percent of rated torque.
+    pub torque: f64,
+}
+
 /// A message to the cycle.
 #[derive(Debug)]
 pub enum Message {
@@ -67,7 +75,7 @@ pub enum Message {
     Push {
         ticket: u64,
         axis: usize,
-        points: Box<[Knot]>,
+        points: Box<[StreamPoint]>,
     },
     Close {
         ticket: u64,
@@ -88,7 +96,7 @@ pub enum Report {
         free: usize,
         error: Option<StreamError>,
         /// Returned to be freed outside the cycle.
-        points: Box<[Knot]>,
+        points: Box<[StreamPoint]>,
     },
     Closed {
         ticket: u64,
@@ -457,13 +465,14 @@ impl External {
         Ok(())
     }
 
-    fn push(&mut self, ticket: u64, index: usize, points: Box<[Knot]>) {
+    fn push(&mut self, ticket: u64, index: usize, points: Box<[StreamPoint]>) {
         let (mut accepted, mut free, mut error) = (0, 0, None);
         match self.axes.get_mut(index).and_then(|a| a.stream.as_mut()) {
             None => error = Some(StreamError::NotOpen),
             Some(stream) => {
-                for &point in &points {
-                    if let Err(refused) = stream.push(point) {
+                for point in &points {
+                    let pushed = stream.push_with_torque(point.knot, point.torque);
+                    if let Err(refused) = pushed {
                         error = Some(refused.into());
                         break;
                     }
@@ -598,7 +607,9 @@ impl External {
             _ if stream.finished(next) => Some(StreamEnd::Done),
             _ => None,
         };
+        let torque = stream.torque();
         let refused = machine.set_point(axis.axis, next.position).err();
+        machine.set_torque_feedforward(axis.axis, torque);
         let end = refused.map(StreamEnd::Refused).or(end);
         axis.source = Source::Stream { motion: next };
         if let Some(end) = end {

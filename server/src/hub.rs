@@ -9,7 +9,7 @@ use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use ecaxis_axis::setpoint::{Knot, StreamConfig};
+use ecaxis_axis::setpoint::StreamConfig;
 use ecaxis_ecat::index::{AxisIndex, IndexVec};
 use ecaxis_master::clock::{self, Nanos};
 use ecaxis_master::config::{Machine, OutputRef, Signal};
@@ -26,7 +26,7 @@ use serde_json::{Map, Value, json};
 use tokio::sync::{broadcast, oneshot, watch};
 
 use crate::error::{ErrorCode, OpError};
-use crate::external::AreaCounters;
+use crate::external::{AreaCounters, StreamPoint};
 use crate::lease::{ClientId, Lease, Owner};
 use crate::sampler::Sampler;
 
@@ -89,7 +89,7 @@ pub enum Work {
     },
     Push {
         axis: usize,
-        points: Box<[Knot]>,
+        points: Box<[StreamPoint]>,
     },
     Close {
         axis: usize,

@@ -190,8 +190,9 @@ impl Axis {
                 let offset = UserVelocity(self.loop_state.velocity_offset);
                 out.velocity_offset = scale.velocity_to_raw(offset).0;
             }
-            if loops.acceleration != 0.0 {
+            if loops.acceleration != 0.0 || self.torque_feedforward != 0.0 {
                 let torque = loops.acceleration * self.motion.acceleration;
+                let torque = torque + self.torque_feedforward;
                 let torque = Percent(bounded(torque, self.config.limits.torque));
                 out.torque_offset = scale.torque_to_raw(torque).0;
             }

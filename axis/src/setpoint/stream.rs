@@ -46,6 +46,9 @@ pub enum StreamState {
 pub struct Stream<const N: usize> {
     config: StreamConfig,
     buffer: [Piece; N],
+    /// The torque at the end of each piece, and at the start of the present one.
+    torques: [f64; N],
+    torque_before: f64,
     first: usize,
     filled: usize,
     /// The last accepted point, with the velocity there.
@@ -78,6 +81,8 @@ impl<const N: usize> Stream<N> {
         Ok(Self {
             config,
             buffer: [Piece::new(at, at, config.interval_s); N],
+            torques: [0.0; N],
+            torque_before: 0.0,
             first: 0,
             filled: 0,
             newest: at,
@@ -91,6 +96,12 @@ impl<const N: usize> Stream<N> {
     /// Accepts the point `interval_s` after the previous one, or rejects it and changes nothing.
     /// RT: O(1).
     pub fn push(&mut self, point: Knot) -> Result<(), SetpointError> {
+        self.push_with_torque(point, 0.0)
+    }
+
+    /// Like [`Stream::push`], with the torque feed-forward at the point in percent of rated torque.
+    pub fn push_with_torque(&mut self, point: Knot, torque: f64) -> Result<(), SetpointError> {
+        finite("torque", torque)?;
         if self.closed || self.state == StreamState::Underrun {
             return Err(SetpointError::Ended);
         }
@@ -100,6 +111,9 @@ impl<const N: usize> Stream<N> {
         let piece = self.check(point)?;
         if let Some(place) = self.buffer.get_mut((self.first + self.filled) % N) {
             *place = piece;
+        }
+        if let Some(place) = self.torques.get_mut((self.first + self.filled) % N) {
+            *place = torque;
         }
         self.filled += 1;
         self.newest = piece.to();
@@ -118,6 +132,21 @@ impl<const N: usize> Stream<N> {
         )?;
         self.closed = true;
         Ok(())
+    }
+
+    /// Returns the torque feed-forward at the present position, linear between the points. 0 unless
+    /// the stream moves.
+    #[must_use]
+    pub fn torque(&self) -> f64 {
+        let piece = self.buffer.get(self.first).filter(|_| self.filled > 0);
+        let (Some(piece), Some(after)) = (piece, self.torques.get(self.first)) else {
+            return 0.0;
+        };
+        if self.state != StreamState::Moving {
+            return 0.0;
+        }
+        let share = self.elapsed / piece.time();
+        self.torque_before + (after - self.torque_before) * share
     }
 
     /// Returns the state.
@@ -171,6 +200,7 @@ impl<const N: usize> Stream<N> {
                 return Some(piece.position(self.elapsed));
             }
             self.elapsed -= piece.time();
+            self.torque_before = self.torques.get(self.first).copied().unwrap_or_default();
             self.first = (self.first + 1) % N;
             self.filled -= 1;
         }

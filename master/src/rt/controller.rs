@@ -134,6 +134,12 @@ impl CycleContext<'_> {
         self.axes[axis.0].axis.set_point(position)
     }
 
+    /// Adds a torque feed-forward to the set-point of this cycle, in percent of rated torque: 0x60B2
+    /// in CSP. Has no effect unless the object is mapped and the set-point was accepted.
+    pub fn set_torque_feedforward(&mut self, axis: AxisRef, percent: f64) {
+        self.axes[axis.0].axis.set_torque_feedforward(percent);
+    }
+
     /// Returns an input as a number; a set bit is 1.
     #[must_use]
     pub fn input(&self, input: InputRef) -> f64 {

@@ -94,3 +94,47 @@ fn impossible_points_are_refused_with_those_behind_them() {
             .contains("no open stream")
     );
 }
+
+/// CiA 402: 0x60B2 is the torque offset, in per mille of the rated torque.
+#[test]
+fn a_torque_feed_forward_reaches_the_drive() {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
+    let demo = std::fs::read_to_string(&path).unwrap();
+    let objects = "pdo.rx = [\"0x6040\", \"0x6060\", \"0x607A\", \"0x60B2\"]\n\n[device.axis]";
+    let (x, y) = demo.split_once("\n[device.axis]").unwrap();
+    let without = objects.replace(", \"0x60B2\"", "");
+    let machine = format!("{x}{objects}{}", y.replacen("\n[device.axis]", &without, 1));
+    let machine = ecaxis_master::config::parse(&path, &machine).unwrap();
+    let server = Server::in_virtual_time(machine);
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "*"}));
+    client.ok(
+        "stream_open",
+        json!({"axis": "x", "interval_ms": 100, "prefill": 1}),
+    );
+    let points = json!([
+        [0.0, 0.0, 4.0],
+        [0.0, 0.0, 4.0],
+        [0.0, 0.0, 4.0],
+        [0.0, 0.0, 4.0]
+    ]);
+    client.ok("stream_push", json!({"axis": "x", "points": points}));
+    let offset = |client: &mut Client| {
+        let read = client.ok("sdo_read", json!({"device": "x", "index": "0x60B2"}));
+        read["value"].as_i64().unwrap()
+    };
+    client.advance(0.05);
+    let rising = offset(&mut client);
+    assert!(
+        (15..=30).contains(&rising),
+        "half of the way to 40: {rising}"
+    );
+    client.advance(0.15);
+    assert_eq!(offset(&mut client), 40);
+    client.advance(1.0);
+    assert_eq!(offset(&mut client), 0);
+    client.ok("stream_open", json!({"axis": "y", "interval_ms": 100}));
+    let points = json!([[0.0, 0.0, 4.0]]);
+    let error = client.refused("stream_push", json!({"axis": "y", "points": points}));
+    assert!(error["message"].as_str().unwrap().contains("0x60B2"));
+}
