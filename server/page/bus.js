@@ -42,7 +42,7 @@ export class Bus {
       h("h2", { text: "Topology" }), part.drawing,
       h("h2", { text: "Devices" }),
       h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Devices" },
-        h("table", {}, h("thead", {}, h("tr", {}, ...["", "Device", "Product", "AL state", "AL status code", "Clock difference", "Port", "Link", "Invalid frames", "RX errors", "Forwarded errors", "Lost links"].map((text, k) => h("th", { text, scope: "col", class: k === 6 || k > 7 ? "number" : null })))),
+        h("table", {}, h("thead", {}, h("tr", {}, ...["", "Device", "Product", "AL state", "AL status code", "Clock difference", "Processing errors", "PDI errors", "Port", "Link", "Invalid frames", "RX errors", "Forwarded errors", "Lost links"].map((text, k) => h("th", { text, scope: "col", class: k > 5 && k !== 9 ? "number" : null })))),
           ...this.#rows.map(({ body }) => body))),
       ...(io.length ? [h("h2", { text: "Inputs and outputs" }), h("div", { class: "lines" }, ...this.#io.map(({ root }) => root))] : []));
   }
@@ -162,7 +162,8 @@ function childrenOf(links) {
   return children;
 }
 
-const alClass = (state) => ({ Op: "good", SafeOp: "busy", "Safe-Op": "busy", PreOp: "busy", "Pre-Op": "busy", Init: "idle" })[state] ?? "unknown";
+const alName = (state) => (state?.answers === false ? "no answer" : (state?.al_state ?? "no state"));
+const alLevel = (state) => (state?.al_code || state?.answers === false ? "bad" : ({ Op: "good", SafeOp: "busy", PreOp: "busy", Init: "idle" }[state?.al_state] ?? "unknown"));
 const portErrors = (port) => (port.invalid_frames ?? 0) + (port.rx_errors ?? 0) + (port.forwarded_errors ?? 0) + (port.lost_links ?? 0);
 const alText = (state) => (state?.al_code ? `0x${state.al_code.toString(16).padStart(4, "0")}${state.al_text ? ` ${state.al_text}` : ""}` : "");
 
@@ -183,15 +184,15 @@ class Box {
 
   update(state, windowNs) {
     const part = this.#part;
-    set(part.state, state?.al_state ?? "no state");
-    mark(this.root, "data-state", state?.al_code ? "bad" : alClass(state?.al_state));
+    set(part.state, alName(state));
+    mark(this.root, "data-state", alLevel(state));
     const difference = state?.clock_difference_ns;
     const known = Number.isFinite(difference) && difference !== null;
     set(part.clock, state?.al_code ? shorten(alText(state), 22) : known ? `clock ${duration(difference)}${windowNs ? ` of ±${duration(windowNs)}` : ""}` : "no clock");
     const ports = state?.ports ?? [];
-    const errors = ports.reduce((sum, port) => sum + portErrors(port), 0);
+    const errors = ports.reduce((sum, port) => sum + portErrors(port), (state?.processing_errors ?? 0) + (state?.pdi_errors ?? 0));
     const open = ports.map((port, k) => (port.link ? k : null)).filter((port) => port !== null);
-    set(part.ports, ports.length ? `ports ${open.join(" ") || "none"}${errors ? ` · ${count(errors)} errors` : ""}` : "");
+    set(part.ports, [open.length && `ports ${open.join(" ")}`, errors && `${count(errors)} errors`].filter(Boolean).join(" · "));
     mark(part.ports, "data-level", errors ? "near" : null);
     set(part.title, `${part.device.name}: ${part.device.product ?? ""} ${state?.al_state ?? ""} ${alText(state)}`);
   }
@@ -219,6 +220,7 @@ class DeviceRow {
         h("td", { class: "number", text: this.#device.position, ...span }), h("th", { scope: "row", text: this.#device.name, ...span }), h("td", { text: this.#device.product ?? "", ...span }),
         (this.#cells.state = h("td", span, (this.#cells.chip = h("span", { class: "chip" })))), cell("code", { class: "wide", ...span }),
         h("td", { class: "clock", ...span }, (this.#cells.clock = h("span", { class: "number" })), (this.#cells.bar = h("div", { class: "bar", role: "meter", "aria-label": "Clock difference", hidden: true }, h("span", { class: "zero" }), (this.#cells.fill = h("span", { class: "fill" }))))),
+        cell("processing", { class: "number", ...span }), cell("pdi", { class: "number", ...span }),
       ];
       rows.push(h("tr", {}, ...own, ...["port", "link", "invalid", "rx", "forwarded", "lost"].map((key) => cell(`${key}${port}`, { class: "number" }))));
     }
@@ -229,12 +231,13 @@ class DeviceRow {
   update(state, windowNs) {
     const ports = state?.ports ?? [];
     const used = ports.map((port, k) => ({ ...port, k })).filter((port) => port.link || portErrors(port) > 0);
+    if (used.length === 0 && ports.length) used.push({ ...ports[0], k: "all" });
     const shape = String(Math.max(1, used.length));
     if (shape !== this.#shape) this.#build(Number(shape));
     this.#shape = shape;
     const cells = this.#cells;
-    set(cells.chip, state?.al_state ?? "no state");
-    mark(cells.chip, "data-state", state?.al_code ? "bad" : alClass(state?.al_state));
+    set(cells.chip, alName(state));
+    mark(cells.chip, "data-state", alLevel(state));
     set(cells.code, alText(state));
     const difference = state?.clock_difference_ns ?? null;
     set(cells.clock, difference === null ? NONE : duration(difference));
@@ -245,9 +248,13 @@ class DeviceRow {
       mark(cells.bar, "data-level", Math.abs(difference) > windowNs ? "over" : Math.abs(share) > 0.5 ? "near" : null);
       mark(cells.bar, "aria-valuetext", `${duration(difference)} of ±${duration(windowNs)}`);
     }
+    for (const [key, name] of [["processing", "processing_errors"], ["pdi", "pdi_errors"]]) {
+      set(cells[key], count(state?.[name]));
+      mark(cells[key], "data-level", state?.[name] > 0 ? "near" : null);
+    }
     used.forEach((port, row) => {
       set(cells[`port${row}`], String(port.k));
-      set(cells[`link${row}`], port.link ? (port.open === false ? "closed" : "link") : "none");
+      set(cells[`link${row}`], port.link === undefined ? NONE : !port.link ? "none" : port.open === false ? "closed" : "link");
       for (const [key, name] of [["invalid", "invalid_frames"], ["rx", "rx_errors"], ["forwarded", "forwarded_errors"], ["lost", "lost_links"]]) {
         set(cells[key + row], count(port[name]));
         mark(cells[key + row], "data-level", port[name] > 0 ? "near" : null);
@@ -275,7 +282,7 @@ class Line {
           if (this.#field.value.trim() !== "" && Number.isFinite(value)) write(value);
         } });
     }
-    this.root = h("div", { class: "line" }, h("span", { class: "lamp" }), h("span", { class: "name", text: `${line.device} · ${line.name}` }), h("span", { class: "way", text: line.output ? "output" : "input" }), this.#value, this.#field);
+    this.root = h("div", { class: "line" }, line.bits === 1 ? h("span", { class: "lamp" }) : h("span"), h("span", { class: "name", text: `${line.device} · ${line.name}` }), h("span", { class: "way", text: line.output ? "output" : "input" }), this.#value, this.#field);
   }
 
   update(value, mine) {

@@ -40,6 +40,8 @@ export class Connection extends EventTarget {
   #retry = 0;
   #samples = null;
   #layout = null;
+  /** The number of signals of the last subscription. */
+  #columns = 0;
 
   constructor(token) {
     super();
@@ -226,17 +228,18 @@ export class Connection extends EventTarget {
     this.#layout = null;
     await this.request("unsubscribe", { topics: ["samples"] });
     if (signals.length === 0 || signals !== this.#samples) return;
-    const { subscription = null } = await this.request("subscribe", { topics: ["samples"], interval_ms: 40, signals });
-    if (signals === this.#samples) this.#layout = { signals, subscription };
+    // A batch of the last subscription may come after the answer; another number of signals shows which one it is.
+    const asked = signals.length === this.#columns ? [...signals, signals[0]] : signals;
+    this.#columns = asked.length;
+    await this.request("subscribe", { topics: ["samples"], interval_ms: 40, signals: asked });
+    if (signals === this.#samples) this.#layout = signals;
   }
 
   #batch(buffer) {
     const batch = readBatch(buffer);
-    const layout = this.#layout;
-    if (!batch || !layout || batch.values.length !== layout.signals.length) return;
-    // A batch of an earlier subscription has other signals.
-    if (layout.subscription !== null && batch.subscription !== layout.subscription) return;
-    this.#say("samples", { ...batch, signals: layout.signals });
+    const signals = this.#layout;
+    if (!batch || !signals || batch.values.length !== this.#columns) return;
+    this.#say("samples", { ...batch, values: batch.values.slice(0, signals.length), signals });
   }
 }
 
@@ -247,7 +250,6 @@ export function readBatch(buffer) {
   const [rows, signals] = [head.getUint32(4, true), head.getUint32(8, true)];
   if (head.getUint8(0) !== 1 || buffer.byteLength < 32 + 8 * rows * (2 + signals)) return null;
   return {
-    subscription: head.getUint32(12, true),
     missed: Number(head.getBigUint64(24, true)),
     rows: new BigUint64Array(buffer, 32, rows),
     times: new BigUint64Array(buffer, 32 + 8 * rows, rows),

@@ -3,6 +3,7 @@
 import { count, h, mark, message, save, set } from "./dom.js";
 
 const KINDS = {
+  client: "Clients",
   fault: "Faults and trips", emergency: "Emergency messages", bus: "Bus", lease: "Control", request: "Commands", program: "Program", group: "Groups", stream: "Streams and cyclic area", captured: "Captured positions", warning: "Warnings",
 };
 const kindOf = (event) => ({ done: "request", failed: "request", refused: "request", replaced: "request", let_go: "request", group_stopped: "group", group_released: "group", area: "stream" })[event] ?? event;
@@ -14,7 +15,7 @@ function textOf(event) {
   const why = event.why ? `: ${event.why}` : "";
   const name = (owner) => (owner ? `\`${owner.name ?? owner}\`` : "no client");
   switch (event.event) {
-    case "bus": return [`The bus is ${event.state}`, event.error, event.help && `help: ${event.help}`, event.retry_s && `next try in ${event.retry_s} s`].filter(Boolean).join(". ");
+    case "bus": return [`The bus ${{ op: "is in Op", down: "is down", failed: "has failed", starting: "starts", stopping: "stops" }[event.state] ?? event.state}`, event.error, event.help && `help: ${event.help}`, event.retry_s && `next try in ${event.retry_s} s`].filter(Boolean).join(". ");
     case "lease": return `${name(event.owner)} has control${event.previous ? `; before: ${name(event.previous)}` : ""}${event.why ? ` (${event.why})` : ""}`;
     case "done": return `${event.what ?? "command"}: done`;
     case "failed": case "refused": case "replaced": case "let_go": return `${event.what ?? "command"}: ${event.event.replace("_", " ")}${why}`;
@@ -22,9 +23,10 @@ function textOf(event) {
     case "group_stopped": return `group ${event.group} stops${why}`;
     case "group_released": return `group ${event.group} is released${why}`;
     case "fault": return event.why ?? "fault";
-    case "emergency": return `${typeof event.code === "number" ? `0x${event.code.toString(16).padStart(4, "0")} ` : `${event.code ?? ""} `}${event.text ?? ""}`;
+    case "emergency": return `${typeof event.code === "number" ? `0x${event.code.toString(16).padStart(4, "0")} ` : ""}${event.text ?? ""}`;
     case "captured": return `${event.input} captured ${event.position}`;
     case "stream": return `stream: ${event.state}${why}`;
+    case "client": return `client ${event.client} ${event.connected ? "connected" : "disconnected"}${event.pid ? ` (process ${event.pid}, user ${event.uid})` : ""}`;
     case "area": return `cyclic area${why}`;
     case "warning": return event.text ?? "";
     default: return JSON.stringify({ ...event, event: undefined, number: undefined, time_ns: undefined });

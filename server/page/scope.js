@@ -496,7 +496,8 @@ export class Scope {
     else if (!this.#live) words.push(mode !== "off" && shownAt !== null ? "triggered" : "paused");
     else if (mode !== "off") words.push(shownAt !== null ? "triggered" : "waits for the trigger");
     else words.push("live");
-    if (this.#data) words.push(this.#data.oneCycle ? "every cycle" : "least and greatest values");
+    if (!this.#data || this.#data.at.length === 0) words.push("no samples");
+    else words.push(this.#data.oneCycle ? "every cycle" : "least and greatest values");
     const { missed } = this.#samples;
     if (missed) words.push(`${missed} cycles missed`);
     set(part.status, words.join(" · "));

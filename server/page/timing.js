@@ -138,7 +138,10 @@ function drawHistogram(canvas, buckets, percentiles) {
     for (const sign of signed ? [-1, 1] : [1]) {
       if (signed && decade === 0 && sign < 0) continue;
       line(context, at(sign * value), top, at(sign * value), height - bottom);
-      if (decade % every === 0) context.fillText(signed && decade === 0 ? "0" : duration(sign * value), Math.min(at(sign * value), width - 20), height - bottom + 5);
+      if (decade % every === 0) {
+        const text = signed && decade === 0 ? "0" : duration(sign * value);
+        context.fillText(text, Math.min(at(sign * value), width - context.measureText(text).width / 2), height - bottom + 5);
+      }
     }
   }
   context.fillStyle = colour.series[0];
