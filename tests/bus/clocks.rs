@@ -302,7 +302,7 @@ impl Watcher for SyncObserver {
 /// SYNC1 without the output SYNC0.
 #[test]
 fn sync1_follows_sync0_as_the_esi_says() {
-    let rows: [(&str, i32, i32, u32, [u8; 2], u32, u64); 4] = [
+    let rows = [
         ("#x0730", -4, -1, 0, [0x30, 0x07], 750_000, 4),
         ("#x700", -4, -1, 0, [0x00, 0x07], 750_000, 4),
         ("#x700", 1, 1, 1_000, [0x00, 0x07], 1_000, 1),
@@ -345,7 +345,7 @@ fn sync1_follows_sync0_as_the_esi_says() {
         assert!(sync1.windows(2).all(|pair| near(pair[1] - pair[0], MS)));
         let last = *sync1.last().expect("a pulse");
         let before = sync0.iter().filter(|at| (last - MS..last).contains(*at));
-        assert_eq!(before.count() as u64, sync0_per_cycle, "{activate}");
+        assert_eq!(before.count(), sync0_per_cycle, "{activate}");
         if sync0_per_cycle > 0 {
             assert!(
                 sync0

@@ -292,7 +292,7 @@ def by_pysoem(bench, d, machine):
         for device, slave in zip(machine.devices, master.slaves):
             _, esi = device
             # What the modules of a device map is not in its own elements.
-            if esi.in_dictionary or esi.of_modules:
+            if esi.in_dictionary or esi.of_modules or esi.modules:
                 continue
             bits = [sum(p.bits for p in pdos if p.sm is not None) for pdos in (esi.rx, esi.tx)]
             sizes = tuple(-(-n // 8) for n in bits)
