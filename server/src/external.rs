@@ -25,6 +25,8 @@ const QUEUE: usize = 256;
 const REPORTS_PER_AXIS: usize = 1;
 /// The most cycles between two sets that count.
 const MOST_STEPS: u32 = 1000;
+/// The cycles after which an axis that has caught up follows the set-points themselves.
+const REGULAR: u32 = 10;
 /// Steps at the limit are accepted although they are rounded.
 const ROUNDING: f64 = 1.0 + 1e-9;
 /// The attempts to read a complete set in one cycle.
@@ -158,6 +160,8 @@ pub enum AreaStop {
 /// What the area has done so far, for everybody outside the cycle.
 #[derive(Debug, Default)]
 pub struct AreaCounters {
+    /// Leases that have ended. The axes then follow no client, also if the supervisor is busy.
+    pub leases_ended: AtomicU64,
     /// 1 while memory is attached.
     pub attached: AtomicU64,
     /// Sets that were used.
@@ -222,6 +226,10 @@ struct AreaSource {
     path: Motion,
     /// Catches up after missing set-points or lost frames.
     gear: Option<Gear>,
+    /// Cycles in which the gear was engaged since the last irregular set.
+    regular: u32,
+    /// The last accepted set-point of the axis.
+    commanded: f64,
 }
 
 #[derive(Debug)]
@@ -243,6 +251,7 @@ pub struct External {
     set: Box<[[u64; 2]]>,
     scratch: Box<[[u64; 2]]>,
     counter: u64,
+    leases_ended: u64,
     /// Cycles since the last new set.
     missing: u32,
     /// Cycles, or sets of the client if more, from the set before to the present one.
@@ -300,6 +309,7 @@ pub fn external(
         set: vec![[0; 2]; axes.len()].into(),
         scratch: vec![[0; 2]; axes.len()].into(),
         counter: 0,
+        leases_ended: counters.leases_ended.load(Ordering::Acquire),
         missing: 0,
         steps: 1,
         stale_cycles: machine.server.stale_cycles,
@@ -336,6 +346,12 @@ impl Controller for External {
     fn cycle(&mut self, machine: &mut CycleContext<'_>) {
         if let Some(hold) = self.hold.as_mut().filter(|_| machine.in_op()) {
             hold();
+        }
+        let ended = self.counters.leases_ended.load(Ordering::Acquire);
+        if std::mem::replace(&mut self.leases_ended, ended) != ended {
+            for axis in &mut self.axes {
+                axis.release();
+            }
         }
         self.take_messages(machine);
         let before = self.counter;
@@ -549,6 +565,8 @@ impl External {
             last: Wanted::Nothing,
             path,
             gear: None,
+            regular: 0,
+            commanded: path.position,
         };
         source.apply(axis, wanted, 1, machine)?;
         axis.source = Source::Area(source);
@@ -672,8 +690,10 @@ impl AreaSource {
             Wanted::Position(position) => {
                 let (at, dt_s) = (motion_of(&machine.axis(axis.axis)), machine.dt_s());
                 if steps > 1 {
-                    self.check_after_gap(axis, previous, position, f64::from(steps) * dt_s)?;
                     self.catch_up(axis, at);
+                }
+                if self.gear.is_some() {
+                    self.check_after_gap(axis, previous, position, f64::from(steps) * dt_s)?;
                 }
                 let from = match previous {
                     Wanted::Position(from) => from,
@@ -752,6 +772,7 @@ impl AreaSource {
     }
 
     fn catch_up(&mut self, axis: &FollowedAxis, at: Motion) {
+        self.regular = 0;
         if self.gear.is_none() {
             let config = GearConfig {
                 ratio: 1.0,
@@ -770,18 +791,27 @@ impl AreaSource {
         at: Motion,
         machine: &mut CycleContext<'_>,
     ) -> Result<(), AreaStop> {
+        // Without frames, the axis may not have followed.
+        if at.position != self.commanded {
+            self.catch_up(axis, at);
+        }
         let position = match &mut self.gear {
             None => self.path.position,
             Some(gear) => {
                 let next = gear.advance(self.path, at, machine.dt_s());
-                if gear.engaged() && next.position == self.path.position {
+                self.regular += u32::from(gear.engaged());
+                // The velocity of the set-points is regular again, too.
+                if gear.engaged() && self.regular >= REGULAR {
                     self.gear = None;
                 }
                 next.position
             }
         };
         match machine.set_point(axis.axis, position) {
-            Ok(()) => Ok(()),
+            Ok(()) => {
+                self.commanded = position;
+                Ok(())
+            }
             Err(CommandError::FramesLost) => {
                 self.catch_up(axis, at);
                 Ok(())

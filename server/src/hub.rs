@@ -5,7 +5,7 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::pin::Pin;
-use std::sync::atomic::AtomicU64;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -98,15 +98,12 @@ pub enum Work {
     Detach,
     /// A transfer with a mailbox.
     Transfer(Transfer),
-    /// The bus goes to Init.
-    Leave,
 }
 
 impl Work {
     /// Returns true if nothing may drop it.
     fn stops(&self) -> bool {
-        matches!(self, Self::Leave | Self::Detach)
-            || matches!(self, Self::Request(request) if request.stops())
+        matches!(self, Self::Detach) || matches!(self, Self::Request(request) if request.stops())
     }
 }
 
@@ -340,6 +337,7 @@ impl Hub {
             abandon(inner, ticket, &error);
         }
         stop_all(inner);
+        self.area.leases_ended.fetch_add(1, Ordering::Release);
         self.report_lease(inner, Some(owner), next, why);
         self.work.notify_all();
     }
@@ -482,8 +480,11 @@ impl Hub {
             body.insert("event".to_owned(), json!("bus"));
             body.remove("up_since_ns");
         }
+        // Whoever sees the state also finds its event.
+        let mut inner = self.lock();
+        self.push_event(&mut inner, body);
         self.bus.send_replace(status);
-        self.event(body);
+        drop(inner);
         self.work.notify_all();
     }
 
@@ -492,12 +493,6 @@ impl Hub {
         let mut inner = self.lock();
         inner.wanted_up = up;
         inner.retry_now |= up;
-        if !up {
-            inner.queue.push_back(QueuedWork {
-                ticket: 0,
-                work: Work::Leave,
-            });
-        }
         self.work.notify_all();
     }
 
@@ -510,6 +505,13 @@ impl Hub {
     #[must_use]
     pub fn is_shut_down(&self) -> bool {
         self.lock().shutdown
+    }
+
+    /// Returns true if the bus is to be up.
+    #[must_use]
+    pub fn is_wanted(&self) -> bool {
+        let inner = self.lock();
+        inner.wanted_up && !inner.shutdown
     }
 
     /// Blocks until the bus is to be up. Returns false if the server ends.

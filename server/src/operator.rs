@@ -39,7 +39,6 @@ pub struct ServerOperator {
     new_jogs: Vec<u64>,
     transfers: Vec<(u64, Transfer)>,
     published: Option<Instant>,
-    leaves: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -62,7 +61,6 @@ impl ServerOperator {
             new_jogs: Vec::new(),
             transfers: Vec::new(),
             published: None,
-            leaves: false,
             hub,
         }
     }
@@ -277,7 +275,6 @@ impl ServerOperator {
                 }
                 Work::Transfer(transfer) => self.transfers.push((ticket, transfer)),
                 Work::Detach => self.send(ticket, Message::Detach),
-                Work::Leave => self.leaves = true,
             }
         }
         requests
@@ -367,9 +364,11 @@ impl Operator for ServerOperator {
         self.report_troubles(view);
         self.hub.expire_lease();
         let requests = self.take_work();
-        let gone = self.leaves || self.hub.is_shut_down();
         OperatorInput {
-            presence: if gone { Presence::Gone } else { Presence::Here },
+            presence: match self.hub.is_wanted() {
+                true => Presence::Here,
+                false => Presence::Gone,
+            },
             requests,
         }
     }

@@ -363,11 +363,7 @@ impl RequestController {
         if let Some(hand) = self.hands.get_mut(axis) {
             hand.preempt(doing, axis, out);
             hand.begin(doing, scene.now);
-            let request = std::mem::replace(&mut hand.request, self.number);
-            if request != 0 {
-                self.news
-                    .push_back(RequestEvent::Replaced { request, axis });
-            }
+            hand.replace(axis, self.number, &mut self.news);
             out.push((axis, command));
         }
     }
@@ -393,7 +389,11 @@ impl RequestController {
         let Some(hand) = self.hands.get_mut(axis) else {
             return;
         };
-        hand.request = self.number;
+        if matches!(hand.doing, Activity::Jogging { .. }) {
+            hand.request = self.number;
+        } else {
+            hand.replace(axis, self.number, &mut self.news);
+        }
         if velocity == 0.0 {
             hand.stop(axis, scene.now, out);
             return;
@@ -526,7 +526,8 @@ impl RequestController {
             if other == axis || with_it {
                 hand.preempt(Activity::Resetting, other, out);
                 hand.begin(Activity::Resetting, scene.now);
-                hand.request = if other == axis { self.number } else { 0 };
+                let number = if other == axis { self.number } else { 0 };
+                hand.replace(other, number, &mut self.news);
                 out.push((other, Command::ResetFault));
             }
         }
@@ -534,6 +535,14 @@ impl RequestController {
 }
 
 impl AxisActivity {
+    /// Takes the number of the next request. The present one has no other outcome.
+    fn replace(&mut self, axis: AxisIndex, number: u64, news: &mut Pending) {
+        let request = std::mem::replace(&mut self.request, number);
+        if request != 0 {
+            news.push_back(RequestEvent::Replaced { request, axis });
+        }
+    }
+
     fn begin(&mut self, doing: Activity, now: Nanos) {
         (self.doing, self.since) = (doing, now);
     }
