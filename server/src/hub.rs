@@ -480,7 +480,7 @@ impl Hub {
             body.insert("event".to_owned(), json!("bus"));
             body.remove("up_since_ns");
         }
-        // Whoever sees the state also finds its event.
+        // A client that sees the state also finds its event.
         let mut inner = self.lock();
         self.push_event(&mut inner, body);
         self.bus.send_replace(status);
