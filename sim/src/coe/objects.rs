@@ -44,11 +44,15 @@ pub(crate) struct Dictionary<'a> {
 const MAX_OBJECT_BITS: usize = 64 << 20;
 
 impl Dictionary<'_> {
-    fn find(&self, index: u16, sub: u8) -> Result<(EntryHandle, &Item), Abort> {
+    /// Fails with the abort that a fault script demands.
+    fn check_forced(&self, index: u16, sub: u8) -> Result<(), Abort> {
         let mut forced = self.forced.iter();
-        if let Some((.., code)) = forced.find(|(i, s, _)| (*i, *s) == (index, sub)) {
-            return Err(Abort(*code));
-        }
+        let abort = forced.find(|(i, s, _)| (*i, *s) == (index, sub));
+        abort.map_or(Ok(()), |(.., code)| Err(Abort(*code)))
+    }
+
+    fn find(&self, index: u16, sub: u8) -> Result<(EntryHandle, &Item), Abort> {
+        self.check_forced(index, sub)?;
         let slot = self.store.slot(index, sub);
         slot.and_then(|slot| Some((slot, self.store.item(slot)?)))
             .ok_or(if self.store.has_object(index) {
@@ -85,7 +89,11 @@ impl Dictionary<'_> {
         if ENUMERATIONS.contains(&index) {
             return Err(Abort::VARIABLE_LENGTH);
         }
-        self.find(index, sub)?;
+        self.check_forced(index, sub)?;
+        // Subindex 1 only leaves out subindex 0; the object may begin with a later one.
+        if self.places(index, sub, i64::MAX).next().is_none() {
+            return Err(Abort::NO_SUBINDEX);
+        }
         Ok(self.store.object_code(index) != ObjectCode::Var)
     }
 

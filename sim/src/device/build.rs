@@ -314,6 +314,11 @@ impl SimDevice {
             ignored_writes: Vec::new(),
             mailbox_silent: false,
             sync0_before_safe_op: false,
+            activations: device
+                .dc_modes
+                .iter()
+                .map(|mode| mode.assign_activate.to_be_bytes()[0])
+                .collect(),
         };
         sim.power_on(0);
         Ok(sim)

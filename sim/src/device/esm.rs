@@ -264,8 +264,12 @@ impl SimDevice {
         if self.esc.dc.is_none() || activation & 1 == 0 {
             return Ok(());
         }
+        // Without SYNC0, some devices take the time alone, or SYNC1.
         if activation & 2 == 0 {
-            return Err(code::INVALID_DC_SYNC);
+            return match self.activations.contains(&activation) {
+                true => Ok(()),
+                false => Err(code::INVALID_DC_SYNC),
+            };
         }
         if self.esc.u32_at(reg::DC_SYNC0_CYCLE) == 0 {
             return Err(code::INVALID_SYNC_CYCLE);

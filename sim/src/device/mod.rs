@@ -173,6 +173,8 @@ pub struct SimDevice {
     pub(crate) ignored_writes: Vec<(u16, u8)>,
     mailbox_silent: bool,
     sync0_before_safe_op: bool,
+    /// The values of 0x0981 that the OpModes of the ESI have.
+    activations: Vec<u8>,
 }
 
 impl SimDevice {
