@@ -197,7 +197,7 @@ fn moved(machine: &Machine, datagrams: &[Datagram], axis: u16) -> i32 {
         i32::from_le_bytes(bytes)
     });
     let first = positions.next().expect("cycles");
-    positions.last().expect("cycles") - first
+    positions.next_back().expect("cycles") - first
 }
 
 #[test]
@@ -210,7 +210,7 @@ fn each_unusual_drive_reaches_op_and_moves() {
         let rx: Vec<u16> = selection.rx.iter().map(|pdo| pdo.index).collect();
         assert_eq!(rx, row.rx, "{}", row.device);
         let layout = &selection.layout;
-        let bytes = [layout.rx_bytes(), layout.tx_bytes()].map(|bytes| bytes as usize);
+        let bytes = [layout.rx_bytes(), layout.tx_bytes()];
         assert_eq!(bytes, row.bytes, "{}", row.device);
 
         let summary = run_well(machine.clone(), options);
