@@ -149,6 +149,8 @@ class Card {
         h("div", {}, h("dt", { text: "Largest following error" }), part("largest", "dd", {}))),
       this.#commands(jogPercent));
     this.#part.digits = digits;
+    // Until the first state is there.
+    for (const button of this.#buttons) button.disabled = true;
   }
 
   #commands(jogPercent) {
