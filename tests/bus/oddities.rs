@@ -71,7 +71,10 @@ const ROWS: &[Row] = &[
     // ETG.1000.6, 6.4: the mailbox is enabled before PreOp.
     Row {
         device: "mailbox-disabled",
-        written: &[(0x0806, &[1]), (0x080e, &[1])],
+        written: &[
+            (0x0800, &[0, 0x10, 0x80, 0, 0x26, 0, 1]),
+            (0x0808, &[0x80, 0x10, 0x80, 0, 0x22, 0, 1]),
+        ],
         ..ROW
     },
     Row {
