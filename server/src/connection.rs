@@ -7,7 +7,7 @@ use std::time::Duration;
 use ecaxis_master::samples::Samples;
 use serde_json::{Map, Value, json};
 use tokio::sync::broadcast::error::RecvError;
-use tokio::sync::mpsc;
+use tokio::sync::{Semaphore, mpsc};
 use tokio::time::{Interval, MissedTickBehavior, interval};
 
 use crate::client::{Answer, Client};
@@ -17,6 +17,10 @@ use crate::state;
 
 /// The messages that may wait for a slow reader.
 const OUTGOING: usize = 256;
+/// The requests whose answers may wait: for an outcome, or for a slow reader.
+const WAITING: usize = 256;
+/// With more messages waiting, the client gets no state and no samples. A batch has up to 8 MB.
+const BACKLOG: usize = 4;
 /// The rows of one batch.
 const BATCH: u64 = 4096;
 /// The values of one batch.
@@ -161,6 +165,7 @@ pub struct Connection {
     client: Arc<Client>,
     changes: mpsc::UnboundedSender<Change>,
     outgoing: mpsc::Sender<Outgoing>,
+    waiting: Arc<Semaphore>,
     /// The token, and why commands stay forbidden with it.
     token: Option<(Arc<str>, Option<OpError>)>,
 }
@@ -179,6 +184,7 @@ impl Connection {
             client,
             changes,
             outgoing,
+            waiting: Arc::new(Semaphore::new(WAITING)),
             token,
         };
         (connection, receiver)
@@ -230,11 +236,23 @@ impl Connection {
             let _ = self.outgoing.send(Outgoing::Answer(answer)).await;
             return;
         }
+        let Ok(place) = Arc::clone(&self.waiting).try_acquire_owned() else {
+            let error = OpError::new(ErrorCode::Busy, "too many requests of this client wait")
+                .help("wait for the outcome of earlier ones");
+            let request = Request {
+                op: Err(error),
+                ..request
+            };
+            let answer = self.client.answer(request).await;
+            let _ = self.outgoing.send(Outgoing::Answer(answer)).await;
+            return;
+        };
         // Polled once at once, so that commands keep their order.
         let (client, outgoing) = (Arc::clone(&self.client), self.outgoing.clone());
         let mut work = Box::pin(async move {
             let answer = client.answer(request).await;
             let _ = outgoing.send(Outgoing::Answer(answer)).await;
+            drop(place);
         });
         let first =
             std::future::poll_fn(|context| std::task::Poll::Ready(work.as_mut().poll(context)));
@@ -344,6 +362,9 @@ async fn publish(
                 _ => continue,
             },
             () = tick(&mut states) => {
+                if outgoing.max_capacity() - outgoing.capacity() > BACKLOG {
+                    continue;
+                }
                 let mut object = match state::state(&hub) {
                     Value::Object(object) => object,
                     _ => Map::new(),
@@ -353,6 +374,9 @@ async fn publish(
             }
             () = tick(&mut samples) => {
                 let Some(subscription) = &mut samples else { continue };
+                if outgoing.max_capacity() - outgoing.capacity() > BACKLOG {
+                    continue;
+                }
                 let columns = subscription.words.len().max(1) as u64;
                 let rows = (BATCH_VALUES / columns).clamp(1, BATCH);
                 let batch = Batch::read(

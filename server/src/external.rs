@@ -18,7 +18,7 @@ use ecaxis_master::sys::shared_memory::SharedMemory;
 /// The number of points that a stream keeps.
 pub const STREAM_POINTS: usize = 256;
 /// The messages handled in one cycle.
-const MESSAGES_PER_CYCLE: usize = 16;
+pub const MESSAGES_PER_CYCLE: usize = 64;
 /// The capacity of the queues. A report has room if its message was taken.
 const QUEUE: usize = 256;
 /// The reports that one cycle may write besides the answers to messages, for each axis.
@@ -212,15 +212,15 @@ enum Source {
     Nothing {
         blocked: bool,
     },
-    Area(AreaSource),
-    Stream {
-        motion: Motion,
-    },
+    Area(Follower),
+    /// `path` is the motion of the stream.
+    Stream(Follower),
 }
 
-/// An axis that follows the cyclic area.
+/// An axis that follows set-points of a client.
 #[derive(Debug, Clone, Copy)]
-struct AreaSource {
+struct Follower {
+    /// The last set-point of the cyclic area.
     last: Wanted,
     /// The set-points of the client: the last position and its velocity.
     path: Motion,
@@ -270,6 +270,14 @@ pub type Hold = Box<dyn FnMut() + Send>;
 pub struct ExternalClient {
     pub messages: rtrb::Producer<Message>,
     pub reports: rtrb::Consumer<Report>,
+}
+
+impl ExternalClient {
+    /// Returns the number of messages that the cycle has not taken yet.
+    #[must_use]
+    pub fn waiting(&self) -> usize {
+        QUEUE - self.messages.slots()
+    }
 }
 
 /// Creates the controller of a run and its ends outside. In virtual time, `hold` blocks each cycle
@@ -349,9 +357,7 @@ impl Controller for External {
         }
         let ended = self.counters.leases_ended.load(Ordering::Acquire);
         if std::mem::replace(&mut self.leases_ended, ended) != ended {
-            for axis in &mut self.axes {
-                axis.release();
-            }
+            self.end_lease(machine);
         }
         self.take_messages(machine);
         let before = self.counter;
@@ -365,8 +371,8 @@ impl Controller for External {
         let (mut follows, mut blocked, mut refused) = (false, 0_u64, 0_u64);
         for index in 0..self.axes.len() {
             let stop = match self.axes[index].source {
-                Source::Stream { motion } => {
-                    self.follow_stream(index, motion, machine);
+                Source::Stream(follower) => {
+                    self.follow_stream(index, follower, machine);
                     continue;
                 }
                 Source::Area(_) => {
@@ -391,6 +397,21 @@ impl Controller for External {
 }
 
 impl External {
+    /// The axes follow no client, and no memory is in use.
+    fn end_lease(&mut self, machine: &mut CycleContext<'_>) {
+        for axis in &mut self.axes {
+            if let Source::Area(_) = axis.source {
+                // A velocity or torque would go on.
+                let _ = machine.command(axis.axis, Command::Stop);
+            }
+            axis.release();
+        }
+        // The report of each message has its own room.
+        if self.reports.slots() > self.axes.len() * REPORTS_PER_AXIS {
+            self.exchange(None, machine);
+        }
+    }
+
     fn take_messages(&mut self, machine: &mut CycleContext<'_>) {
         for _ in 0..MESSAGES_PER_CYCLE {
             // Each message has at most one report.
@@ -413,11 +434,11 @@ impl External {
                 }
                 Message::Attach(memory) => {
                     self.counters.attached.store(1, Ordering::Relaxed);
-                    self.exchange(Some(memory));
+                    self.exchange(Some(memory), machine);
                 }
                 Message::Detach => {
                     self.counters.attached.store(0, Ordering::Relaxed);
-                    self.exchange(None);
+                    self.exchange(None, machine);
                 }
                 Message::Open {
                     ticket,
@@ -441,15 +462,20 @@ impl External {
         }
     }
 
-    fn exchange(&mut self, memory: Option<Arc<SharedMemory>>) {
+    fn exchange(&mut self, memory: Option<Arc<SharedMemory>>, machine: &mut CycleContext<'_>) {
         let old = std::mem::replace(&mut self.memory, memory);
         // A set of the previous client is not one of the next.
         self.set.fill([0; 2]);
         self.counter = 0;
         for axis in &mut self.axes {
-            if !matches!(axis.source, Source::Stream { .. }) {
-                axis.source = Source::Nothing { blocked: false };
+            match axis.source {
+                Source::Stream(_) => continue,
+                Source::Area(_) => {
+                    let _ = machine.command(axis.axis, Command::Stop);
+                }
+                Source::Nothing { .. } => {}
             }
+            axis.source = Source::Nothing { blocked: false };
         }
         if let Some(old) = old {
             let _ = self.reports.push(Report::Detached(old));
@@ -477,7 +503,7 @@ impl External {
             ..config
         };
         axis.stream = Some(Stream::new(config, motion)?);
-        axis.source = Source::Stream { motion };
+        axis.source = Source::Stream(Follower::new(motion));
         Ok(())
     }
 
@@ -561,13 +587,7 @@ impl External {
             return Err(AreaStop::NotReady);
         }
         let path = motion_of(&status);
-        let mut source = AreaSource {
-            last: Wanted::Nothing,
-            path,
-            gear: None,
-            regular: 0,
-            commanded: path.position,
-        };
+        let mut source = Follower::new(path);
         source.apply(axis, wanted, 1, machine)?;
         axis.source = Source::Area(source);
         Ok(())
@@ -613,23 +633,33 @@ impl External {
         result
     }
 
-    fn follow_stream(&mut self, index: usize, motion: Motion, machine: &mut CycleContext<'_>) {
+    fn follow_stream(
+        &mut self,
+        index: usize,
+        mut follower: Follower,
+        machine: &mut CycleContext<'_>,
+    ) {
         let axis = &mut self.axes[index];
         let Some(stream) = &mut axis.stream else {
             axis.source = Source::Nothing { blocked: true };
             return;
         };
-        let next = stream.advance(motion, machine.dt_s());
+        let next = stream.advance(follower.path, machine.dt_s());
         let end = match stream.state() {
             StreamState::Underrun => Some(StreamEnd::Underrun),
-            _ if stream.finished(next) => Some(StreamEnd::Done),
+            _ if stream.finished(next) && follower.gear.is_none() => Some(StreamEnd::Done),
             _ => None,
         };
         let torque = stream.torque();
-        let refused = machine.set_point(axis.axis, next.position).err();
+        follower.path = next;
+        let at = motion_of(&machine.axis(axis.axis));
+        let refused = match follower.follow(axis, at, machine) {
+            Err(AreaStop::Refused(error)) => Some(StreamEnd::Refused(error)),
+            _ => None,
+        };
         machine.set_torque_feedforward(axis.axis, torque);
-        let end = refused.map(StreamEnd::Refused).or(end);
-        axis.source = Source::Stream { motion: next };
+        let end = refused.or(end);
+        axis.source = Source::Stream(follower);
         if let Some(end) = end {
             // Without a set-point the axis decelerates and holds.
             axis.release();
@@ -675,7 +705,17 @@ impl FollowedAxis {
     }
 }
 
-impl AreaSource {
+impl Follower {
+    fn new(path: Motion) -> Self {
+        Self {
+            last: Wanted::Nothing,
+            path,
+            gear: None,
+            regular: 0,
+            commanded: path.position,
+        }
+    }
+
     /// Gives the axis a new set-point of the client, `steps` cycles after the one before.
     fn apply(
         &mut self,

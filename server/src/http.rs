@@ -532,36 +532,41 @@ async fn serve_websocket(
     hub.event(json!({"event": "client", "client": id, "connected": true}));
     let (connection, mut outgoing) = Connection::start(Arc::clone(&client), token);
     let (mut sink, mut stream) = socket.split();
-    let mut ping = tokio::time::interval(PING);
-    loop {
-        tokio::select! {
-            message = stream.next() => match message {
+    let read = async {
+        loop {
+            match stream.next().await {
                 Some(Ok(Message::Text(text))) => connection.take(text.as_bytes()).await,
                 Some(Ok(Message::Binary(_))) => {
                     let error = OpError::new(ErrorCode::BadRequest, "requests are text frames");
                     connection.refuse(error).await;
                 }
                 Some(Ok(Message::Ping(_) | Message::Pong(_))) => {}
-                Some(Ok(Message::Close(_)) | Err(_)) | None => break,
-            },
-            message = outgoing.recv() => {
-                let frame = match message {
+                Some(Ok(Message::Close(_)) | Err(_)) | None => return,
+            }
+        }
+    };
+    let write = async {
+        let mut ping = tokio::time::interval(PING);
+        loop {
+            let frame = tokio::select! {
+                message = outgoing.recv() => match message {
                     Some(Outgoing::Answer(Answer { body, .. }) | Outgoing::Object(body)) => {
                         Message::Text(serde_json::to_string(&body).unwrap_or_default().into())
                     }
                     Some(Outgoing::Samples(batch)) => Message::Binary(batch.frame().into()),
-                    None => break,
-                };
-                if sink.send(frame).await.is_err() {
-                    break;
-                }
-            }
-            _ = ping.tick() => {
-                if sink.send(Message::Ping(Bytes::new())).await.is_err() {
-                    break;
-                }
+                    None => return,
+                },
+                _ = ping.tick() => Message::Ping(Bytes::new()),
+            };
+            if sink.send(frame).await.is_err() {
+                return;
             }
         }
+    };
+    // Apart, so that a reader whose answers wait does not wait for itself.
+    tokio::select! {
+        () = read => {}
+        () = write => {}
     }
     drop(connection);
     client.leave();

@@ -105,6 +105,10 @@ impl Work {
     fn stops(&self) -> bool {
         matches!(self, Self::Detach) || matches!(self, Self::Request(request) if request.stops())
     }
+
+    fn is_emergency(&self) -> bool {
+        matches!(self, Self::Request(Request::EmergencyStop))
+    }
 }
 
 #[derive(Debug)]
@@ -126,6 +130,8 @@ struct PendingCommand {
     reply: Option<oneshot::Sender<Outcome>>,
     /// The client waits for the outcome.
     waits: bool,
+    /// The command needs the lease, and ends with it.
+    owned: bool,
 }
 
 impl PendingCommand {
@@ -296,6 +302,10 @@ impl Hub {
         let owner = Owner { client, name };
         let ttl = (!self.options.virtual_time).then_some(ttl);
         let mut inner = self.lock();
+        // The machine may be down, so that nothing else ends the lease of a silent owner.
+        if let Some(owner) = inner.lease.expire(Instant::now()) {
+            self.end_lease(&mut inner, &owner, None, "expired");
+        }
         let previous = inner
             .lease
             .take(owner.clone(), ttl, force, Instant::now())?;
@@ -329,14 +339,14 @@ impl Hub {
 
     /// Stops everything that the owner moved, before any command of the next owner.
     fn end_lease(&self, inner: &mut Inner, owner: &Owner, next: Option<&Owner>, why: &str) {
-        inner.queue.clear();
         let message = format!("`{}` no longer owns the motion: {why}", owner.name);
         let error = OpError::new(ErrorCode::Replaced, message);
-        let all: Vec<u64> = inner.pending.keys().copied().collect();
-        for ticket in all {
+        stop_all(inner, &error);
+        let owned = inner.pending.iter().filter(|(_, pending)| pending.owned);
+        let owned: Vec<u64> = owned.map(|(ticket, _)| *ticket).collect();
+        for ticket in owned {
             abandon(inner, ticket, &error);
         }
-        stop_all(inner);
         self.area.leases_ended.fetch_add(1, Ordering::Release);
         self.report_lease(inner, Some(owner), next, why);
         self.work.notify_all();
@@ -391,7 +401,11 @@ impl Hub {
             return Err(OpError::new(ErrorCode::NotUp, message)
                 .help("wait for it with `await`, or bring it up with `bus`"));
         }
-        if inner.queue.len() + parts.len() > QUEUE && !parts.iter().all(Work::stops) {
+        let capacity = match parts.iter().all(Work::stops) {
+            true => 2 * QUEUE,
+            false => QUEUE,
+        };
+        if inner.queue.len() + parts.len() > capacity {
             let error = OpError::new(ErrorCode::Busy, "too many commands wait");
             return Err(error.help("wait for the outcome of earlier commands"));
         }
@@ -403,6 +417,7 @@ impl Hub {
             failure: None,
             reply: Some(reply),
             waits,
+            owned: client.is_some(),
         };
         inner.pending.insert(ticket, pending);
         let parts = parts.into_iter().map(|work| QueuedWork { ticket, work });
@@ -414,13 +429,9 @@ impl Hub {
     /// Stops everything at once, before all commands that wait.
     pub fn stop_everything(&self, emergency: bool) {
         let mut inner = self.lock();
-        let waiting: Vec<u64> = inner.queue.drain(..).map(|queued| queued.ticket).collect();
         let error = OpError::new(ErrorCode::Replaced, "all axes were stopped");
-        for ticket in waiting {
-            abandon(&mut inner, ticket, &error);
-        }
-        stop_all(&mut inner);
-        if emergency {
+        stop_all(&mut inner, &error);
+        if emergency && !inner.queue.iter().any(|queued| queued.work.is_emergency()) {
             inner.queue.push_back(QueuedWork {
                 ticket: 0,
                 work: Work::Request(Request::EmergencyStop),
@@ -434,11 +445,22 @@ impl Hub {
         finish(&mut self.lock(), ticket, outcome);
     }
 
-    /// Takes up to `count` pieces of work, in order.
-    pub fn take_work(&self, count: usize) -> Vec<QueuedWork> {
+    /// Takes up to `count` pieces of work, in order. Takes at most `room` of those that do not stop,
+    /// and one set of points: the cycle checks each point.
+    pub fn take_work(&self, count: usize, room: usize) -> Vec<QueuedWork> {
         let mut inner = self.lock();
-        let count = count.min(inner.queue.len());
-        inner.queue.drain(..count).collect()
+        let (mut left, mut points) = (room, false);
+        let taken = inner.queue.iter().take(count).take_while(|queued| {
+            if queued.work.stops() {
+                return true;
+            }
+            let more = left > 0 && !points;
+            left = left.saturating_sub(1);
+            points |= matches!(queued.work, Work::Push { .. });
+            more
+        });
+        let taken = taken.count();
+        inner.queue.drain(..taken).collect()
     }
 
     /// Ends all commands: the bus has left Op.
@@ -753,15 +775,28 @@ fn abandon(inner: &mut Inner, ticket: u64, error: &OpError) {
     finish(inner, ticket, Err(error.clone()));
 }
 
-/// Queues the stop of everything that clients moved.
-fn stop_all(inner: &mut Inner) {
+/// Queues the stop of everything that clients moved. Commands of the owner that wait end with the
+/// error. Those that need no lease stay behind the stop: one of them may ask for more than a stop.
+fn stop_all(inner: &mut Inner, error: &OpError) {
+    for queued in std::mem::take(&mut inner.queue) {
+        let pending = inner.pending.get(&queued.ticket);
+        let stays = match pending {
+            Some(pending) => !pending.owned,
+            None => queued.work.is_emergency(),
+        };
+        match stays {
+            true => inner.queue.push_back(queued),
+            false => abandon(inner, queued.ticket, error),
+        }
+    }
     let stops = [
         Work::Detach,
         Work::Request(Request::Program(ProgramRequest::Stop)),
         Work::Request(Request::StopAll),
     ];
-    let stops = stops.map(|work| QueuedWork { ticket: 0, work });
-    inner.queue.extend(stops);
+    for work in stops.into_iter().rev() {
+        inner.queue.push_front(QueuedWork { ticket: 0, work });
+    }
 }
 
 impl std::fmt::Debug for Hub {

@@ -14,7 +14,7 @@ use ecaxis_master::supervise::operator::{
 use serde_json::{Map, Value, json};
 
 use crate::error::{ErrorCode, OpError};
-use crate::external::{AreaStop, ExternalClient, Message, Report, StreamEnd};
+use crate::external::{AreaStop, ExternalClient, MESSAGES_PER_CYCLE, Message, Report, StreamEnd};
 use crate::hub::{Hub, Latest, QueuedWork, RunningStep, Transfer, Work};
 
 /// The pieces of work that one call takes; the machine accepts 64 requests.
@@ -245,7 +245,9 @@ impl ServerOperator {
 
     fn take_work(&mut self) -> Vec<Request> {
         let mut requests = Vec::new();
-        for QueuedWork { ticket, work } in self.hub.take_work(WORK_PER_CALL) {
+        // The rest of the queue is for stops.
+        let room = MESSAGES_PER_CYCLE.saturating_sub(self.cycle.waiting());
+        for QueuedWork { ticket, work } in self.hub.take_work(WORK_PER_CALL, room) {
             match work {
                 Work::Request(request) => {
                     self.release(&request);
@@ -291,7 +293,7 @@ impl ServerOperator {
     }
 
     fn send(&mut self, ticket: u64, message: Message) {
-        // The cycle takes 16 messages each time, so there is room unless it stands still.
+        // There is room unless the cycle stands still.
         if self.cycle.messages.push(message).is_err() {
             let error = OpError::new(ErrorCode::Busy, "the cycle takes no more messages");
             self.hub.finish(ticket, Err(error));
@@ -318,7 +320,10 @@ impl ServerOperator {
             Request::Jog { axis, .. } => {
                 if let Some(last) = self.jogs.get_mut(axis) {
                     let last = std::mem::replace(last, self.requests);
-                    self.commands.remove(&last);
+                    if let Some(command) = self.commands.remove(&last) {
+                        // Another jog of the same call.
+                        self.hub.finish(command.ticket, Ok(Map::new()));
+                    }
                 }
                 self.new_jogs.push(self.requests);
             }

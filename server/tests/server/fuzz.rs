@@ -8,17 +8,17 @@ use serde_json::{Value, json};
 use crate::harness::{Server, demo};
 
 /// A small generator with a fixed seed (xorshift64).
-struct Random(u64);
+pub struct Random(pub u64);
 
 impl Random {
-    fn next(&mut self) -> u64 {
+    pub fn next(&mut self) -> u64 {
         self.0 ^= self.0 << 13;
         self.0 ^= self.0 >> 7;
         self.0 ^= self.0 << 17;
         self.0
     }
 
-    fn below(&mut self, n: usize) -> usize {
+    pub fn below(&mut self, n: usize) -> usize {
         usize::try_from(self.next() % n as u64).unwrap()
     }
 }
@@ -62,7 +62,7 @@ const PARTS: &[&str] = &[
     ":",
 ];
 
-fn mutated(random: &mut Random) -> Vec<u8> {
+pub fn mutated(random: &mut Random) -> Vec<u8> {
     let mut line = LINES[random.below(LINES.len())].as_bytes().to_vec();
     match random.below(6) {
         0 => {}

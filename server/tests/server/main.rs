@@ -5,6 +5,7 @@ mod commands;
 mod faults;
 mod fuzz;
 mod harness;
+mod hostile;
 mod http;
 mod lease;
 mod streams;
