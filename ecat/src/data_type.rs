@@ -1,4 +1,13 @@
 //! Data types of objects: converts the names of ESI files and the codes of SDO Information.
+//!
+//! ```
+//! use ecaxis_ecat::data_type::{DataType, Kind};
+//!
+//! let position = DataType::named("DINT", 0).expect("a base type");
+//! assert_eq!((position.kind, position.bits), (Kind::Signed, 32));
+//! assert_eq!(DataType::coded(0x0004, 32), position);
+//! assert_eq!(position.show(&[0xfe, 0xff, 0xff, 0xff]), "-2");
+//! ```
 
 use core::fmt;
 
@@ -30,7 +39,7 @@ pub struct DataType {
 
 /// Base types with their codes (ETG.1020, "Base Data Types"). The first of several names is the one
 /// shown.
-const BASE: [(&str, u16, Kind, u32); 44] = [
+const BASE: [(&str, u16, Kind, u32); 52] = [
     ("BOOL", 0x0001, Kind::Unsigned, 1),
     ("USINT", 0x0005, Kind::Unsigned, 8),
     ("UINT", 0x0006, Kind::Unsigned, 16),
@@ -53,8 +62,8 @@ const BASE: [(&str, u16, Kind, u32); 44] = [
     ("STRING", 0x0009, Kind::Text, 0),
     ("UNICODE_STRING", 0x000b, Kind::Unicode, 0),
     ("OCTET_STRING", 0x000a, Kind::Bytes, 0),
-    // Aliases, and the short names of machine files.
-    ("BIT", 0x0030, Kind::Unsigned, 1),
+    // Aliases, the names of CiA 301, and the short names of machine files.
+    ("BIT", 0x0001, Kind::Unsigned, 1),
     ("BYTE", 0x001e, Kind::Unsigned, 8),
     ("WORD", 0x001f, Kind::Unsigned, 16),
     ("DWORD", 0x0020, Kind::Unsigned, 32),
@@ -62,8 +71,16 @@ const BASE: [(&str, u16, Kind, u32); 44] = [
     ("BITARR8", 0x002d, Kind::Unsigned, 8),
     ("BITARR16", 0x002e, Kind::Unsigned, 16),
     ("BITARR32", 0x002f, Kind::Unsigned, 32),
-    ("VISIBLE_STRING", 0, Kind::Text, 0),
+    ("VISIBLE_STRING", 0x0009, Kind::Text, 0),
     ("ARRAY", 0, Kind::Bytes, 0),
+    ("UNSIGNED8", 0, Kind::Unsigned, 8),
+    ("UNSIGNED16", 0, Kind::Unsigned, 16),
+    ("UNSIGNED32", 0, Kind::Unsigned, 32),
+    ("UNSIGNED64", 0, Kind::Unsigned, 64),
+    ("INTEGER8", 0, Kind::Signed, 8),
+    ("INTEGER16", 0, Kind::Signed, 16),
+    ("INTEGER32", 0, Kind::Signed, 32),
+    ("INTEGER64", 0, Kind::Signed, 64),
     ("U8", 0, Kind::Unsigned, 8),
     ("U16", 0, Kind::Unsigned, 16),
     ("U32", 0, Kind::Unsigned, 32),
@@ -92,12 +109,8 @@ impl DataType {
     /// length, 0 if unknown. `None` if neither determines the type.
     #[must_use]
     pub fn named(name: &str, bits: u32) -> Option<Self> {
-        let upper = name.trim().to_ascii_uppercase();
-        let (stem, rest) = match upper.find(['(', '[', ' ']) {
-            Some(at) => upper.split_at(at),
-            None => (upper.as_str(), ""),
-        };
-        if let Some((.., kind, own)) = BASE.iter().find(|(known, ..)| *known == stem) {
+        let (stem, rest) = split(name);
+        if let Some((.., kind, own)) = base(stem) {
             let reported = match kind {
                 Kind::Text | Kind::Unicode | Kind::Bytes => length(rest).map(|n| match kind {
                     Kind::Unicode => n.saturating_mul(16),
@@ -114,9 +127,8 @@ impl DataType {
                 },
             });
         }
-        let of_bits = stem.strip_prefix("BIT").and_then(|n| n.parse().ok());
-        match of_bits {
-            Some(n @ 1..=16) => Some(Self {
+        match bit_field(stem) {
+            Some(n) => Some(Self {
                 kind: Kind::Unsigned,
                 bits: n,
             }),
@@ -166,6 +178,35 @@ impl DataType {
     }
 }
 
+/// Returns the code of a base type in SDO Information and in the EEPROM, or 0 for other names.
+#[must_use]
+pub fn code(name: &str) -> u16 {
+    let (stem, _) = split(name);
+    match (base(stem), bit_field(stem)) {
+        (Some((_, code, ..)), _) => *code,
+        (None, Some(bits @ 1..=16)) => BITS + bits as u16,
+        _ => 0,
+    }
+}
+
+fn base(stem: &str) -> Option<&'static (&'static str, u16, Kind, u32)> {
+    BASE.iter()
+        .find(|(known, ..)| known.eq_ignore_ascii_case(stem))
+}
+
+/// Splits `STRING(12)` and `ARRAY [0..9] OF BYTE` after the name.
+fn split(name: &str) -> (&str, &str) {
+    let name = name.trim();
+    name.split_at(name.find(['(', '[', ' ']).unwrap_or(name.len()))
+}
+
+/// Returns the length of `BIT12`.
+fn bit_field(stem: &str) -> Option<u32> {
+    let (bit, number) = stem.split_at_checked(3)?;
+    let bits = number.parse().ok()?;
+    (bit.eq_ignore_ascii_case("BIT") && (1..=64).contains(&bits)).then_some(bits)
+}
+
 /// Parses the number in `(12)`.
 fn length(text: &str) -> Option<u32> {
     text.strip_prefix('(')?
@@ -211,6 +252,7 @@ mod tests {
             assert_eq!(named(&name.to_lowercase(), bits), named(name, bits));
             if code != 0 {
                 assert_eq!(DataType::coded(code, bits), named(name, bits), "{name}");
+                assert_eq!(super::code(name), code, "{name}");
             }
         }
         for bits in 1..=16 {
@@ -218,6 +260,25 @@ mod tests {
                 DataType::coded(0x2f + bits, u32::from(bits)).bits,
                 u32::from(bits)
             );
+        }
+    }
+
+    #[test]
+    fn codes_of_names_outside_the_table() {
+        // ETG.1020, "Base Data Types": BIT1 is 0x0030, BIT16 is 0x003f.
+        for (name, expected) in [
+            ("BIT1", 0x0030),
+            ("BIT8", 0x0037),
+            ("BIT16", 0x003f),
+            ("BIT17", 0),
+            ("STRING(12)", 0x0009),
+            ("int48", 0x0013),
+            ("ARRAY [0..9] OF BYTE", 0),
+            ("DT1234", 0),
+            ("", 0),
+            ("µm", 0),
+        ] {
+            assert_eq!(code(name), expected, "{name}");
         }
     }
 

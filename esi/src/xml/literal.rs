@@ -1,5 +1,7 @@
 //! Default, minimum and maximum literals → little-endian bytes of the object's length.
 
+use ecaxis_ecat::data_type::{DataType, Kind};
+
 use super::number::{boolean, hex_bytes, hex_start, number};
 use super::object::Literal;
 use crate::model::Bytes;
@@ -11,12 +13,13 @@ pub(super) fn bytes(
     bit_len: u32,
 ) -> Result<Option<Bytes>, String> {
     let length = usize::try_from(bit_len.div_ceil(8)).unwrap_or(0);
+    let data_type = DataType::named(type_name, bit_len).unwrap_or(DataType::BYTES);
     match literal {
         Literal::Value(text) | Literal::Data(text) if text.is_empty() => Ok(None),
-        Literal::Value(text) if is_text(type_name) => {
+        Literal::Value(text) if data_type.kind == Kind::Text => {
             Ok(Some(Bytes::fitted(text.as_bytes(), length)))
         }
-        Literal::Value(text) => value(text, type_name, bit_len, length).map(Some),
+        Literal::Value(text) => value(text, data_type, bit_len, length).map(Some),
         Literal::Data(text) => match data(text, length) {
             Some(data) => Ok(Some(data)),
             None => Err(format!(
@@ -46,53 +49,19 @@ pub(super) fn slice(block: &[u8], bit_offset: u32, bit_len: u32) -> Option<Bytes
     Some(out.into())
 }
 
-/// Returns the bit length of an ETG.1020 base type, or 0 for other names.
+/// Returns the bit length of a base type, or 0 for other names.
 pub(super) fn base_bits(type_name: &str) -> u32 {
-    match type_name {
-        "BOOL" | "BIT" | "BIT1" => 1,
-        "SINT" | "USINT" | "BYTE" | "BITARR8" => 8,
-        "INT" | "UINT" | "WORD" | "BITARR16" => 16,
-        "INT24" | "UINT24" => 24,
-        "DINT" | "UDINT" | "DWORD" | "REAL" | "BITARR32" => 32,
-        "INT40" | "UINT40" => 40,
-        "INT48" | "UINT48" => 48,
-        "INT56" | "UINT56" => 56,
-        "LINT" | "ULINT" | "LWORD" | "LREAL" => 64,
-        _ => {
-            let bits = type_name
-                .strip_prefix("BIT")
-                .and_then(|n| n.parse::<u32>().ok())
-                .filter(|n| *n <= 64);
-            let text = type_name
-                .strip_prefix("STRING(")
-                .and_then(|rest| rest.strip_suffix(')'))
-                .and_then(|n| n.trim().parse::<u32>().ok())
-                .and_then(|n| n.checked_mul(8));
-            bits.or(text).unwrap_or(0)
-        }
-    }
+    DataType::named(type_name, 0).map_or(0, |data_type| data_type.bits)
 }
 
-fn is_text(type_name: &str) -> bool {
-    type_name.starts_with("STRING") || type_name.starts_with("VISIBLE_STRING")
-}
-
-fn value(text: &str, type_name: &str, bit_len: u32, length: usize) -> Result<Bytes, String> {
-    let decimal = !text.contains(['x', 'X']);
-    match type_name {
-        "REAL" if decimal => {
-            return text
-                .parse::<f32>()
-                .map(|v| Bytes::fitted(&v.to_le_bytes(), length))
-                .map_err(|_| not_a_number(text));
-        }
-        "LREAL" if decimal => {
-            return text
-                .parse::<f64>()
-                .map(|v| Bytes::fitted(&v.to_le_bytes(), length))
-                .map_err(|_| not_a_number(text));
-        }
-        _ => {}
+fn value(text: &str, data_type: DataType, bit_len: u32, length: usize) -> Result<Bytes, String> {
+    if data_type.kind == Kind::Real && !text.contains(['x', 'X']) {
+        let bytes = match data_type.bits {
+            32 => text.parse::<f32>().map(|v| v.to_le_bytes().to_vec()),
+            _ => text.parse::<f64>().map(|v| v.to_le_bytes().to_vec()),
+        };
+        let bytes = bytes.map_err(|_| not_a_number(text))?;
+        return Ok(Bytes::fitted(&bytes, length));
     }
     let value = number(text)
         .or_else(|| boolean(text).map(i128::from))

@@ -184,7 +184,7 @@ fn variable<'t, 'a>(
 ) -> UnresolvedItem<'t, 'a> {
     let type_name = types.base(&raw.type_name);
     let typed = data_type.map_or(0, |t| t.bit_size);
-    let bit_len = first_non_zero([raw.bit_size, typed, literal::base_bits(type_name)]);
+    let bit_len = bits_of([raw.bit_size, typed], type_name);
     UnresolvedItem {
         sub: 0,
         name: Cow::Borrowed(&raw.name),
@@ -214,7 +214,7 @@ fn record_items<'t, 'a>(
         };
         last = Some((&item.type_name, (sub_type, base)));
         let typed = sub_type.map_or(0, |t| t.bit_size);
-        let bits = first_non_zero([item.bit_size, typed, literal::base_bits(base)]);
+        let bits = bits_of([item.bit_size, typed], base);
         let offset = item.bit_offset.unwrap_or(running);
         let last_slot = memory.slots.last();
         let next_sub = last_slot.map_or(0, |slot| slot.sub.saturating_add(1));
@@ -234,7 +234,10 @@ fn record_items<'t, 'a>(
                     c.warn_at(position, dictionary, message);
                 }
                 let share = bits.checked_div(array.elements).unwrap_or(0);
-                let bits = first_non_zero([literal::base_bits(element), share, 0]);
+                let bits = match literal::base_bits(element) {
+                    0 => share,
+                    bits => bits,
+                };
                 for number in 0..elements {
                     let Ok(sub) = u8::try_from(array.lower_bound.saturating_add(number)) else {
                         break;
@@ -319,6 +322,8 @@ fn access(item: Option<Access>, object: Option<Access>) -> Access {
     }
 }
 
-fn first_non_zero(candidates: [u32; 3]) -> u32 {
-    candidates.into_iter().find(|&bits| bits != 0).unwrap_or(0)
+/// Returns the first length that is not 0, or that of the base type.
+fn bits_of(written: [u32; 2], type_name: &str) -> u32 {
+    let bits = written.into_iter().find(|&bits| bits != 0);
+    bits.unwrap_or_else(|| literal::base_bits(type_name))
 }

@@ -1,5 +1,6 @@
 //! Process data by name: the bits of a device that a step reads or sets.
 
+use ecaxis_ecat::data_type::{DataType, Kind};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_esi as esi;
 use ecaxis_esi::layout::Field;
@@ -25,10 +26,10 @@ pub struct Signal {
 impl Signal {
     #[must_use]
     pub fn kind(&self) -> NumericFormat {
-        match self.field.data_type.as_str() {
-            "REAL" if self.field.bit_len == 32 => NumericFormat::Real,
-            "SINT" | "INT" | "INT24" | "DINT" | "INT40" | "INT48" | "INT56" | "LINT"
-            | "INTEGER8" | "INTEGER16" | "INTEGER32" | "INTEGER64" => NumericFormat::Signed,
+        let bits = u32::from(self.field.bit_len);
+        match DataType::named(&self.field.data_type, bits).map(|known| (known.kind, known.bits)) {
+            Some((Kind::Real, 32)) if bits == 32 => NumericFormat::Real,
+            Some((Kind::Signed, _)) => NumericFormat::Signed,
             _ => NumericFormat::Unsigned,
         }
     }

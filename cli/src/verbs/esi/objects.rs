@@ -1,5 +1,6 @@
 //! `ecaxis esi objects`: shows the object dictionary of a device.
 
+use ecaxis_ecat::data_type::{DataType, Kind};
 use ecaxis_esi::{
     Dictionary, Mode, ObjectItem, PdoMapping, SelectOptions, Writable, address, select,
 };
@@ -142,32 +143,27 @@ fn mapping(mapping: PdoMapping) -> &'static str {
 
 /// Formats numbers by type, text as text, everything else as bytes.
 fn value(type_name: &str, bytes: &[u8]) -> String {
-    if type_name.contains("STRING") && !type_name.contains("OCTET") {
-        let text = String::from_utf8_lossy(bytes);
-        return format!("{:?}", text.trim_end_matches('\0'));
-    }
-    let signed = matches!(type_name, "SINT" | "INT" | "DINT" | "LINT");
-    let float = type_name == "REAL";
-    let mut wide = [0_u8; 8];
-    match (bytes.len(), wide.get_mut(..bytes.len())) {
-        (1..=8, Some(low)) => low.copy_from_slice(bytes),
+    let bits = u32::try_from(8 * bytes.len()).unwrap_or(u32::MAX);
+    let data_type = DataType::named(type_name, bits).unwrap_or(DataType::BYTES);
+    match data_type.kind {
+        Kind::Text | Kind::Unicode => data_type.show(bytes),
+        Kind::Signed | Kind::Real if data_type.width() == Some(bytes.len()) => {
+            data_type.show(bytes)
+        }
+        Kind::Unsigned if (1..=8).contains(&bytes.len()) => {
+            let number = bytes
+                .iter()
+                .rev()
+                .fold(0, |n, &byte| n << 8 | u64::from(byte));
+            match number {
+                0..=0xffff => number.to_string(),
+                _ => format!("0x{number:x}"),
+            }
+        }
         _ => {
             let more = if bytes.len() > 8 { " …" } else { "" };
-            return hex_bytes(bytes.iter().take(8), " ") + more;
+            hex_bytes(bytes.iter().take(8), " ") + more
         }
-    }
-    let raw = u64::from_le_bytes(wide);
-    if float {
-        return f32::from_bits(raw as u32).to_string();
-    }
-    if signed {
-        let unused = 64 - 8 * bytes.len() as u32;
-        return (raw.cast_signed() << unused >> unused).to_string();
-    }
-    if raw > 0xffff {
-        format!("0x{raw:x}")
-    } else {
-        raw.to_string()
     }
 }
 
@@ -182,7 +178,14 @@ mod tests {
             ("SINT", &[0xfd], "-3"),
             ("DINT", &[0xfe, 0xff, 0xff, 0xff], "-2"),
             ("UDINT", &[0, 0, 1, 0], "0x10000"),
+            // 24 to 56 bits: ETG.1020, "Base Data Types".
+            ("INT24", &[0xfe, 0xff, 0xff], "-2"),
+            ("INT40", &[0xfd, 0xff, 0xff, 0xff, 0xff], "-3"),
+            ("INT48", &[0, 0, 0, 0, 0, 0x80], "-140737488355328"),
+            ("UINT24", &[0, 0, 1], "0x10000"),
             ("REAL", &[0, 0, 0xc0, 0x3f], "1.5"),
+            ("LREAL", &[0, 0, 0, 0, 0, 0, 0xf8, 0x3f], "1.5"),
+            ("OCTET_STRING(2)", &[1, 2], "01 02"),
             ("STRING(5)", b"EPOS4", "\"EPOS4\""),
             (
                 "ARRAY [0..9] OF BYTE",
