@@ -4,7 +4,9 @@
 
 extern crate alloc;
 
+pub mod al_state;
 pub mod al_status_code;
+mod codes;
 pub mod data_type;
 pub mod datagram;
 pub mod index;
@@ -12,4 +14,5 @@ pub mod mailbox;
 pub mod object;
 mod object_names;
 pub mod registers;
+pub mod sii;
 pub mod value;

@@ -7,6 +7,7 @@ use ecaxis_axis::cia402::describe;
 use ecaxis_axis::scale::UnitMismatch;
 use ecaxis_axis::{CommandError, HomingError, State, Trip, VelocityUnit};
 use ecaxis_ecat::al_status_code::al_status_hint;
+use ecaxis_ecat::mailbox::abort_code as abort;
 use ecaxis_esi::address;
 use ecaxis_master::acyclic::StateError;
 use ecaxis_master::config::{ConfigError, LimitConflict, Nic, UnitProblem};
@@ -322,41 +323,41 @@ fn sdo(error: &SdoError, origin: &str) -> String {
     let own = origin == OWN_SDO;
     match error.cause {
         CoeCause::Abort(code) => match code {
-            0x0602_0000 | 0x0609_0011 if own => {
+            code if abort::is_no_such_object(code) && own => {
                 "the drive has no such object: check `index` and `sub` in `sdo`"
             }
-            0x0602_0000 | 0x0609_0011 => {
+            code if abort::is_no_such_object(code) => {
                 "the drive has no such object: its firmware does not match the ESI file"
             }
-            0x0609_0030..=0x0609_0036 if origin.contains("cycle") => {
+            abort::OUT_OF_RANGE..=abort::MAX_BELOW_MIN if origin.contains("cycle") => {
                 "the drive does not take this cycle time: try another `cycle`"
             }
-            0x0609_0030..=0x0609_0036 if own => {
+            abort::OUT_OF_RANGE..=abort::MAX_BELOW_MIN if own => {
                 "the value is outside what the drive allows: check `value` in `sdo`"
             }
-            0x0609_0030..=0x0609_0036 => {
+            abort::OUT_OF_RANGE..=abort::MAX_BELOW_MIN => {
                 "the value is outside what the drive allows: its firmware does not match the ESI file"
             }
-            0x0601_0000..=0x0601_0003 if own => {
+            abort::UNSUPPORTED_ACCESS..=abort::SUBINDEX_0_NOT_ZERO if own => {
                 "the object cannot be written: remove it from `sdo`"
             }
-            0x0601_0000..=0x0601_0003 => {
+            abort::UNSUPPORTED_ACCESS..=abort::SUBINDEX_0_NOT_ZERO => {
                 "the object is read-only in the drive: its firmware does not match the ESI file"
             }
-            0x0607_0010..=0x0607_0013 if own => {
+            abort::TYPE_MISMATCH..=abort::DATA_TOO_SHORT if own => {
                 "the object has another length in the drive: set its `type` in `sdo`"
             }
-            0x0607_0010..=0x0607_0013 => "the object has another length in the drive: its firmware does not match the ESI file",
-            0x0604_0041..=0x0604_0042 if origin.starts_with("pdo.") => {
+            abort::TYPE_MISMATCH..=abort::DATA_TOO_SHORT => "the object has another length in the drive: its firmware does not match the ESI file",
+            abort::NOT_MAPPABLE | abort::PDO_TOO_LONG if origin.starts_with("pdo.") => {
                 "the drive cannot map this: remove it from `pdo.rx` or `pdo.tx`"
             }
-            0x0604_0041..=0x0604_0042 => {
+            abort::NOT_MAPPABLE | abort::PDO_TOO_LONG => {
                 "the drive cannot map what the ESI file lists: choose other objects with `pdo.rx` and `pdo.tx`"
             }
-            0x0800_0021 => "the drive is under local control: end its panel or commissioning tool; an object that is mapped now may not be writable either",
-            0x0504_0005 | 0x0800_0020 | 0x0606_0000 => "the drive cannot store it now: switch it off and on, then check its own error history",
-            0x0604_0043 | 0x0604_0047 if own => "the value contradicts another setting of the drive: the order of `sdo` matters, and the mode must allow it",
-            0x0800_0022 => "the drive refuses it in its present state: switch it off and on",
+            abort::LOCAL_CONTROL => "the drive is under local control: end its panel or commissioning tool; an object that is mapped now may not be writable either",
+            abort::NO_MEMORY | abort::NOT_STORED | abort::HARDWARE => "the drive cannot store it now: switch it off and on, then check its own error history",
+            abort::INCOMPATIBLE_PARAMETERS | abort::INTERNAL_INCOMPATIBILITY if own => "the value contradicts another setting of the drive: the order of `sdo` matters, and the mode must allow it",
+            abort::DEVICE_STATE => "the drive refuses it in its present state: switch it off and on",
             _ => "look the code up in the drive's manual; `ecaxis explain` shows where the value comes from",
         },
         CoeCause::Timeout { .. } => "the drive does not answer its mailbox: switch it off and on",

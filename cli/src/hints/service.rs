@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use ecaxis_ecat::mailbox::abort_code as abort;
 use ecaxis_master::acyclic::eeprom::EepromError;
 use ecaxis_master::acyclic::image::WriteError;
 use ecaxis_master::config::Nic;
@@ -100,16 +101,20 @@ pub(crate) fn with_other_main_device(failure: Failure, error: &Error) -> Failure
 /// Returns the hint for an object that the user requested.
 pub(super) fn parameter(error: &SdoError) -> String {
     let hint = match error.abort_code() {
-        Some(0x0602_0000 | 0x0609_0011) => "`ecaxis sdo list` shows its objects",
-        Some(0x0601_0001 | 0x0601_0002) => "`ecaxis sdo list` shows what can be read and written",
-        Some(0x0601_0000 | 0x0601_0004 | 0x0601_0005) => "read or write its subindices one by one",
-        Some(0x0609_0030..=0x0609_0036) => {
+        Some(code) if abort::is_no_such_object(code) => "`ecaxis sdo list` shows its objects",
+        Some(abort::WRITE_ONLY | abort::READ_ONLY) => {
+            "`ecaxis sdo list` shows what can be read and written"
+        }
+        Some(
+            abort::UNSUPPORTED_ACCESS | abort::NO_COMPLETE_ACCESS | abort::LONGER_THAN_MAILBOX,
+        ) => "read or write its subindices one by one",
+        Some(abort::OUT_OF_RANGE..=abort::MAX_BELOW_MIN) => {
             "`ecaxis esi objects` shows the range if the ESI file contains it"
         }
-        Some(0x0607_0010..=0x0607_0013) => {
+        Some(abort::TYPE_MISMATCH..=abort::DATA_TOO_SHORT) => {
             "the device has another type than its ESI file: set it with `--type`"
         }
-        Some(0x0601_0006 | 0x0800_0020..=0x0800_0022) => {
+        Some(abort::MAPPED_TO_RX_PDO | abort::NOT_STORED..=abort::DEVICE_STATE) => {
             "the device forbids it in its present state: disable the axis or stop the program that drives the bus, then try again"
         }
         _ => return sdo(error, "the device"),

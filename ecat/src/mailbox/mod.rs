@@ -15,11 +15,13 @@
 
 use alloc::vec::Vec;
 
+pub mod abort_code;
 pub mod coe;
 mod error_text;
 pub mod foe;
 
-pub use error_text::{abort_text, mailbox_error_text};
+pub use abort_code::abort_text;
+pub use error_text::mailbox_error_text;
 
 /// The length in bytes of the mailbox header (ETG.1000.4 Table 29): length, address, channel and
 /// priority, type and counter.

@@ -35,10 +35,9 @@ pub use image::SiiOptions;
 pub use parse::SiiError;
 pub use warning::{SiiWarning, WarningKind};
 
-use crate::model::{Device, FmmuUse, Identity, Module, SmUse};
+use ecaxis_ecat::sii::{HEADER_BYTES, category};
 
-/// The offset of the first category.
-const HEADER_BYTES: usize = 0x80;
+use crate::model::{Device, FmmuUse, Identity, Module, SmUse};
 
 /// The contents of an EEPROM image (ETG.2010).
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -280,20 +279,6 @@ pub fn parse(bytes: &[u8]) -> Result<Sii, SiiError> {
 /// Reads an EEPROM image and returns its problems as well, if the image is readable.
 pub fn inspect(bytes: &[u8]) -> Result<(Sii, Vec<SiiWarning>), SiiError> {
     parse::image(bytes)
-}
-
-/// Category types of ETG.2010.
-mod category {
-    pub const STRINGS: u16 = 10;
-    pub const GENERAL: u16 = 30;
-    pub const FMMU: u16 = 40;
-    pub const SYNC_MANAGER: u16 = 41;
-    pub const FMMU_DETAILS: u16 = 42;
-    pub const SYNC_UNIT: u16 = 43;
-    pub const TX_PDO: u16 = 50;
-    pub const RX_PDO: u16 = 51;
-    pub const DC: u16 = 60;
-    pub const END: u16 = 0xffff;
 }
 
 fn fmmu_code(usage: FmmuUse) -> u8 {

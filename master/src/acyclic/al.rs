@@ -3,17 +3,18 @@
 //! Registers: AL control 0x0120, AL status 0x0130, AL status code 0x0134 (ETG.1000.4, 6.1).
 
 use std::convert::Infallible;
-use std::fmt;
 use std::time::Duration;
+
+pub use ecaxis_ecat::al_state::AlState;
 
 use super::{DatagramClient, DeviceRef, Transition};
 use crate::concurrent::try_join_all;
 use crate::mailbox::{DatagramError, MailboxTransport};
 use crate::report::{Cause, Error};
-use ecaxis_ecat::al_status_code::al_status_text;
+use ecaxis_ecat::al_state::ERROR;
+use ecaxis_ecat::al_status_code::{self, al_status_text};
 use ecaxis_ecat::registers;
 
-pub(super) const ERROR: u8 = 0x10;
 const ID_REQUEST: u8 = 0x20;
 const DEVICE_EMULATION: u8 = 0x01;
 const POLL: Duration = Duration::from_micros(500);
@@ -30,63 +31,6 @@ pub const BACK_TIMEOUT: Duration = Duration::from_secs(5);
 pub const IDENTIFICATION_TIMEOUT: Duration = Duration::from_secs(1);
 /// The time for every other device.
 pub const SHORT_IDENTIFICATION_TIMEOUT: Duration = Duration::from_millis(10);
-
-/// A state of the EtherCAT state machine.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum AlState {
-    Init,
-    PreOp,
-    Bootstrap,
-    SafeOp,
-    Op,
-    /// A value that no state has.
-    Unknown(u8),
-}
-
-impl AlState {
-    /// True if AL status shows an error.
-    pub(crate) const fn has_error(status: u8) -> bool {
-        status & ERROR != 0
-    }
-
-    /// Decodes the low nibble of AL status.
-    #[must_use]
-    pub fn from_status(status: u8) -> Self {
-        match status & 0x0f {
-            1 => Self::Init,
-            2 => Self::PreOp,
-            3 => Self::Bootstrap,
-            4 => Self::SafeOp,
-            8 => Self::Op,
-            other => Self::Unknown(other),
-        }
-    }
-
-    #[must_use]
-    pub fn code(self) -> u8 {
-        match self {
-            Self::Init => 1,
-            Self::PreOp => 2,
-            Self::Bootstrap => 3,
-            Self::SafeOp => 4,
-            Self::Op => 8,
-            Self::Unknown(code) => code,
-        }
-    }
-}
-
-impl fmt::Display for AlState {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Init => "Init",
-            Self::PreOp => "PreOp",
-            Self::Bootstrap => "Bootstrap",
-            Self::SafeOp => "SafeOp",
-            Self::Op => "Op",
-            Self::Unknown(code) => return write!(f, "state 0x{code:x}"),
-        })
-    }
-}
 
 /// A SubDevice that did not reach the requested state.
 #[derive(Debug, thiserror::Error)]
@@ -179,14 +123,12 @@ pub(crate) fn is_wire(error: &Error) -> bool {
     matches!(*error.cause, Cause::State(StateError::Wire { .. }))
 }
 
-/// True for a refusal by a device that may need SYNC0 before the change: synchronization error, fatal
-/// synchronization error, no synchronization, PLL error, DC I/O error, DC time-out (ETG.1020).
+/// True for a refusal by a device that may need SYNC0 before the change (ETG.1020).
 pub(crate) fn awaits_sync(error: &Error) -> bool {
-    const CODES: [u16; 6] = [0x001a, 0x002c, 0x002d, 0x0032, 0x0033, 0x0034];
     let Cause::State(StateError::Refused { code, .. }) = &*error.cause else {
         return false;
     };
-    CODES.contains(code)
+    al_status_code::SYNC_LOST.contains(code) || *code == al_status_code::DC_SYNC_IO_ERROR
 }
 
 /// Requests a lower state from all devices at the same time, even if some fail. Returns the first

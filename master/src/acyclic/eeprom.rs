@@ -8,6 +8,7 @@ use crate::cancel::CancelToken;
 use crate::mailbox::MailboxTransport;
 use crate::report::{Cause, Error};
 use ecaxis_ecat::registers;
+use ecaxis_ecat::sii::{self, HEADER_BYTES, control::*};
 use ecaxis_esi::sii::chip_length;
 
 /// 0x0500: the PDI has access to the EEPROM; the MainDevice can take it by force.
@@ -16,20 +17,8 @@ const FORCE: u8 = 0x02;
 /// 0x0501: the PDI is using the EEPROM.
 const IN_USE: u8 = 0x01;
 
-const WRITE_ENABLE: u16 = 0x0001;
-const EIGHT_BYTES: u16 = 0x0040;
-const READ: u16 = 0x0100;
-const WRITE: u16 = 0x0200;
-const RELOAD: u16 = 0x0400;
-const NOT_LOADED: u16 = 0x1000;
-const REFUSED: u16 = 0x2000;
-const NOT_ENABLED: u16 = 0x4000;
-const BUSY: u16 = 0x8000;
-
-/// The word address of the size, in KiBit minus one.
-const SIZE: u32 = 0x3e;
-/// The start of the categories in bytes; the minimum length of an image.
-const HEADER_BYTES: usize = 0x80;
+/// The word address of the size.
+const SIZE: u32 = sii::SIZE as u32;
 /// The maximum length of an image in bytes: 4 MiBit, more than the interface can address.
 const MAX_BYTES: usize = 512 * 1024;
 

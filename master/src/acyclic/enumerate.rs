@@ -13,7 +13,6 @@ const MAX_ATTEMPTS: u32 = 5;
 pub(crate) const FIRST_STATION: u16 = 0x1000;
 
 const STEP: &str = "asking who is there";
-const ERROR: u8 = 0x10;
 
 /// A SubDevice as its registers describe it.
 ///
@@ -144,7 +143,7 @@ pub async fn read_device(wire: &DatagramClient, position: u16) -> Result<Enumera
         alias: u16::from_le_bytes([a0, a1]),
         dl_status: status.dl_status,
         state: AlState::from_status(status.al_status),
-        error: status.al_status & ERROR != 0,
+        error: AlState::has_error(status.al_status),
         code: status.al_code,
     })
 }

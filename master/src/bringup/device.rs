@@ -1,5 +1,6 @@
 //! The steps of one SubDevice from PreOp to SafeOp.
 
+use ecaxis_ecat::mailbox::abort_code::is_no_such_object;
 use ecaxis_ecat::registers;
 use ecaxis_esi::layout::SmLayout;
 use ecaxis_esi::{StartupSdo, address};
@@ -108,7 +109,7 @@ fn abort_code(error: &Error) -> Option<u32> {
 }
 
 /// Returns the interpolation time that a device keeps after it has refused another one. `None` if it
-/// is the wanted one, or if the device has no such object (abort code 0x06020000 or 0x06090011).
+/// is the wanted one, or if the device has no such object.
 async fn kept_period(
     wire: &impl MailboxTransport,
     at: &DeviceRef,
@@ -116,7 +117,7 @@ async fn kept_period(
     wanted: &[&StartupSdo],
     code: u32,
 ) -> Result<Option<String>, Error> {
-    if matches!(code, 0x0602_0000 | 0x0609_0011) {
+    if is_no_such_object(code) {
         return Ok(None);
     }
     let mut same = true;

@@ -1,6 +1,7 @@
 //! The CoE client of one SubDevice: SDO upload and download, expedited, normal and segmented, with
 //! complete access.
 
+use ecaxis_ecat::mailbox::abort_code;
 use ecaxis_ecat::mailbox::coe::{Answer, Message, Request, download_room, segment_room};
 
 use super::emergency::{Emergencies, Emergency};
@@ -13,11 +14,6 @@ use super::{MailboxLayout, MailboxTransport, Timeouts};
 pub const MAX_OBJECT: usize = 1 << 20;
 /// The maximum number of messages that [`CoeClient::drain`] reads per call.
 const DRAIN: usize = 64;
-
-const ABORT_TOGGLE: u32 = 0x0503_0000;
-const ABORT_TIMEOUT: u32 = 0x0504_0000;
-const ABORT_MEMORY: u32 = 0x0504_0005;
-const ABORT_GENERAL: u32 = 0x0800_0000;
 
 /// The CoE mailbox of one SubDevice, for one transfer at a time. After a transfer that failed or
 /// was dropped, the next one never takes an old answer for its own.
@@ -253,7 +249,7 @@ impl CoeClient {
     ) -> Result<(), TransportError> {
         self.port.check()?;
         if let Some((index, sub)) = self.in_segments.take() {
-            let code = ABORT_GENERAL;
+            let code = abort_code::GENERAL;
             let farewell = Request::Abort { index, sub, code };
             // The device may not receive it; whether it is present shows in the next step.
             let _ = self.port.send(w, &farewell).await;
@@ -324,7 +320,7 @@ impl CoeClient {
         if size > MAX_OBJECT {
             return Err(transfer
                 .failure(CoeCause::TooLarge(size))
-                .with_abort_code(ABORT_MEMORY));
+                .with_abort_code(abort_code::NO_MEMORY));
         }
         if data.len() >= size {
             return Ok(data);
@@ -348,12 +344,12 @@ impl CoeClient {
             if seen != toggle {
                 return Err(transfer
                     .malformed("the toggle bit of a segment did not alternate")
-                    .with_abort_code(ABORT_TOGGLE));
+                    .with_abort_code(abort_code::TOGGLE));
             }
             if part.is_empty() && !last {
                 return Err(transfer
                     .malformed("a segment without data")
-                    .with_abort_code(ABORT_GENERAL));
+                    .with_abort_code(abort_code::GENERAL));
             }
             data.extend_from_slice(&part);
             if data.len() > size || last && data.len() < size {
@@ -362,7 +358,7 @@ impl CoeClient {
                 return Err(if last {
                     ended
                 } else {
-                    ended.with_abort_code(ABORT_GENERAL)
+                    ended.with_abort_code(abort_code::GENERAL)
                 });
             }
             if last {
@@ -438,7 +434,7 @@ impl CoeClient {
             if seen != toggle {
                 return Err(transfer
                     .malformed("the toggle bit of a segment did not alternate")
-                    .with_abort_code(ABORT_TOGGLE));
+                    .with_abort_code(abort_code::TOGGLE));
             }
             toggle = !toggle;
             progress(data.len() - rest.len());
@@ -473,14 +469,14 @@ impl CoeClient {
         loop {
             if transfer.deadline.passed(w) {
                 let ended = transfer.trouble(&self.port, TransportError::Timeout(Phase::Transfer));
-                return Err(reported(ended, ABORT_TIMEOUT));
+                return Err(reported(ended, abort_code::TIMEOUT));
             }
             match self.port.receive(w, &mut deadline).await {
                 Ok(()) => {}
                 Err(trouble @ TransportError::Timeout(_)) => {
                     return Err(reported(
                         transfer.trouble(&self.port, trouble),
-                        ABORT_TIMEOUT,
+                        abort_code::TIMEOUT,
                     ));
                 }
                 Err(trouble) => return Err(transfer.trouble(&self.port, trouble)),
@@ -502,12 +498,12 @@ impl CoeClient {
                 }
                 Ok(Message::Refused(code)) => return Err(transfer.failure(CoeCause::Refused(code))),
                 Ok(_) => {}
-                Err(flaw) => return Err(reported(transfer.malformed(flaw), ABORT_GENERAL)),
+                Err(flaw) => return Err(reported(transfer.malformed(flaw), abort_code::GENERAL)),
             }
             self.port.set_aside(w);
             if deadline.passed(w) {
                 let ended = transfer.trouble(&self.port, TransportError::Timeout(Phase::Answer));
-                return Err(reported(ended, ABORT_TIMEOUT));
+                return Err(reported(ended, abort_code::TIMEOUT));
             }
             deadline.pause(w).await;
         }

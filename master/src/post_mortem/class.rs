@@ -1,11 +1,13 @@
 //! The class of causes that an error can have.
 
-use super::diagnose::{SYNC_CODES, WATCHDOG};
 use super::evidence::{Evidence, Lateness};
 use crate::acyclic::{AlState, DeviceRef, StateError};
 use crate::mailbox::CoeCause;
 use crate::report::{Cause, Error};
 use crate::rt::setpoint_generator::GeneratorError;
+use ecaxis_ecat::al_status_code::{
+    INVALID_PRE_OP_MAILBOX, INVALID_STATE_CHANGE, SYNC_LOST, SYNC_MANAGER_WATCHDOG,
+};
 
 /// The class of causes that an error can have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,7 +38,7 @@ impl Class {
             },
             Cause::LeftOp {
                 state,
-                code: WATCHDOG,
+                code: SYNC_MANAGER_WATCHDOG,
             } if *state != AlState::Op => Self::of_watchdog(error.device(), evidence),
             Cause::LeftOp { state, code } => Self::of_state(*state, *code, evidence),
             Cause::State(error) => Self::of_change(error, evidence),
@@ -92,9 +94,8 @@ impl Class {
     }
 
     fn of_change(error: &StateError, evidence: &Evidence) -> Self {
-        // Invalid requested state change and invalid mailbox configuration: another MainDevice may
-        // have set the device to Init during bring-up.
-        const SENT_ELSEWHERE: [u16; 2] = [0x0011, 0x0016];
+        // Another MainDevice may have set the device to Init during bring-up.
+        const SENT_ELSEWHERE: [u16; 2] = [INVALID_STATE_CHANGE, INVALID_PRE_OP_MAILBOX];
         let others = evidence.other_frames() > 0;
         match error {
             StateError::Gone { .. } | StateError::Wire { .. } => Self::Bus,
@@ -115,9 +116,9 @@ impl Class {
     }
 
     fn of_state(state: AlState, code: u16, evidence: &Evidence) -> Self {
-        if code == 0 || code == WATCHDOG {
+        if code == 0 || code == SYNC_MANAGER_WATCHDOG {
             Self::Bus
-        } else if !SYNC_CODES.contains(&code) || state != AlState::SafeOp {
+        } else if !SYNC_LOST.contains(&code) || state != AlState::SafeOp {
             Self::Device
         } else if evidence.stop.is_some() && evidence.without_data() > evidence.cycle_ns {
             Self::Bus

@@ -13,15 +13,12 @@ use super::evidence::{DeviceEvidence, Evidence, Lateness, place};
 use super::snapshot::SyncSnapshot;
 use crate::acyclic::{AlState, DeviceRef, StateError};
 use crate::report::{self, Error};
-use ecaxis_ecat::al_status_code::al_status_text;
+use ecaxis_ecat::al_state::ERROR as AL_ERROR;
+use ecaxis_ecat::al_status_code::{SYNC_LOST, SYNC_MANAGER_WATCHDOG, al_status_text};
 
-/// AL status codes that follow from a lost synchronization (ETG.1020).
-pub(super) const SYNC_CODES: [u16; 5] = [0x001a, 0x002c, 0x002d, 0x0032, 0x0034];
-pub(super) const WATCHDOG: u16 = 0x001b;
 /// AL status Init: the state of a device after a power cycle.
-const INIT: u8 = 1;
-const OP: u8 = 8;
-const AL_ERROR: u8 = 0x10;
+const INIT: u8 = AlState::Init.code();
+const OP: u8 = AlState::Op.code();
 /// Error codes for a following error (CiA 402), used by drives of all vendors.
 const FOLLOWING_ERROR: [u16; 2] = [0x8611, 0x8600];
 
@@ -263,7 +260,7 @@ fn silence(error: &Error, evidence: &Evidence) -> Option<Seen> {
     let silent = match &*error.cause {
         report::Cause::BusLost { answered, .. } => !answered,
         // The AL status code says that the device noticed the outage.
-        report::Cause::LeftOp { code, .. } => SYNC_CODES.contains(code),
+        report::Cause::LeftOp { code, .. } => SYNC_LOST.contains(code),
         _ => false,
     };
     let silence_ns = evidence.silence();
@@ -347,7 +344,7 @@ fn device_cause(error: &Error, evidence: &Evidence) -> Option<DiagnosedCause> {
             let state = AlState::from_status(device.look.al_status?);
             let code = device.look.al_code.unwrap_or(0);
             // A watchdog error is a consequence of a lost bus.
-            let cause = code != WATCHDOG || evidence.silence() == 0;
+            let cause = code != SYNC_MANAGER_WATCHDOG || evidence.silence() == 0;
             cause.then(|| left_op(&device.at, state, code, evidence))
         }
         report::Cause::Trip {
@@ -397,9 +394,10 @@ fn device_cause(error: &Error, evidence: &Evidence) -> Option<DiagnosedCause> {
 }
 
 fn left_op(device: &DeviceRef, state: AlState, code: u16, evidence: &Evidence) -> DiagnosedCause {
-    if code == WATCHDOG {
+    if code == SYNC_MANAGER_WATCHDOG {
         let others = evidence.devices.iter().filter(|other| {
-            other.at.position != device.position && other.look.al_code == Some(WATCHDOG)
+            other.at.position != device.position
+                && other.look.al_code == Some(SYNC_MANAGER_WATCHDOG)
         });
         let look = evidence.named(&device.name).map(|found| &found.look);
         return DiagnosedCause::Watchdog {
@@ -422,7 +420,7 @@ fn sync(
     refused: bool,
     evidence: &Evidence,
 ) -> Option<DiagnosedCause> {
-    if !SYNC_CODES.contains(&code) {
+    if !SYNC_LOST.contains(&code) {
         return None;
     }
     let look = evidence.named(&device.name).map(|found| &found.look);

@@ -15,6 +15,7 @@ use crate::rt::exchange::ErrorCounters;
 use crate::rt::flight_recorder::{AxisCycle, Cycle};
 use crate::rt::stats::Counters;
 use ecaxis_ecat::al_status_code::al_status_text;
+use ecaxis_ecat::sii::control;
 
 /// The report of a failed run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -125,9 +126,6 @@ impl Stop {
     }
 }
 
-/// The error bits of 0x0502: checksum, device information, acknowledge (bits 11 to 14).
-const EEPROM_ERRORS: u16 = 0x7800;
-
 impl DeviceSection {
     pub(crate) fn all(evidence: &Evidence) -> Vec<Self> {
         let devices = evidence.devices.iter();
@@ -154,7 +152,7 @@ impl DeviceSection {
                 errors: device.grown,
                 watchdog: look.watchdog,
                 sync: look.sync,
-                eeprom_error: look.eeprom.map(|status| status & EEPROM_ERRORS != 0),
+                eeprom_error: look.eeprom.map(|status| status & control::ERRORS != 0),
                 error_code: look.error_code,
                 error_text: look.error_code.map(|code| describe(code).text),
                 interpolation_ns: look.interpolation_ns,

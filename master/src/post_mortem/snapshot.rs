@@ -4,6 +4,7 @@
 
 use std::time::Duration;
 
+use ecaxis_ecat::al_state::AlState;
 use ecaxis_ecat::index::GroupIndex;
 use ecaxis_ecat::registers;
 use serde::Serialize;
@@ -23,7 +24,7 @@ const MAX_CONSECUTIVE_LOSSES: u32 = 2;
 /// The number of attempts per frame.
 const MAX_ATTEMPTS: u32 = 3;
 
-const OP: u8 = 8;
+const OP: u8 = AlState::Op.code();
 const ERROR_COUNTERS_LEN: usize = 0x14;
 const WATCHDOG_LEN: usize = 0x44;
 const SYNC_LEN: usize = 0x24;

@@ -1,11 +1,12 @@
 //! Counts bad cycles and decides when they stop the machine or a group.
 
+use ecaxis_ecat::al_state::AlState;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 
 use super::exchange::{CycleResult, DeviceAnswer, GroupResult};
 
 /// AL status that every SubDevice must show while the machine runs.
-pub const OP: u8 = 0x08;
+pub const OP: u8 = AlState::Op.code();
 /// Cycles for which the AL status may differ before the machine stops: one lost broadcast is not a
 /// fault.
 const AL_CYCLES: u32 = 2;

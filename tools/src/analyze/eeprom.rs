@@ -5,17 +5,9 @@ use std::collections::BTreeMap;
 
 use super::registers::{part, part_u16};
 use ecaxis_ecat::registers;
+use ecaxis_ecat::sii::control::{BUSY, COMMAND, EIGHT_BYTES, READ};
+use ecaxis_ecat::sii::{FIRST_CATEGORY, category};
 
-/// Bits of the control register: busy, eight-byte reads, command mask, read command.
-const BUSY: u16 = 0x8000;
-const WIDE: u16 = 0x0040;
-const COMMAND: u16 = 0x0700;
-const READ: u16 = 0x0100;
-
-const FIRST_CATEGORY: u16 = 0x0040;
-const STRINGS: u16 = 10;
-const GENERAL: u16 = 30;
-const END: u16 = 0xffff;
 /// The maximum number of categories.
 const CATEGORIES: usize = 64;
 
@@ -43,7 +35,7 @@ impl Eeprom {
     pub fn read(&mut self, register: u16, data: &[u8]) {
         let status = part_u16(register, data, registers::EEPROM_CONTROL);
         if let Some(status) = status {
-            self.wide = status & WIDE != 0;
+            self.wide = status & EIGHT_BYTES != 0;
         }
         let (Some(at), false) = (self.reading, status.is_some_and(|s| s & BUSY != 0)) else {
             return;
@@ -102,7 +94,7 @@ impl Eeprom {
             if kind == wanted {
                 return Some((start, len));
             }
-            if kind == END {
+            if kind == category::END {
                 return None;
             }
             at = start.checked_add(len)?;
@@ -118,7 +110,7 @@ impl Eeprom {
     }
 
     fn text(&self, number: u8) -> Option<String> {
-        let strings = self.bytes(STRINGS)?;
+        let strings = self.bytes(category::STRINGS)?;
         let mut rest = strings.get(1..)?;
         for _ in 1..number {
             rest = rest.get(1 + usize::from(*rest.first()?)..)?;
@@ -131,7 +123,7 @@ impl Eeprom {
 
     /// Returns the type ("order") text, else the name.
     pub fn name(&self) -> Option<String> {
-        let general = self.bytes(GENERAL)?;
+        let general = self.bytes(category::GENERAL)?;
         let text = |at: usize| self.text(*general.get(at)?);
         text(2).or_else(|| text(3))
     }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use ecaxis_ecat::mailbox::abort_code::is_no_such_object;
 use ecaxis_ecat::mailbox::coe::{Answer, Fragment, Message, Request};
 use ecaxis_ecat::mailbox::{self, TYPE_COE, TYPE_ERROR, TYPE_FOE, foe};
 use ecaxis_master::mailbox::Emergency;
@@ -57,10 +58,7 @@ impl Transfer {
     pub fn is_absent(&self) -> bool {
         let absent = matches!(
             self.ended,
-            TransferOutcome::Aborted {
-                code: 0x0602_0000 | 0x0609_0011,
-                ..
-            }
+            TransferOutcome::Aborted { code, .. } if is_no_such_object(code)
         );
         absent && self.way == TransferDirection::Read
     }

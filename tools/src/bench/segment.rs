@@ -1,6 +1,7 @@
 //! A segment of CiA 402 drives in Op, limited to cyclic frames. It has no bring-up, states, mailbox
 //! or EEPROM; the simulator covers those. Answering must take very little time.
 
+use ecaxis_ecat::al_state::AlState;
 use ecaxis_ecat::registers;
 use ecaxis_master::clock::Nanos;
 use ecaxis_sim::frame::{self, Command, Datagram, Kind, wire_time};
@@ -12,7 +13,7 @@ pub const FIRST_STATION: u16 = 0x1001;
 
 /// Set by the first SubDevice in the source address of a frame.
 const LOCALLY_ADMINISTERED: u8 = 0x02;
-const OP: u8 = 0x08;
+const OP: u8 = AlState::Op.code();
 
 /// The forwarding delay of one SubDevice and its cable in ns, both directions.
 pub const NANOS_PER_DEVICE: u64 = 1_000;
