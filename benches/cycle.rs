@@ -38,7 +38,7 @@ fn whole_cycle(c: &mut Criterion) {
             ..Options::default()
         };
         options.clock.enter();
-        let (progress, _told) = channel();
+        let (progress, _receiver) = channel();
         let stop = Arc::<CancelToken>::default();
         let job = RunBuilder {
             machine: &Arc::new(machine),

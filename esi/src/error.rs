@@ -99,7 +99,7 @@ pub enum EsiProblem {
         /// The largest accepted value.
         max: i128,
     },
-    /// A text is no sequence of hexadecimal bytes.
+    /// A text is not a sequence of hexadecimal bytes.
     #[error("{what} {text:?} is not a sequence of hexadecimal bytes")]
     HexBytes {
         /// The element or attribute.

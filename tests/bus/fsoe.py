@@ -1,4 +1,4 @@
-"""An FSoE master of another maker (PyPI `fsoe-master`) between two pipes.
+"""An FSoE master of another vendor (PyPI `fsoe-master`) between two pipes.
 
 Each message on stdin is the safety PDU in the device's outputs, once per bus cycle. Each answer on stdout is the PDU for
 the device's inputs, the number of errors, the number of checked answers, and 1 in the state Data.

@@ -76,7 +76,7 @@ fn a_released_axis_brakes() {
             _ => None,
         }),
     );
-    outcome.result.expect("leaving is no failure");
+    outcome.result.expect("leaving is not a failure");
     within_limits(&seen, 0);
     let moving = |s: &&Seen| s.axes[0].target_velocity != 0.0;
     let first = seen.iter().find(moving).expect("it jogs").time_s;
@@ -129,7 +129,7 @@ fn an_absent_operator_starts_nothing_and_stops_all_motion() {
                 Some(turn)
             }),
         );
-        outcome.result.expect("leaving is no failure");
+        outcome.result.expect("leaving is not a failure");
         within_limits(&seen, 0);
         let ready = seen
             .iter()
@@ -157,7 +157,7 @@ fn an_operator_who_leaves_in_motion_leaves_a_machine_at_rest() {
             _ => None,
         }),
     );
-    outcome.result.expect("leaving is no failure");
+    outcome.result.expect("leaving is not a failure");
     within_limits(&seen, 0);
     let last = &seen.last().expect("seen").axes[0];
     assert_eq!(
@@ -216,7 +216,7 @@ fn jog_rejects_more_than_a_quarter_of_the_speed_limit() {
             (since < 5.0).then(here)
         }),
     );
-    outcome.result.expect("leaving is no failure");
+    outcome.result.expect("leaving is not a failure");
     assert!(seen.iter().all(|s| s.axes[0].target_velocity == 0.0));
     let refused = seen.iter().flat_map(|s| &s.news);
     let refused = refused.filter(|news| matches!(news, RequestEvent::Refused { .. }));
@@ -247,7 +247,7 @@ fn a_rejected_request_keeps_the_dead_man_rule_active() {
             (since < 2.0).then_some(turn)
         }),
     );
-    outcome.result.expect("leaving is no failure");
+    outcome.result.expect("leaving is not a failure");
     within_limits(&seen, 0);
     let moving = seen.iter().filter(|s| s.axes[0].target_velocity != 0.0);
     let moving: Vec<f64> = moving.map(|s| s.time_s).collect();
@@ -269,7 +269,7 @@ fn jog_stays_within_the_range_while_the_key_is_held() {
             _ => None,
         }),
     );
-    outcome.result.expect("leaving is no failure");
+    outcome.result.expect("leaving is not a failure");
     within_limits(&seen, 0);
     let last = &seen.last().expect("seen").axes[0];
     assert!(last.held_by_range);
@@ -371,7 +371,9 @@ fn an_emergency_stop_removes_power_and_requires_a_reset() {
                 Some(turn)
             }),
         );
-        outcome.result.expect("leaving is no failure, reset or not");
+        outcome
+            .result
+            .expect("leaving is not a failure, reset or not");
         let again = seen.iter().skip_while(|s| s.axes[0].trip.is_none());
         assert_eq!(again.clone().any(|s| s.axes[0].ready), reset);
     }
@@ -428,7 +430,7 @@ fn jog_homes_an_axis_and_switches_its_mode() {
             Some(here())
         }),
     );
-    outcome.result.expect("leaving is no failure");
+    outcome.result.expect("leaving is not a failure");
     within_limits(&seen, 0);
     let news = seen.iter().flat_map(|s| s.news.clone());
     let done: Vec<RequestEvent> = news
@@ -459,7 +461,7 @@ fn homing_ends_without_an_operator() {
             Some(turn)
         }),
     );
-    outcome.result.expect("leaving is no failure");
+    outcome.result.expect("leaving is not a failure");
     let ready = seen
         .iter()
         .find(|s| s.axes[0].ready)

@@ -33,7 +33,7 @@ fn replaced_by(file: &str, instead: Request, presence: Presence) -> (f64, Vec<Se
             (since < 3.0).then_some(turn)
         }),
     );
-    outcome.result.expect("leaving is no failure");
+    outcome.result.expect("leaving is not a failure");
     within_limits(&seen, 0);
     let ready = seen.iter().find(|s| s.axes[0].ready).expect("enabled");
     let moving = seen.iter().rfind(|s| s.axes[0].target_velocity != 0.0);
@@ -149,7 +149,7 @@ fn every_rejection_is_reported() {
             _ => None,
         }),
     );
-    outcome.result.expect("leaving is no failure");
+    outcome.result.expect("leaving is not a failure");
     let news = seen.iter().flat_map(|s| s.news.clone());
     let news: Vec<RequestEvent> = news
         .skip_while(|news| matches!(news, RequestEvent::Done { .. }))
@@ -185,7 +185,7 @@ fn rejected_homing_counts_as_finished() {
             (!view.idle()).then(here)
         }),
     );
-    outcome.result.expect("leaving is no failure");
+    outcome.result.expect("leaving is not a failure");
     let news = seen.iter().flat_map(|s| &s.news);
     let refused = news.filter(|news| matches!(news, RequestEvent::Refused { .. }));
     assert_eq!(refused.count(), 2);

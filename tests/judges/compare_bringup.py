@@ -77,7 +77,7 @@ def by_pysoem(nic, sdos):
         master.config_dc()
         for slave in master.slaves:
             slave.dc_sync(True, cycle.PERIOD)
-        if master.state_check(pysoem.SAFEOP_STATE, cycle.PATIENCE_US) != pysoem.SAFEOP_STATE:
+        if master.state_check(pysoem.SAFEOP_STATE, cycle.TIMEOUT_US) != pysoem.SAFEOP_STATE:
             raise RuntimeError(f"not in SafeOp: {cycle.states(master)}")
         exchange = cycle.Cycle(master, master.expected_wkc)
         exchange.once()

@@ -9,7 +9,7 @@ import pysoem
 
 PERIOD = 1_000_000  # ns
 # This computer may stall.
-PATIENCE_US = 10_000_000
+TIMEOUT_US = 10_000_000
 NO_FRAME = -1
 
 STATES = {1: "Init", 2: "PreOp", 3: "Boot", 4: "SafeOp", 8: "Op"}
@@ -92,7 +92,7 @@ def states(master):
     return [state_name(slave.state) for slave in master.slaves]
 
 
-def reach(master, state, timeout_us=PATIENCE_US):
+def reach(master, state, timeout_us=TIMEOUT_US):
     """Requests a state of all devices and waits for it. Returns True if every device reaches it."""
     master.state = state
     master.write_state()

@@ -12,7 +12,7 @@ INCLUDES = ["oshw/linux", "osal/linux", "oshw", "osal", "soem", "test/linux/slav
 SOURCES = ["osal/linux/osal.c", "oshw/linux/*.c", "soem/*.c"]
 # The size of SOEM's cache of one EEPROM; SOEM finds nothing beyond it.
 CACHED = 4096
-PATIENCE_US = 5_000_000
+TIMEOUT_US = 5_000_000
 TIMEOUTS = re.compile(r"(#define EC_TIMEOUT(?:RET|SAFE|EEP|TXM) +)\d+")
 
 
@@ -39,7 +39,7 @@ def sources(folder, python):
         main.write_text(text.replace("    &ec_DCtime, ", "    0, 0, &ec_DCtime, "))
         # SOEM takes a late reply for that of the next request, and this computer may stall.
         header = soem / "soem/ethercattype.h"
-        text, count = TIMEOUTS.subn(rf"\g<1>{PATIENCE_US}", header.read_text())
+        text, count = TIMEOUTS.subn(rf"\g<1>{TIMEOUT_US}", header.read_text())
         assert count == 4
         header.write_text(text)
         soem.rename(done)

@@ -21,16 +21,16 @@ class Watch:
 
     def __enter__(self):
         self.began = time.monotonic()
-        self.told, self.children = [], []
+        self.results, self.children = [], []
         for cpu in sorted(os.sched_getaffinity(0)):
-            told = mmap.mmap(-1, 16)
+            results = mmap.mmap(-1, 16)
             child = os.fork()
             if child == 0:
                 try:
-                    watch(cpu, told)
+                    watch(cpu, results)
                 finally:
                     os._exit(0)
-            self.told.append(told)
+            self.results.append(results)
             self.children.append(child)
         return self
 
@@ -38,12 +38,12 @@ class Watch:
         for child in self.children:
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
-        taken = [struct.unpack("dd", told[:16]) for told in self.told]
+        taken = [struct.unpack("dd", results[:16]) for results in self.results]
         self.longest = max(longest for longest, _ in taken)
         self.share = max(total for _, total in taken) / (time.monotonic() - self.began)
 
 
-def watch(cpu, told):
+def watch(cpu, results):
     libc = ctypes.CDLL(ctypes.util.find_library("c") or "libc.so.6")
     libc.prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
     os.sched_setaffinity(0, {cpu})
@@ -55,4 +55,4 @@ def watch(cpu, told):
         late = time.monotonic() - began - EVERY
         if late > LATE:
             longest, total = max(longest, late), total + late
-            told[:] = struct.pack("dd", longest, total)
+            results[:] = struct.pack("dd", longest, total)

@@ -5,7 +5,7 @@ Walks over the requests alone, keeping of every device what the MainDevice has w
 address, FMMUs, SyncManagers, AL control, EEPROM ownership), and compares the counter that follows
 with the one in the answer. Written from ETG.1000.4; shares nothing with simulator or master.
 
-Three things no request tells, so answers are read for them: the AL state reached (0x0130), whether
+Requests do not contain three things, so they are read from answers: the AL state reached (0x0130), whether
 a mailbox is full (SyncManager status) and what the controller has (0x0004 to 0x0008, clock). Where such
 knowledge is missing the prediction is a range; those are counted apart.
 """

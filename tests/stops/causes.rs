@@ -210,7 +210,7 @@ fn a_fault_from_before_the_run_is_reset_once() {
 fn an_emergency_in_motion_is_reported_and_stops_nothing() {
     let script = "[[fault]]\nkind = \"emergency\"\ndevice = 1\nat = \"1.5s\"\ncode = 0x5000\n";
     let (outcome, heard) = run(machine(&axes(2)), faults(script));
-    outcome.result.expect("an emergency alone is no fault");
+    outcome.result.expect("an emergency alone is not a fault");
     let warnings = heard.warnings();
     let reported = warnings
         .iter()

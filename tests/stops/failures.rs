@@ -539,7 +539,7 @@ fn a_panic_in_the_cycle_brings_the_axes_to_rest() {
             panics,
             seen: Arc::clone(&seen),
         };
-        let (progress, _told) = channel();
+        let (progress, _receiver) = channel();
         let job = RunBuilder {
             machine: &Arc::new(machine),
             options: &options,

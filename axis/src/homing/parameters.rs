@@ -175,7 +175,7 @@ pub enum ParameterError {
         limit: f64,
     },
     /// A position is not representable as counts.
-    #[error("{what} of {value} is no number of counts that 32 bits hold")]
+    #[error("{what} of {value} is not an integer of 32 bits")]
     Counts {
         /// The parameter's name.
         what: &'static str,

@@ -23,8 +23,8 @@ pub struct TableError {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum TableProblem {
-    /// A field is no number.
-    #[error("`{field}` is no number")]
+    /// A field is not a number.
+    #[error("`{field}` is not a number")]
     NotANumber {
         /// The start of the field.
         field: String,

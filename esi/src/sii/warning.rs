@@ -136,8 +136,10 @@ impl fmt::Display for SiiWarning {
             WarningKind::NoString { number, strings } => {
                 write!(f, "text {number} is named, there are {strings}")
             }
-            WarningKind::Fmmu { code } => write!(f, "{code} is no use of an FMMU"),
-            WarningKind::SyncManager { code } => write!(f, "{code} is no type of a SyncManager"),
+            WarningKind::Fmmu { code } => write!(f, "{code} is not a defined use of an FMMU"),
+            WarningKind::SyncManager { code } => {
+                write!(f, "{code} is not a defined SyncManager type")
+            }
         }
     }
 }

@@ -94,7 +94,7 @@ pub const MUTATIONS: &[Mutation] = &[
         r##"SlotPdoIncrement "#x10000""##,
     ),
     row(
-        "InitCmd data that is no data",
+        "InitCmd data that is not hexadecimal",
         |text| replace_in(&text, "<InitCmd>", "<Data>01", "<Data>0x1"),
         ("error", At::First("<Data>0x1")),
         "EtherCATInfo/Descriptions/Modules/Module[1]/Mailbox/CoE/InitCmd[1]/Data",

@@ -84,7 +84,7 @@ pub const MUTATIONS: &[Mutation] = &[
         "Vendor is missing",
     ),
     row(
-        "a product code that is no number",
+        "a product code that is not a number",
         |text| {
             replace(
                 &text,

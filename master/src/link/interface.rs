@@ -160,7 +160,7 @@ impl<'n> SysfsNic<'n> {
         let number = self.read("type").ok().and_then(|text| text.parse().ok());
         match number {
             Some(ARPHRD_LOOPBACK) => return Some("is the loopback; no wire leads out of it"),
-            Some(other) if other != ARPHRD_ETHER => return Some("is no Ethernet"),
+            Some(other) if other != ARPHRD_ETHER => return Some("is not an Ethernet interface"),
             _ => {}
         }
         if self.has("wireless") || self.has("phy80211") {

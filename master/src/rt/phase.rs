@@ -242,7 +242,7 @@ mod tests {
         }
     }
 
-    /// 2^32 ns is no multiple of these cycles. The first measurement, or the next one after a broken
+    /// 2^32 ns is not a multiple of these cycles. The first measurement, or the next one after a broken
     /// cable, may come several wraps later; the host clock has a drift of 100 ppm.
     #[test]
     fn a_clock_of_32_bits_keeps_its_phase_over_a_long_pause() {

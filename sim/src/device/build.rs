@@ -113,7 +113,7 @@ pub enum SimError {
         /// The length in bytes.
         len: u16,
     },
-    /// [`DeviceOptions::gateway`] is set for the device with this type name, which is no gateway.
+    /// [`DeviceOptions::gateway`] is set for the device with this type name, which is not a gateway.
     #[error("device `{0}` is not a CANopen gateway, so it has no nodes")]
     NoGateway(String),
     /// The settings of the gateway are invalid.

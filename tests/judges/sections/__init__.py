@@ -30,14 +30,14 @@ OWN = rig.ROOT / "configs/esi"
 
 
 @contextlib.contextmanager
-def patience(master):
+def long_timeouts(master):
     """SOEM takes a late reply for that of its next request, and this computer may stall for a second."""
     timeouts = pysoem.settings.timeouts
     names = ("ret", "eeprom", "tx_mailbox", "rx_mailbox")
     before = {name: getattr(timeouts, name) for name in names}
     for name in names:
-        setattr(timeouts, name, cycle.PATIENCE_US)
-    master.sdo_read_timeout = master.sdo_write_timeout = cycle.PATIENCE_US
+        setattr(timeouts, name, cycle.TIMEOUT_US)
+    master.sdo_read_timeout = master.sdo_write_timeout = cycle.TIMEOUT_US
     try:
         yield
     finally:
@@ -95,7 +95,7 @@ class Bench:
         master = pysoem.Master()
         master.open(self.nic, second)
         try:
-            with cycle.real_time(), patience(master) if patient else contextlib.nullcontext():
+            with cycle.real_time(), long_timeouts(master) if patient else contextlib.nullcontext():
                 yield master
         finally:
             master.state = pysoem.INIT_STATE

@@ -8,7 +8,7 @@ import pysoem
 import esi
 import pcapng
 import rig
-from cycle import PATIENCE_US, reach
+from cycle import TIMEOUT_US, reach
 
 EMERGENCY = '[[fault]]\ndevice = 0\nkind = "emergency"\ncode = 0x2310\n'
 ESI = rig.HERE / "esi/mailbox.xml"
@@ -102,8 +102,8 @@ def files(bench, slave, how):
     data = BLOB * 3
     # A full last packet must be followed by an empty one; a packet has 36 or 1012 bytes.
     for size in (0, 1, 36, 72, 1012, 1500):
-        written = slave.foe_write("judge.bin", 0, data[:size], PATIENCE_US)
-        back = slave.foe_read("judge.bin", 0, 2000, PATIENCE_US)
+        written = slave.foe_write("judge.bin", 0, data[:size], TIMEOUT_US)
+        back = slave.foe_read("judge.bin", 0, 2000, TIMEOUT_US)
         good = written > 0 and back == data[:size]
         report.check(f"a file of {size} bytes is written and read back, {how}", good, len(back))
     report.equal("a file that does not exist yields nothing", slave.foe_read("nothing.bin", 0, 10), b"")
@@ -129,11 +129,11 @@ def bootstrap(bench, master, slave):
     slave.amend_mbx("in", 0x1064, 100)
     slave.state = pysoem.BOOT_STATE
     slave.write_state()
-    reached = slave.state_check(pysoem.BOOT_STATE, PATIENCE_US)
+    reached = slave.state_check(pysoem.BOOT_STATE, TIMEOUT_US)
     report.equal("Bootstrap", reached, pysoem.BOOT_STATE, hex)
     firmware = bytes(n * n & 0xFF for n in range(5_000))
-    report.check("firmware is written", slave.foe_write("EPOS4.bin", 0, firmware, PATIENCE_US) > 0)
-    report.check("and read back", slave.foe_read("EPOS4.bin", 0, 10_000, PATIENCE_US) == firmware)
+    report.check("firmware is written", slave.foe_write("EPOS4.bin", 0, firmware, TIMEOUT_US) > 0)
+    report.check("and read back", slave.foe_read("EPOS4.bin", 0, 10_000, TIMEOUT_US) == firmware)
     reach(master, pysoem.INIT_STATE)
     slave.amend_mbx("out", 0x1000, 48)
     slave.amend_mbx("in", 0x1030, 48)

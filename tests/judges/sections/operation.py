@@ -83,9 +83,9 @@ def clocks(bench, master, machine):
     for name, slave, device in zip(machine.names, master.slaves, machine.devices):
         if not device.dc:
             continue
-        raw = struct.unpack("<I", slave._fprd(DIFFERENCE, 4, cyclic.PATIENCE_US))[0]
+        raw = struct.unpack("<I", slave._fprd(DIFFERENCE, 4, cyclic.TIMEOUT_US))[0]
         report.check(f"{name}: the clock is locked", raw & 0x7FFFFFFF < LOCKED_NS, f"{raw & 0x7FFFFFFF} ns")
-        delays.append(struct.unpack("<I", slave._fprd(DELAY, 4, cyclic.PATIENCE_US))[0])
+        delays.append(struct.unpack("<I", slave._fprd(DELAY, 4, cyclic.TIMEOUT_US))[0])
     report.check("propagation delays grow along the line", delays == sorted(delays), delays)
     report.check("the first is the reference", delays and delays[0] == 0, delays)
 

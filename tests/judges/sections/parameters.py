@@ -112,8 +112,8 @@ def compare(report, listed, objects):
             if mine is None and item.bit_length == 0:
                 continue
             name = NAMES.get(item.data_type, "?")
-            told = mine and mine["type"].startswith(name) and mine["name" if entry.entries else "object"][:40]
-            if told != item.name.decode() or mine["bits"] != item.bit_length:
+            printed = mine and mine["type"].startswith(name) and mine["name" if entry.entries else "object"][:40]
+            if printed != item.name.decode() or mine["bits"] != item.bit_length:
                 wrong.append(f"{entry.index:#06x}:{sub:02}: {mine} is not {item.name}, {name}, {item.bit_length}")
     report.equal("types, lengths and names as pysoem reads them", wrong[:5], [])
 

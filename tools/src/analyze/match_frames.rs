@@ -8,7 +8,7 @@ use ecaxis_master::recording::Direction;
 use ecaxis_master::recording::frame::Frame;
 
 /// The maximum round-trip time in ns; later requests count as unanswered.
-pub const PATIENCE_NS: u64 = 250_000_000;
+pub const TIMEOUT_NS: u64 = 250_000_000;
 /// The maximum number of pending requests.
 const UNDER_WAY: usize = 2048;
 /// The number of frames read before the first is classified, so that both directions were seen.
@@ -224,7 +224,7 @@ impl Pairing {
     /// Releases exchanges that are complete or timed out.
     fn give_up(&mut self) {
         while let Some(first) = self.under_way.front() {
-            let waits = |sent: &Frame| self.latest.saturating_sub(sent.at) <= PATIENCE_NS;
+            let waits = |sent: &Frame| self.latest.saturating_sub(sent.at) <= TIMEOUT_NS;
             if first.back.is_none()
                 && first.sent.as_ref().is_some_and(waits)
                 && self.under_way.len() <= UNDER_WAY

@@ -74,7 +74,7 @@ pub fn analyze<R: Read>(parts: Vec<Reader<R>>, interface: Option<u32>, known: Co
     for (number, mut reader) in (1..).zip(parts) {
         // Frames may be missing between two parts.
         let next = reader.peek().and_then(|packet| packet.at);
-        if next.is_some_and(|at| at > counted.last.saturating_add(match_frames::PATIENCE_NS)) {
+        if next.is_some_and(|at| at > counted.last.saturating_add(match_frames::TIMEOUT_NS)) {
             pairing.end();
             drain(&mut pairing, &mut segment);
             segment.cycle.pause();

@@ -224,7 +224,7 @@ fn ran_well(link: &Shared, machine: &Arc<Machine>) -> bool {
         ..session::Options::default()
     };
     let stop = Arc::<CancelToken>::default();
-    let (progress, _told) = channel();
+    let (progress, _receiver) = channel();
     let own = Box::new(link.clone());
     let job = RunBuilder {
         machine,

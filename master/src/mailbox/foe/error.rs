@@ -54,7 +54,7 @@ pub enum FoeCause {
     #[error("has more than {most} bytes")]
     TooLarge { most: usize },
     /// The name would be empty or truncated, or contains a zero byte.
-    #[error("is no name for a file here: 1 to {room} bytes without a zero byte")]
+    #[error("is not a valid file name: 1 to {room} bytes without a zero byte")]
     Name { room: usize },
     /// Frames come back, but this SubDevice processed none of them.
     #[error("the device does not answer{}: it is off, or has lost its address", Context(*packet))]

@@ -203,7 +203,7 @@ fn limits(device: &Device, drive: &DriveInfo, scale: Scale, most: f64, lines: &m
     // A value beyond the range of the object, or of real motors, is not a limit.
     let velocity = slowest.filter(|(n, _)| *n <= most && VELOCITIES.contains(n));
     let absurd = |value: Option<(f64, &'static str)>| match value {
-        Some((_, object)) => format!("{object} is no limit of a real drive"),
+        Some((_, object)) => format!("{object} is not a plausible limit"),
         None => unsaid(device, NOT_REPORTED).to_owned(),
     };
     let usual = USUAL_VELOCITY.min(most);
