@@ -115,16 +115,16 @@ pub fn al_status_hint(code: u16) -> Option<&'static str> {
             "valid outputs must already arrive when Op is requested; is the cyclic exchange running?"
         }
         SYNC_ERROR | DC_SYNC_MISSED => {
-            "frames come at the wrong moment; look at the host's jitter and the DC shift of the ESI's mode"
+            "frames arrive at the wrong time; check the host's jitter and the DC shift of the ESI's mode"
         }
         SYNC_MANAGER_WATCHDOG => {
-            "no process data for longer than the watchdog allows: a cable, lost frames, or a host that was held up"
+            "no process data for longer than the watchdog allows: a cable, lost frames, or a delayed host"
         }
         INVALID_OUTPUT_CONFIGURATION => {
-            "the length of the outputs' SyncManager differs from the assigned RxPDOs (0x1C12); did a start-up SDO fail, or is the mapping another one?"
+            "the length of the outputs' SyncManager differs from the assigned RxPDOs (0x1C12); did a start-up SDO fail, or does the mapping differ?"
         }
         INVALID_INPUT_CONFIGURATION => {
-            "the length of the inputs' SyncManager differs from the assigned TxPDOs (0x1C13); did a start-up SDO fail, or is the mapping another one?"
+            "the length of the inputs' SyncManager differs from the assigned TxPDOs (0x1C13); did a start-up SDO fail, or does the mapping differ?"
         }
         INVALID_WATCHDOG => {
             "the device does not accept this watchdog time; leave `watchdog` out to get the default"

@@ -280,7 +280,7 @@ fn an_emergency_and_the_end_stop_every_group() {
 fn a_follower_of_a_stopped_group_stops_with_its_own_group() {
     let steps = "\n[[step]]\ngear = { z = { to = \"x\" } }\n\n[[step]]\nvelocity = { x = 10.0, y = 10.0 }\n\n[[step]]\ndwell = \"2s\"\n";
     let (error, _) = run_badly(alone(steps), faults(FAULT));
-    assert_contains(&error, &["`z`", "follows no longer"]);
+    assert_contains(&error, &["`z`", "no longer follows"]);
     let line = "\n[[step]]\nline = { x = 80.0, z = 80.0 }\n";
     let (_, summary) = run_badly(alone(line), faults(FAULT));
     let summary = summary.expect("the cycle has run");
@@ -299,7 +299,7 @@ fn a_follower_of_a_stopped_group_stops_with_its_own_group() {
         .map(|s| s.group.as_str())
         .collect();
     assert_eq!(stops, ["gantry", "feeder"]);
-    assert_contains(&summary.group_stops[1].cause, &["`z`", "follows no longer"]);
+    assert_contains(&summary.group_stops[1].cause, &["`z`", "no longer follows"]);
 }
 
 /// A ramp takes its own time, independent of other groups.

@@ -79,7 +79,7 @@ pub enum SetpointError {
         highest: f64,
     },
     /// The duration is zero or too short.
-    #[error("there is no time, or too little, for the way")]
+    #[error("the time is 0 or too short for the distance")]
     NoTime,
     /// The motion starts at another position.
     #[error("the axis stands at {at} and must stand at {expected}")]

@@ -299,7 +299,7 @@ impl OpenDevice {
                     "{device}: the machine file says that it is {name} ({expected}), it is {actual}"
                 );
                 Err(Failure::new(hints::FAILED, message)
-                    .hint("check the order of the devices; `ecaxis scan` shows who is there"))
+                    .hint("check the order of the devices; `ecaxis scan` lists the devices"))
             }
             _ => Ok(()),
         }

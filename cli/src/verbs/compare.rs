@@ -85,7 +85,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let seen = ScanResult::new(&nic, scan, library.as_ref());
     seen.warn(args.intrude);
     if seen.scan.devices.iter().any(|device| device.sii.is_err()) {
-        let message = "an EEPROM could not be read, so it is not known who is there";
+        let message = "an EEPROM could not be read, so the device is unknown";
         return Err(Failure::new(hints::FAILED, message)
             .hint("end the other master, or lead the devices to Init, and compare again"));
     }

@@ -64,10 +64,10 @@ pub enum DecodeError {
         length: usize,
     },
     /// An FoE opcode that does not exist.
-    #[error("FoE opcode {0} is none that a SubDevice sends")]
+    #[error("unexpected FoE opcode {0} from a SubDevice")]
     Opcode(u8),
     /// An SDO command specifier that does not exist.
-    #[error("SDO command {0:#04x} is none")]
+    #[error("invalid SDO command specifier {0:#04x}")]
     Command(u8),
 }
 

@@ -125,7 +125,7 @@ fn type_element<'a>(
         Some("HW_EQ") => RevisionCheck::HighEqual,
         Some("HW_EQ_LW_EQ_OR_G") => RevisionCheck::HighEqualLowEqualOrGreater,
         Some(_) => {
-            c.warn(element, "CheckRevisionNo is none of its values".to_owned());
+            c.warn(element, "CheckRevisionNo has an undefined value".to_owned());
             RevisionCheck::Unstated
         }
     };

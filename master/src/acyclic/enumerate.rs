@@ -12,7 +12,7 @@ const MAX_ATTEMPTS: u32 = 5;
 /// The first station address assigned, as in ethercrab.
 pub(crate) const FIRST_STATION: u16 = 0x1000;
 
-const STEP: &str = "asking who is there";
+const STEP: &str = "looking for SubDevices";
 
 /// A SubDevice as its registers describe it.
 ///

@@ -220,7 +220,7 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
     if let (Some(idle), true, None) = (&raw.idle, awake, &raw.cpu)
         && !raw.written.has("cpu")
     {
-        let message = "it is not said which CPU to keep awake";
+        let message = "the CPU to keep awake is missing";
         let hint = "say where the real-time thread runs: `cpu = 1`";
         p.add_hint(idle.span(), message, hint);
     }
@@ -344,7 +344,7 @@ fn places(devices: &[RawDevice], p: &mut Problems<'_>) -> Vec<Option<Locator>> {
             }
             (None, _) if placed => None,
             (None, _) => {
-                let message = "it is not said where on the bus the device is";
+                let message = "the position on the bus is missing";
                 let hint = format!("add `position = {}`, or `alias` or `id`", places.len());
                 p.add_hint(device.span.clone(), message, hint);
                 None

@@ -54,7 +54,7 @@ pub(crate) fn check(
         p.add_hint(after.span(), message, hint);
     }
     if let (Some(port), None) = (&raw.port, &raw.after) {
-        let message = "it is not said which device's port this is";
+        let message = "the device of this port is missing";
         let hint = "add `after`, the name of the device it is connected to";
         p.add_hint(port.span(), message, hint);
     }
@@ -336,7 +336,7 @@ mod tests {
         let c = ("c", "C", 0, "");
         for (rest, message, hint) in [
             (&[("t", "T", 1, "after = \"d\"")][..], "no device \"d\"", "devices"),
-            (&[("t", "T", 1, "port = 1")], "not said which device's port", "add `after`"),
+            (&[("t", "T", 1, "port = 1")], "the device of this port is missing", "add `after`"),
             (&[("t", "T", 1, "after = \"c\"\nport = 0")], "from 1 to 3, found 0", ""),
             (&[("t", "T", 1, "after = \"c\"\nport = 3")], "\"c\" has no port 3", "0 (Ethernet), 1 (E-bus), 2 (Ethernet)"),
             (&[("t", "T", 1, "after = \"c\"\nport = 2")], "port 2 of \"c\" is Ethernet, \"t\" needs E-bus", ""),

@@ -121,7 +121,7 @@ pub enum Cause {
     Eeprom(EepromError),
     #[error("its EEPROM: {0}")]
     Sii(SiiError),
-    #[error("the EEPROM says nothing of a mailbox")]
+    #[error("the EEPROM describes no mailbox")]
     NoMailbox,
     #[error("is in {state}, where it has no CoE mailbox")]
     WrongState { state: AlState },
@@ -331,7 +331,7 @@ pub enum Cause {
     #[error("emergency stop: {condition}")]
     EmergencyStop { condition: String },
     #[error(
-        "follows no longer: {}{}",
+        "no longer follows: {}{}",
         reason.map_or_else(|| "another command took over".to_owned(), |reason| reason.to_string()),
         cause.as_ref().map_or_else(String::new, |cause| format!(": {cause}"))
     )]

@@ -48,11 +48,8 @@ pub(super) fn check(raw: &RawFault, line: u32) -> Result<Fault, String> {
         .find(|(key, given)| *given && !allowed.contains(key))
     {
         return Err(match allowed {
-            [] => format!("`{key}` means nothing here; it has no keys of its own"),
-            _ => format!(
-                "`{key}` means nothing here; what it knows is `{}`",
-                allowed.join("`, `")
-            ),
+            [] => format!("`{key}` is unknown here: this kind takes no keys"),
+            _ => format!("`{key}` is unknown here; known: `{}`", allowed.join("`, `")),
         });
     }
     Ok(Fault {

@@ -176,9 +176,9 @@ fn script_errors_name_line_and_field() {
     );
     #[rustfmt::skip] // one row a mistake
     let rows = [
-        ("kind = \"absent\"\ncode = 1\n", "`code` means nothing here; what it knows is `device`"),
-        ("kind = \"silent\"\ndevice = 1\n", "`device` means nothing here; it has no keys of its own"),
-        ("kind = \"frame-loss\"\ndevice = 1\ncount = 1\n", "`device` means nothing here"),
+        ("kind = \"absent\"\ncode = 1\n", "`code` is unknown here; known: `device`"),
+        ("kind = \"silent\"\ndevice = 1\n", "`device` is unknown here: this kind takes no keys"),
+        ("kind = \"frame-loss\"\ndevice = 1\ncount = 1\n", "`device` is unknown here"),
         ("kind = \"link-break\"\nport = 4\n", "ports are 0 to 3"),
         ("kind = \"melt\"\n", "known are frame-loss, frame-duplicate, frame-delay, frame-corrupt, drive-fault"),
         ("kind = \"frame-duplicate\"\n", "needs either `count` or `probability`"),
@@ -187,7 +187,7 @@ fn script_errors_name_line_and_field() {
         ("kind = \"frame-corrupt\"\nprobability = 1.5\n", "between 0 and 1"),
         ("kind = \"frame-delay\"\ncount = 1\n", "`delay` is missing"),
         ("kind = \"frame-delay\"\ncount = 1\ndelay = \"1\"\n", "not a duration"),
-        ("kind = \"swap\"\nstate = \"op\"\n", "`state` means nothing here; what it knows is `device`, `vendor`"),
+        ("kind = \"swap\"\nstate = \"op\"\n", "`state` is unknown here; known: `device`, `vendor`"),
         ("kind = \"sync-late\"\n", "`delay` is missing"),
         ("kind = \"sdo-ignored\"\n", "`index` is missing"),
         ("kind = \"other-main-device\"\n", "needs either"),

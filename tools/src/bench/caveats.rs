@@ -51,7 +51,7 @@ fn of_one(plan: &Plan, variant: &Variant) -> Vec<String> {
         && steal_ns as f64 > wall * STEAL
     {
         remarks.push(format!(
-            "{name}: the hypervisor took {:.1} % of CPU {} for others: its p99.9 and max say nothing of this program",
+            "{name}: the hypervisor took {:.1} % of CPU {} for others: its p99.9 and max do not characterize this program",
             steal_ns as f64 / wall * 100.0,
             plan.cpu
         ));
@@ -97,7 +97,7 @@ fn of_one(plan: &Plan, variant: &Variant) -> Vec<String> {
         && bus.held_up * 100 > bus.frames
     {
         remarks.push(format!(
-            "{name}: {:.1} % of the replies were held up by this computer: release to input is too long by that",
+            "{name}: {:.1} % of the replies were delayed by this computer: release to input includes the delay",
             bus.held_up as f64 / bus.frames.max(1) as f64 * 100.0
         ));
     }

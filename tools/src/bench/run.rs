@@ -420,7 +420,7 @@ fn settings(plan: &Plan) -> Vec<Fact> {
     settings.push(fact("spinning", spin));
     let other = match (plan.other_cpu, plan.hog) {
         (Some(cpu), true) => format!("a CPU hog on CPU {cpu}"),
-        (None, true) => "a hog was asked for, but there is no other CPU".to_owned(),
+        (None, true) => "a CPU hog was requested, but there is no other CPU".to_owned(),
         _ => "nothing of ours".to_owned(),
     };
     settings.push(fact("other load", other));

@@ -301,7 +301,7 @@ fn siblings(context: &Context<'_>, notes: &mut ReportBuilder) {
         Severity::Note,
         "smt",
         format!("CPU {cpu} shares its core with CPU {other}"),
-        "Whatever runs there takes execution units and cache: work a cycle takes up to twice as long.",
+        "Programs on that CPU use the same execution units and cache: the work of a cycle takes up to twice as long.",
         write(host, "0", &format!("/{FOLDER}/cpu{other}/online")),
     );
 }

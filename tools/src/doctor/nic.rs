@@ -111,7 +111,7 @@ impl NicCheck<'_> {
                 fix,
             );
         };
-        let other = || Fix::advice("take an Ethernet card of its own for EtherCAT");
+        let other = || Fix::advice("use a dedicated network card for EtherCAT");
         if self.has("wireless") || self.has("phy80211") {
             bad(
                 notes,
@@ -163,7 +163,7 @@ impl NicCheck<'_> {
                 Severity::Warning,
                 "nic-usb",
                 format!("`{nic}` is a USB adapter"),
-                "USB asks for received frames in intervals of its own: replies come 0.1 to 1 ms later, irregularly. Good for cycles of some milliseconds at best.",
+                "USB polls for received frames at its own intervals: replies come 0.1 to 1 ms later, irregularly. Usable only for cycle times of several milliseconds.",
                 vec![Fix::advice("take a card on PCI Express, or one of the mainboard's")],
             );
         }

@@ -153,7 +153,7 @@ fn balancing(context: &Context<'_>, notes: &mut ReportBuilder) {
             Severity::Note,
             "irqbalance",
             "irqbalance moves interrupts between all CPUs",
-            "The cycle's CPU gets the interrupts of other devices, a few microseconds each, and the network card's wander.",
+            "The cycle's CPU gets the interrupts of other devices, a few microseconds each, and the network card's interrupts move between CPUs.",
             vec![Fix::lasting("sudo systemctl disable --now irqbalance")],
         );
     }

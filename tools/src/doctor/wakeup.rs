@@ -208,7 +208,7 @@ pub(super) fn examine(wake_up: &WakeUp, notes: &mut ReportBuilder) {
     let stolen = way.stolen_ms.filter(|ms| *ms > 0);
     let mut fix = vec![Fix::advice(match stolen {
         Some(ms) => format!(
-            "The host of this virtual machine took {ms} ms meanwhile: give it CPUs of its own there, or take a computer of metal."
+            "The host of this virtual machine took {ms} ms meanwhile: assign dedicated CPUs to it there, or use a physical computer."
         ),
         None => {
             "Fix the other findings, then measure again with the machine's usual load.".to_owned()

@@ -138,7 +138,7 @@ async fn read_coe_identity(
     examined: &DeviceIdentity,
 ) -> Result<CoeIdentity, Error> {
     let DeviceIdentity { device, sii, .. } = examined;
-    with_mailbox(wire, device, sii, "asking it who it is", async |lent| {
+    with_mailbox(wire, device, sii, "reading its identity", async |lent| {
         lent.coe.set_timeouts(PATIENT);
         let spoken = ask(wire, &mut lent.coe).await;
         spoken.map_err(|error| Cause::Sdo(error).with_device(device))

@@ -362,7 +362,7 @@ async fn ask(wire: &DatagramClient, device: &Device) -> Option<Result<CoeInfo, S
     let at = device
         .found
         .named(format!("position {}", device.position()));
-    let answers = with_mailbox(wire, &at, sii, "asking it who it is", async |lent| {
+    let answers = with_mailbox(wire, &at, sii, "reading its identity", async |lent| {
         let answers = coe_info::ask(wire, &mut lent.coe, device).await;
         answers.map_err(|error| Cause::Sdo(error).with_device(&at))
     });

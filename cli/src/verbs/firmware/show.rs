@@ -53,7 +53,7 @@ pub(super) fn change(before: &DeviceIdentity, now: &DeviceIdentity, out: &mut Do
     }
     out.table(table);
     if VERSION.iter().all(|(_, of)| of(before) == of(now)) {
-        out.line("It says the same of itself as before.");
+        out.line("It reports the same versions as before.");
     }
 }
 

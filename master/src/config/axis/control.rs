@@ -170,7 +170,7 @@ pub(super) fn homing(
     if let Some(timeout) = raw.timeout.as_ref().filter(|t| *t.get_ref() == 0) {
         p.add_hint(
             timeout.span(),
-            "a `timeout` of nothing ends the search before it begins",
+            "a `timeout` of 0 ends the search before it begins",
             "write the time that the longest search may take, such as \"60s\"",
         );
         return None;

@@ -359,7 +359,7 @@ impl RawProbe {
             }
             [false, false] if self.written.unknown => return None,
             [false, false] => (
-                "it is not said how far to search for the edge",
+                "the distance to search for the edge is missing",
                 "add `to = 50.0`, a position, or `by = 10.0`, a way from where the axis is",
             ),
             _ => return Some(()),

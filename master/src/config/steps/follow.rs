@@ -33,7 +33,7 @@ impl ProgramChecker<'_> {
             return Some((index, axis));
         }
         let message = format!(
-            "`{verb}` is nothing that `{}` does in mode \"{}\"",
+            "`{verb}` is not possible for `{}` in mode \"{}\"",
             name.get_ref(),
             axis.mode
         );

@@ -389,7 +389,7 @@ impl ProgramState<'_, '_, '_, '_> {
                 None => String::new(),
             };
             let message = format!(
-                "`{verb}` is nothing that `{name}` does in mode \"{}\"{by}{round}",
+                "`{verb}` is not possible for `{name}` in mode \"{}\"{by}{round}",
                 word(state.mode)
             );
             (message, better(name, setup, what))

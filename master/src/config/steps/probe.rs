@@ -49,7 +49,7 @@ impl ProgramChecker<'_> {
         if !self.any_mode(index, |mode| TargetKind::Position.possible(mode, axis)) {
             let (_, hint) = TargetKind::Position.impossible(name.get_ref(), axis);
             let message = format!(
-                "`probe` is nothing that `{}` does in mode \"{}\"",
+                "`probe` is not possible for `{}` in mode \"{}\"",
                 name.get_ref(),
                 axis.mode
             );

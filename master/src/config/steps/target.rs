@@ -129,7 +129,7 @@ impl TargetKind {
 
     pub(super) fn impossible(self, name: &str, axis: &AxisSetup) -> (String, String) {
         let message = format!(
-            "`{}` is nothing that `{name}` does in mode \"{}\"",
+            "`{}` is not possible for `{name}` in mode \"{}\"",
             self.verb(),
             axis.mode
         );

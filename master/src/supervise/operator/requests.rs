@@ -483,7 +483,7 @@ impl RequestController {
                 let Some(homing) = setup else {
                     return Err((
                         axis,
-                        "the machine file says nothing of its homing".to_owned(),
+                        "the machine file does not configure its homing".to_owned(),
                     ));
                 };
                 let timeout_s = homing.timeout_ns as f64 * 1e-9;
