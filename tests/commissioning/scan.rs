@@ -214,7 +214,7 @@ fn scan_write_includes_a_device_without_esi() {
     // The simulated bus takes the images, too.
     bench.well(&["run", "machine.toml", "--virtual", "--enable"]);
 
-    // A damaged image is no description: its process data would be others.
+    // A damaged image does not describe the device: its process data would differ.
     let image = std::fs::read(bench.path().join("axis2.sii")).expect("an image");
     std::fs::write(bench.path().join("axis2.sii"), &image[..image.len() - 40]).expect("written");
     let refused = bench.ecaxis(&["check", "machine.toml"]);
