@@ -506,6 +506,89 @@ fn packages_depend_in_one_direction() {
     }
 }
 
+/// Returns the names after each `crate::` of a source file, without comments and in-file tests.
+fn used_modules(text: &str) -> Vec<String> {
+    let mut lines = text.lines().peekable();
+    let mut code = String::new();
+    while let Some(line) = lines.next() {
+        if line == "#[cfg(test)]" && lines.peek().is_some_and(|next| next.ends_with('{')) {
+            break;
+        }
+        code += line.split("//").next().unwrap_or_default();
+        code.push('\n');
+    }
+    let names = |rest: &str| -> Vec<String> {
+        let paths = match rest.strip_prefix('{') {
+            Some(group) => group.split(['}', ';']).next().unwrap_or_default(),
+            None => rest,
+        };
+        let count = if paths.len() == rest.len() {
+            1
+        } else {
+            usize::MAX
+        };
+        let first = |path: &str| {
+            let end = path.find(|c: char| !c.is_alphanumeric() && c != '_');
+            path[..end.unwrap_or(path.len())].to_owned()
+        };
+        paths
+            .split(',')
+            .take(count)
+            .map(|path| first(path.trim()))
+            .collect()
+    };
+    code.split("crate::").skip(1).flat_map(names).collect()
+}
+
+/// A module of the library may use the modules below it, never one that uses it.
+#[test]
+fn modules_of_the_library_have_no_circles() {
+    let source = root().join("master/src");
+    let mut uses = std::collections::BTreeMap::<String, std::collections::BTreeSet<String>>::new();
+    let mut folders = vec![source.clone()];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).expect("a folder") {
+            let path = entry.expect("an entry").path();
+            let name = path.file_stem().and_then(|n| n.to_str()).expect("a name");
+            if name.ends_with("tests") || name == "lib" || name == "documented" {
+                continue;
+            }
+            if path.is_dir() {
+                folders.push(path);
+                continue;
+            }
+            let below = path.strip_prefix(&source).expect("below");
+            let module = below
+                .iter()
+                .next()
+                .and_then(|n| n.to_str())
+                .expect("a name");
+            let module = module.trim_end_matches(".rs").to_owned();
+            let text = std::fs::read_to_string(&path).expect("a source file");
+            let used = used_modules(&text)
+                .into_iter()
+                .filter(|used| *used != module);
+            uses.entry(module.clone()).or_default().extend(used);
+        }
+    }
+    let known: Vec<String> = uses.keys().cloned().collect();
+    for used in uses.values_mut() {
+        used.retain(|module| known.contains(module));
+    }
+    assert!(
+        uses["session"].contains("config"),
+        "uses are found: {uses:?}"
+    );
+    // Takes away modules that use nothing more; the modules of a circle stay.
+    while let Some(bottom) = uses.iter().find(|(_, used)| used.is_empty()) {
+        let bottom = bottom.0.clone();
+        uses.remove(&bottom);
+        uses.values_mut()
+            .for_each(|used| drop(used.remove(&bottom)));
+    }
+    assert!(uses.is_empty(), "modules that use each other: {uses:#?}");
+}
+
 /// The cycle takes plain data. Of its package it uses only what lies below it.
 #[test]
 fn the_cycle_depends_on_links_and_clocks_only() {

@@ -5,14 +5,16 @@
 use std::convert::Infallible;
 use std::time::Duration;
 
+pub use crate::config::state_timeouts::BACK_TIMEOUT;
+pub use crate::report::StateError;
 pub use ecaxis_ecat::al_state::AlState;
 
-use super::{DatagramClient, DeviceRef, Transition};
+use super::{DatagramClient, DeviceRef};
 use crate::concurrent::try_join_all;
 use crate::mailbox::{DatagramError, MailboxTransport};
 use crate::report::{Cause, Error};
 use ecaxis_ecat::al_state::ERROR;
-use ecaxis_ecat::al_status_code::{self, al_status_text};
+use ecaxis_ecat::al_status_code;
 use ecaxis_ecat::registers;
 
 const ID_REQUEST: u8 = 0x20;
@@ -21,48 +23,17 @@ const POLL: Duration = Duration::from_micros(500);
 /// 200 ms for a device to process an acknowledgement.
 const ACKNOWLEDGE_POLLS: u32 = 400;
 
-/// The ETG.1020 default for PreOp → SafeOp.
-pub const SAFE_OP_TIMEOUT: Duration = Duration::from_secs(10);
-/// The ETG.1020 default for a transition to a lower state.
-pub const BACK_TIMEOUT: Duration = Duration::from_secs(5);
-
 /// The time in which a device answers the request of its identification if ESI or EEPROM say that it
 /// has one.
 pub const IDENTIFICATION_TIMEOUT: Duration = Duration::from_secs(1);
 /// The time for every other device.
 pub const SHORT_IDENTIFICATION_TIMEOUT: Duration = Duration::from_millis(10);
 
-/// A SubDevice that did not reach the requested state.
-#[derive(Debug, thiserror::Error)]
-pub enum StateError {
-    #[error(
-        "refused {wanted}: stays in {actual}, AL status code 0x{code:04x} ({})",
-        al_status_text(*code)
-    )]
-    Refused {
-        wanted: AlState,
-        actual: AlState,
-        code: u16,
-    },
-    #[error("did not reach {wanted} within {} ms, is in {actual}", timeout.as_millis())]
-    Timeout {
-        wanted: AlState,
-        actual: AlState,
-        timeout: Duration,
-    },
-    #[error("no longer answers while it should go to {wanted}")]
-    Gone { wanted: AlState },
-    #[error("changing to {wanted}: {source}")]
-    Wire {
-        wanted: AlState,
-        source: DatagramError,
-    },
-}
-
-impl StateError {
-    pub(crate) fn with_device(self, device: &DeviceRef) -> Error {
-        Cause::State(self).with_device(device)
-    }
+/// A device and the time-out of its state change.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Transition<'d> {
+    pub device: &'d DeviceRef,
+    pub timeout: Duration,
 }
 
 /// Returns AL status and AL status code; `None` if the device does not answer.

@@ -6,6 +6,8 @@ use super::Registers;
 use crate::acyclic::{AlState, DeviceRef};
 use crate::cancel::CancelToken;
 use crate::mailbox::MailboxTransport;
+use crate::report::EEPROM_TIMEOUT;
+pub use crate::report::EepromError;
 use crate::report::{Cause, Error};
 use ecaxis_ecat::registers;
 use ecaxis_ecat::sii::{self, HEADER_BYTES, control::*};
@@ -26,29 +28,9 @@ const MAX_BYTES: usize = 512 * 1024;
 const PIECE: usize = 1024;
 
 const POLL: Duration = Duration::from_micros(200);
-/// The timeout for one word; a write takes at most 10 ms.
-const TIMEOUT: Duration = Duration::from_secs(1);
 /// The number of attempts. A chip that is still writing does not acknowledge.
 const MAX_ATTEMPTS: u32 = 5;
 const RETRY: Duration = Duration::from_millis(10);
-
-/// An error of the EEPROM interface.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum EepromError {
-    #[error("the device's own processor is using it")]
-    InUse,
-    #[error("word 0x{word:04x}: still busy after {} ms", TIMEOUT.as_millis())]
-    Busy { word: u32 },
-    #[error("word 0x{word:04x}: the chip does not acknowledge (status 0x{status:04x})")]
-    NotAcknowledged { word: u32, status: u16 },
-    #[error("word 0x{word:04x}: writing is not permitted (status 0x{status:04x})")]
-    WriteProtected { word: u32, status: u16 },
-    /// The chip is smaller than the image: reads beyond its end return its beginning.
-    #[error("the image is longer than the chip, which holds {bytes} bytes")]
-    Smaller { bytes: usize },
-    #[error("word 0x{word:04x}: 0x{wanted:04x} was written, 0x{found:04x} is there")]
-    NotKept { word: u32, wanted: u16, found: u16 },
-}
 
 /// Whether the MainDevice may take the EEPROM from the PDI.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -344,7 +326,7 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
 
     async fn done(&self, word: u32) -> Result<u16, Error> {
         let wire = self.registers.wire;
-        let time = u64::try_from(TIMEOUT.as_nanos()).unwrap_or(u64::MAX);
+        let time = u64::try_from(EEPROM_TIMEOUT.as_nanos()).unwrap_or(u64::MAX);
         let end = wire.now().saturating_add(time);
         loop {
             let status = u16::from_le_bytes(self.registers.read(registers::EEPROM_CONTROL).await?);

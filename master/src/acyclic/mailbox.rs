@@ -1,7 +1,5 @@
 //! The mailboxes of one SubDevice, in the state in which it is found.
 
-use std::time::Duration;
-
 use ecaxis_ecat::registers;
 use ecaxis_esi::model::SmUse;
 use ecaxis_esi::sii::{MailboxAreas, Sii};
@@ -18,8 +16,7 @@ const MAILBOX_OUT: u8 = 0x26;
 const MAILBOX_IN: u8 = 0x22;
 const ENABLED: u8 = 1;
 
-/// The ETG.1020 default timeout for Init → PreOp and Init → Bootstrap.
-pub const PRE_OP_TIMEOUT: Duration = Duration::from_secs(3);
+pub use crate::config::state_timeouts::PRE_OP_TIMEOUT;
 
 /// A CoE mailbox, and the state to which its device returns afterwards.
 #[derive(Debug)]

@@ -10,17 +10,15 @@
 //! - [`eeprom`]: the EEPROM interface of one device;
 //! - [`image`]: EEPROM images, and how to write them;
 //! - [`mailbox`]: the mailboxes of one device, and the state they need;
-//! - [`state_timeouts`]: the time-outs of state changes;
 //! - [`topology`]: how the devices are connected.
-
-use std::fmt;
 
 use crate::mailbox::{DatagramError, MailboxTransport};
 use crate::report::{Cause, Error};
 
+pub use crate::config::StateTimeouts;
 pub use crate::datagram::DatagramClient;
-pub use al::{AlState, StateError};
-pub use state_timeouts::{StateTimeouts, Transition};
+pub use crate::report::DeviceRef;
+pub use al::{AlState, StateError, Transition};
 
 pub mod al;
 pub mod device;
@@ -28,28 +26,9 @@ pub mod eeprom;
 pub mod enumerate;
 pub mod image;
 pub mod mailbox;
-pub mod state_timeouts;
 #[cfg(test)]
 mod tests;
 pub mod topology;
-
-/// The SubDevice that an error refers to.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct DeviceRef {
-    pub name: String,
-    pub position: u16,
-    pub station: u16,
-}
-
-impl fmt::Display for DeviceRef {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
-            "`{}` (position {}, station 0x{:04x})",
-            self.name, self.position, self.station
-        )
-    }
-}
 
 /// The registers of a device. Every error names the device.
 #[derive(Debug)]

@@ -11,16 +11,19 @@
     reason = "an error here carries the whole address and ends the run"
 )]
 
-use std::fmt;
+use std::future::poll_fn;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::pin::pin;
+use std::task::{Context, Poll};
 
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
-use crate::acyclic::state_timeouts::mailbox_timeouts;
 use crate::acyclic::{AlState, DeviceRef, StateTimeouts, Transition, al, enumerate};
 use crate::clock;
 use crate::concurrent::try_join_all;
+use crate::config::state_timeouts::mailbox_timeouts;
 use crate::config::{AdoptedUnits, DeviceConfig, LimitConflict, MAX_SUBDEVICES, Machine};
 use crate::datagram::DatagramClient;
 use crate::mailbox::CoeClient;
@@ -28,7 +31,7 @@ use crate::mailbox::worker::EmergencySink;
 use crate::report::{Cause, Error};
 use crate::rt::image::{self, DeviceRegion, ImagePlan};
 use crate::rt::phase::ClockPlan;
-use crate::text::pluralize;
+use crate::text::panic_text;
 
 pub mod align;
 pub(crate) mod clocks;
@@ -43,10 +46,11 @@ mod times;
 pub(crate) use identify::name_at;
 mod watchdog;
 
+pub use crate::report::bring_up::{Step, StepTime};
 use device::StartupPhase;
 pub(crate) use device::enable_op_only;
 pub use device::{SdoOutcome, write_startup_sdo};
-pub use times::{StepTime, StepTimes};
+pub use times::StepTimes;
 
 /// The size of ethercrab's own process image, which is not used.
 const MAX_PDI: usize = 1;
@@ -91,84 +95,6 @@ pub struct Bus {
     pub clocks_settled: bool,
     /// The durations of the steps so far.
     pub times: StepTimes,
-}
-
-/// A step of the bring-up, for display.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Step {
-    Scan,
-    Found {
-        devices: usize,
-    },
-    StartUp {
-        device: String,
-        done: usize,
-        of: usize,
-    },
-    /// Start-up SDOs whose values the device already had.
-    Held {
-        device: String,
-        held: usize,
-        of: usize,
-    },
-    ProcessData {
-        bytes: usize,
-        frames: usize,
-    },
-    Clocks {
-        reference: String,
-        devices: usize,
-    },
-    State(AlState),
-    /// A unit taken over from the drive.
-    Adopted {
-        device: String,
-        what: String,
-    },
-    /// A warning; the bring-up continues.
-    Warning(String),
-}
-
-impl fmt::Display for Step {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Scan => f.write_str("scanning the segment"),
-            Self::Found { devices: 1 } => {
-                f.write_str("1 SubDevice, as in the machine file; in PreOp")
-            }
-            Self::Found { devices } => {
-                write!(
-                    f,
-                    "{devices} SubDevices, all as in the machine file; in PreOp"
-                )
-            }
-            Self::StartUp { device, done, of } => write!(f, "`{device}`: start-up SDO {done}/{of}"),
-            Self::Held { device, held, of } => {
-                write!(
-                    f,
-                    "`{device}`: {held} of {of} start-up SDOs were held already"
-                )
-            }
-            Self::ProcessData { bytes, frames } => {
-                write!(
-                    f,
-                    "process image: {} in {}",
-                    pluralize(*bytes, "byte"),
-                    pluralize(*frames, "frame")
-                )
-            }
-            Self::Clocks { reference, devices } => {
-                write!(
-                    f,
-                    "distributed clocks: `{reference}` is the reference, SYNC0 on {}",
-                    pluralize(*devices, "device")
-                )
-            }
-            Self::State(state) => write!(f, "all SubDevices in {state}"),
-            Self::Adopted { device, what } => write!(f, "`{device}`: {what}"),
-            Self::Warning(text) => f.write_str(text),
-        }
-    }
 }
 
 /// Brings the segment from any state to SafeOp. Passes emergencies of the devices to the listener,

@@ -3,21 +3,8 @@
 use std::cell::RefCell;
 use std::future::Future;
 
-use serde::Serialize;
-
 use crate::clock::{self, Nanos};
-
-/// A step of the bring-up. Devices run their steps at the same time, so steps may overlap.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct StepTime {
-    pub name: &'static str,
-    /// The time in ns from the start of the bring-up to the start of the first device.
-    pub began_ns: Nanos,
-    /// The time in ns from the start of the first device to the end of the last one.
-    pub took_ns: Nanos,
-    /// The device that took longest, and its time in ns.
-    pub slowest: Option<(String, Nanos)>,
-}
+use crate::report::bring_up::StepTime;
 
 /// The steps of a bring-up in the order of their start.
 #[derive(Debug)]

@@ -47,6 +47,7 @@ mod sdo;
 mod signal;
 pub mod sim;
 mod startup;
+pub mod state_timeouts;
 pub(crate) mod steps;
 mod syntax;
 #[cfg(test)]
@@ -63,6 +64,7 @@ pub use problem::{ConfigError, Problem, nearest};
 pub use program::{Action, Step, StopGroup, StopSetup, TableFile};
 pub use signal::{NameError, Signal};
 pub use startup::{Startup, StartupOptions};
+pub use state_timeouts::StateTimeouts;
 
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 use ecaxis_esi as esi;
@@ -70,9 +72,9 @@ use ecaxis_esi as esi;
 use fields::Read;
 use raw::RawMachine;
 
-use crate::acyclic::StateTimeouts;
 use crate::esi_library::{RevisionMatch, SiiImage};
 use crate::file;
+use crate::link::SocketKind;
 pub use crate::rt::config::{Condition, ExchangeMode, GroupStopScope};
 use crate::rt::config::{GroupConfig, RtConfig};
 pub use crate::rt::controller::{AxisRef, InputRef, OutputRef};
@@ -185,35 +187,6 @@ impl Default for Bus {
             link: SocketKind::default(),
             written: Vec::new(),
         }
-    }
-}
-
-/// How frames are received from a network interface.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum SocketKind {
-    /// From a ring in memory that the kernel shares.
-    #[default]
-    Ring,
-    /// By one system call per frame.
-    Packet,
-}
-
-impl SocketKind {
-    pub const ALL: &[Self] = &[Self::Ring, Self::Packet];
-
-    /// Returns the name in the machine file.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Ring => "ring",
-            Self::Packet => "packet",
-        }
-    }
-}
-
-impl fmt::Display for SocketKind {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
     }
 }
 

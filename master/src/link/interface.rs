@@ -266,7 +266,7 @@ mod tests {
         assert_eq!(with(&[("mtu", "9000")]).1, Ok(()));
         for (file, text, said) in [
             ("type", "772", "loopback"),
-            ("type", "280", "no Ethernet"),
+            ("type", "280", "not an Ethernet interface"),
             ("phy80211", "", "wireless"),
             ("wireless", "", "wireless"),
             ("uevent", "DEVTYPE=vlan\nINTERFACE=eth9", "VLAN"),

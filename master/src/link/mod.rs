@@ -24,15 +24,16 @@ pub mod nic;
 pub mod pdu_loop;
 pub mod replay;
 pub mod sim;
+mod socket_kind;
 pub mod source_address;
 
 pub use crate::clock::Nanos;
-pub use crate::config::SocketKind;
 pub use filter::LinkStats;
 pub use frame_queue::FrameQueue;
 pub use interface::{NicWarning, OpenError};
 pub use lock::open_exclusive;
 use nic::NicLink;
+pub use socket_kind::SocketKind;
 
 /// Largest frame without FCS.
 pub const MAX_FRAME: usize = 1514;

@@ -50,7 +50,7 @@ pub enum CoeCause {
     Mailbox { out_len: u16, in_len: u16 },
     /// No frames come back.
     #[error("{}", LostDatagram(.0))]
-    Wire(DatagramError),
+    Wire(#[source] DatagramError),
 }
 
 impl<S: fmt::Display> fmt::Display for CoeError<S> {
@@ -64,7 +64,11 @@ impl<S: fmt::Display> fmt::Display for CoeError<S> {
     }
 }
 
-impl<S: fmt::Debug + fmt::Display> std::error::Error for CoeError<S> {}
+impl<S: fmt::Debug + fmt::Display> std::error::Error for CoeError<S> {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        Some(&self.cause)
+    }
+}
 
 impl<S: fmt::Display> CoeError<S> {
     /// Returns the text without the station, for a reader who knows the device.

@@ -4,19 +4,18 @@ use std::borrow::Borrow;
 use std::fmt;
 use std::sync::Arc;
 
-use ecaxis_axis::cia402::describe;
 use ecaxis_axis::{CommandError, Mode, State, Trip};
 
-use crate::acyclic::eeprom::EepromError;
-use crate::acyclic::{AlState, DeviceRef, StateError};
 use crate::config::{LimitConflict, Step, UnitProblem};
 use crate::link::{LinkError, OpenError};
 use crate::mailbox::{DatagramError, InfoError, SdoError};
 use crate::rt::image::{NotMapped, TooLarge};
 use crate::rt::setpoint_generator::GeneratorError;
-use crate::text::{pluralize, rounded};
+use crate::text::rounded;
 
-use super::{DiagnosisMessage, EmergencyReport, StepRef};
+use super::cause_text::{al_note, by, code_note, list, lost, lost_note, mode_note};
+use super::{DeviceRef, DiagnosisMessage, EepromError, EmergencyReport, StateError, StepRef};
+use ecaxis_ecat::al_state::AlState;
 use ecaxis_ecat::al_status_code::al_status_text;
 use ecaxis_esi::address;
 use ecaxis_esi::sii::SiiError;
@@ -29,6 +28,7 @@ pub struct Error {
     pub at: Option<Location>,
     /// What the master was doing there.
     pub action: Option<&'static str>,
+    #[source]
     pub cause: Box<Cause>,
 }
 
@@ -94,7 +94,7 @@ pub enum Cause {
     #[error("starting a thread: {0}")]
     Thread(String),
     #[error("the link failed: {0}")]
-    Link(LinkError),
+    Link(#[source] LinkError),
     #[error(transparent)]
     TooLarge(TooLarge),
     #[error(transparent)]
@@ -120,15 +120,15 @@ pub enum Cause {
     #[error(transparent)]
     Eeprom(EepromError),
     #[error("its EEPROM: {0}")]
-    Sii(SiiError),
+    Sii(#[source] SiiError),
     #[error("the EEPROM describes no mailbox")]
     NoMailbox,
     #[error("is in {state}, where it has no CoE mailbox")]
     WrongState { state: AlState },
     #[error("{}", .0.without_station())]
-    Sdo(SdoError),
+    Sdo(#[source] SdoError),
     #[error("{}", .0.without_station())]
-    Information(InfoError),
+    Information(#[source] InfoError),
     /// The scan failed, and no device explains it.
     #[error("{0}")]
     Scan(String),
@@ -280,6 +280,7 @@ pub enum Cause {
     Refused {
         reason: String,
         /// The axis's error if the axis refused the command.
+        #[source]
         by_axis: Option<Box<CommandError>>,
     },
     #[error(
@@ -316,6 +317,7 @@ pub enum Cause {
     NotHomed {
         /// The homing method (0x6098).
         method: i8,
+        #[source]
         error: ecaxis_axis::homing::HomingError,
     },
     #[error("{condition} did not come within {timeout_ms} ms: it is {value}")]
@@ -339,6 +341,7 @@ pub enum Cause {
         /// `None`: another command took over the axis.
         reason: Option<GeneratorError>,
         /// The error that stopped the group of the axis it followed.
+        #[source]
         cause: Option<Arc<Error>>,
     },
     #[error("is not enabled: {reason}")]
@@ -347,6 +350,7 @@ pub enum Cause {
     GroupStopped {
         group: String,
         /// The error that stopped the group.
+        #[source]
         cause: Arc<Error>,
     },
     #[error("the controller panicked")]
@@ -536,64 +540,5 @@ fn few(names: &[String]) -> String {
     match names.len().saturating_sub(FEW) {
         0 => text,
         more => format!("{text} and {more} more"),
-    }
-}
-
-fn list(problems: &[UnitProblem]) -> String {
-    let each: Vec<String> = problems.iter().map(ToString::to_string).collect();
-    each.join("; ")
-}
-
-fn al_note(al_status: Option<(u8, u16)>) -> String {
-    match al_status {
-        Some((status, count)) => {
-            let answer = if count == 1 { "answers" } else { "answer" };
-            format!(
-                "the working counter is wrong; {} {answer}, AL status 0x{status:02x}",
-                pluralize(usize::from(count), "SubDevice")
-            )
-        }
-        None => "cyclic frames do not return in time".to_owned(),
-    }
-}
-
-fn mode_note(confirmed: bool) -> &'static str {
-    if confirmed {
-        ""
-    } else {
-        ", the drive has not taken over the mode of operation"
-    }
-}
-
-fn code_note(code: Option<u16>) -> String {
-    match code {
-        Some(code) => format!(
-            ", error code (0x603F) 0x{code:04x}: {}",
-            describe(code).text
-        ),
-        None => String::new(),
-    }
-}
-
-fn lost(group: Option<&str>) -> String {
-    match group {
-        Some(group) => format!("the process data of the group `{group}` is lost"),
-        None => "the bus is lost".to_owned(),
-    }
-}
-
-fn lost_note(answered: bool, (seen, expected): (u16, u16)) -> String {
-    if answered {
-        format!("with working counter {seen} instead of {expected}")
-    } else {
-        "without an answer".to_owned()
-    }
-}
-
-/// Returns the homing method in words.
-fn by(method: i8) -> String {
-    match ecaxis_axis::homing::method(method) {
-        Some(known) => format!("method {method} ({})", known.text),
-        None => format!("method {method}"),
     }
 }

@@ -6,6 +6,9 @@
 //!   reported;
 //! - [`Summary`]: the result.
 
+pub mod bring_up;
+mod cause_text;
+mod device_error;
 mod diagnosis_message;
 mod emergencies;
 mod error;
@@ -13,6 +16,8 @@ pub mod events;
 mod progress;
 pub(crate) mod summary;
 
+pub(crate) use device_error::EEPROM_TIMEOUT;
+pub use device_error::{DeviceRef, EepromError, StateError};
 pub use diagnosis_message::{DiagnosisKind, DiagnosisMessage};
 pub use emergencies::{EmergencyLine, EmergencyLog, EmergencyReport};
 pub use error::{Cause, DriveReport, Error, FailedStep, Location};

@@ -6,8 +6,8 @@ use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{Mode, State};
 use serde::Serialize;
 
+use super::bring_up::{Step, StepTime};
 use super::{EmergencyReport, Error};
-use crate::bringup::{Step, StepTime};
 use crate::clock::Nanos;
 use crate::config::{Machine, TorqueUnit};
 use crate::link::NicWarning;

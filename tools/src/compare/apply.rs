@@ -26,7 +26,7 @@ pub enum ApplyError {
     #[error("all devices of the file are missing")]
     NothingLeft,
     #[error("the rewritten file would be wrong: {0}")]
-    Wrong(ConfigError),
+    Wrong(#[source] ConfigError),
 }
 
 /// The inputs for the rewrite.

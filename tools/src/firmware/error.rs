@@ -62,6 +62,7 @@ pub enum UpdateCause {
         /// The last value, or why it was not readable.
         last: String,
         /// The device's answer to the command, if any.
+        #[source]
         refused: Option<Box<SdoError>>,
     },
     #[error("interrupted")]
@@ -75,7 +76,11 @@ pub enum UpdateCause {
         after: Duration,
     },
     #[error("after {after:?} it is not back: {error}")]
-    NotBack { error: Error, after: Duration },
+    NotBack {
+        #[source]
+        error: Error,
+        after: Duration,
+    },
 }
 
 struct Refusal<'a>(Option<&'a SdoError>);
@@ -158,6 +163,7 @@ pub enum FirmwareError {
     Failed {
         device: DeviceRef,
         step: UpdateStep,
+        #[source]
         cause: Box<UpdateCause>,
         left: FinalDeviceState,
     },

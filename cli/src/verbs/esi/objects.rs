@@ -146,7 +146,11 @@ fn value(type_name: &str, bytes: &[u8]) -> String {
     let bits = u32::try_from(8 * bytes.len()).unwrap_or(u32::MAX);
     let data_type = DataType::named(type_name, bits).unwrap_or(DataType::BYTES);
     match data_type.kind {
-        Kind::Text | Kind::Unicode => data_type.show(bytes),
+        Kind::Text => {
+            let text = String::from_utf8_lossy(bytes);
+            format!("{:?}", text.trim_end_matches('\0'))
+        }
+        Kind::Unicode => data_type.show(bytes),
         Kind::Signed | Kind::Real if data_type.width() == Some(bytes.len()) => {
             data_type.show(bytes)
         }

@@ -61,7 +61,7 @@ fn program_check_rejects_steps_certain_to_fail() {
         (&["torque = { x = 1.0 }", "mode = { x = \"cst\" }"], "`torque` is not possible for `x` in mode \"csp\"", "\"cst\""),
         (&["mode = { x = \"pp\" }", "line = { x = 1.0 }"], "`line` is not possible for `x` in mode \"pp\"", "\"csp\" }`"),
         (&["mode = { x = \"pp\" }", "move = { x = 1.0 }\narrive = \"together\""], "`arrive = \"together\"` is not possible for `x` in mode \"pp\"", "\"csp\" }`"),
-        (&["mode = { x = \"pp\" }", "sine = { x = { amplitude = 1, frequency = 1, periods = 1 } }"], "`sine` or `square` is nothing", "\"csp\" }`"),
+        (&["mode = { x = \"pp\" }", "sine = { x = { amplitude = 1, frequency = 1, periods = 1 } }"], "`sine` or `square` is not possible", "\"csp\" }`"),
         (&["mode = { x = \"pv\" }", "gear = { x = { to = \"y\" } }"], "`gear` is not possible for `x` in mode \"pv\"", "\"csp\" }`"),
         (&["repeat = 3", "  move = { x = 1.0 }", "  mode = { x = \"pv\" }"], "does in mode \"pv\", to which step 1.2 has switched it, when it is repeated", "\"csp\""),
         (&["all 2", "move = { x = 1.0 }", "mode = { x = \"pv\" }"], "to which step 2 has switched it, when it is repeated", "\"csp\""),

@@ -15,6 +15,7 @@ use super::super::{DatagramError, Phase};
 pub struct FoeError {
     pub station: u16,
     pub file: String,
+    #[source]
     pub cause: FoeCause,
 }
 

@@ -5,8 +5,15 @@ use std::time::Duration;
 
 use ecaxis_esi::model::Info;
 
-use super::{AlState, DeviceRef, al, mailbox};
 use crate::mailbox::Timeouts;
+use ecaxis_ecat::al_state::AlState;
+
+/// The ETG.1020 default for Init → PreOp.
+pub const PRE_OP_TIMEOUT: Duration = Duration::from_secs(3);
+/// The ETG.1020 default for PreOp → SafeOp.
+pub const SAFE_OP_TIMEOUT: Duration = Duration::from_secs(10);
+/// The ETG.1020 default for a transition to a lower state.
+pub const BACK_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The time-outs of one device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -24,9 +31,9 @@ pub struct StateTimeouts {
 impl StateTimeouts {
     /// The defaults of ETG.1020.
     pub const DEFAULT: Self = Self {
-        pre_op: mailbox::PRE_OP_TIMEOUT,
-        safe_op_op: al::SAFE_OP_TIMEOUT,
-        back_to_init: al::BACK_TIMEOUT,
+        pre_op: PRE_OP_TIMEOUT,
+        safe_op_op: SAFE_OP_TIMEOUT,
+        back_to_init: BACK_TIMEOUT,
         back_to_safe_op: Duration::from_millis(200),
     };
 
@@ -53,13 +60,6 @@ impl StateTimeouts {
             (AlState::SafeOp | AlState::Op, false) => self.safe_op_op,
         }
     }
-}
-
-/// A device and the time-out of its state change.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Transition<'d> {
-    pub device: &'d DeviceRef,
-    pub timeout: Duration,
 }
 
 /// Returns the mailbox time-outs of `Info/Mailbox/Timeout` (ETG.2000).

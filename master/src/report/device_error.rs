@@ -1,0 +1,82 @@
+//! Errors of one SubDevice: its AL state and its EEPROM.
+
+use std::fmt;
+use std::time::Duration;
+
+use ecaxis_ecat::al_state::AlState;
+use ecaxis_ecat::al_status_code::al_status_text;
+
+use super::{Cause, Error};
+use crate::mailbox::DatagramError;
+
+/// The timeout for one word; a write takes at most 10 ms.
+pub(crate) const EEPROM_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// The SubDevice that an error refers to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DeviceRef {
+    pub name: String,
+    pub position: u16,
+    pub station: u16,
+}
+
+impl fmt::Display for DeviceRef {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "`{}` (position {}, station 0x{:04x})",
+            self.name, self.position, self.station
+        )
+    }
+}
+
+/// A SubDevice that did not reach the requested state.
+#[derive(Debug, thiserror::Error)]
+pub enum StateError {
+    #[error(
+        "refused {wanted}: stays in {actual}, AL status code 0x{code:04x} ({})",
+        al_status_text(*code)
+    )]
+    Refused {
+        wanted: AlState,
+        actual: AlState,
+        code: u16,
+    },
+    #[error("did not reach {wanted} within {} ms, is in {actual}", timeout.as_millis())]
+    Timeout {
+        wanted: AlState,
+        actual: AlState,
+        timeout: Duration,
+    },
+    #[error("no longer answers while it should go to {wanted}")]
+    Gone { wanted: AlState },
+    #[error("changing to {wanted}: {source}")]
+    Wire {
+        wanted: AlState,
+        source: DatagramError,
+    },
+}
+
+impl StateError {
+    pub(crate) fn with_device(self, device: &DeviceRef) -> Error {
+        Cause::State(self).with_device(device)
+    }
+}
+
+/// An error of the EEPROM interface.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum EepromError {
+    #[error("the device's own processor is using it")]
+    InUse,
+    #[error("word 0x{word:04x}: still busy after {} ms", EEPROM_TIMEOUT.as_millis())]
+    Busy { word: u32 },
+    #[error("word 0x{word:04x}: the chip does not acknowledge (status 0x{status:04x})")]
+    NotAcknowledged { word: u32, status: u16 },
+    #[error("word 0x{word:04x}: writing is not permitted (status 0x{status:04x})")]
+    WriteProtected { word: u32, status: u16 },
+    /// The chip is smaller than the image: reads beyond its end return its beginning.
+    #[error("the image is longer than the chip, which holds {bytes} bytes")]
+    Smaller { bytes: usize },
+    #[error("word 0x{word:04x}: 0x{wanted:04x} was written, 0x{found:04x} is there")]
+    NotKept { word: u32, wanted: u16, found: u16 },
+}
