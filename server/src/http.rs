@@ -256,7 +256,7 @@ async fn operation(
         Ok(_) => {
             return refusal(&OpError::new(
                 ErrorCode::BadRequest,
-                "the body is no object",
+                "the body is not an object",
             ));
         }
         Err(error) => {

@@ -483,7 +483,7 @@ fn a_safety_connection_stays_connected() {
     }
 }
 
-/// ETG.5100: a repeated safety PDU is no error; the watchdog bounds the repetitions.
+/// ETG.5100: a repeated safety PDU does not count as an error; the watchdog bounds the repetitions.
 #[test]
 fn a_safety_connection_survives_lost_frames() {
     let (outcome, endpoints) = run("same-cycle", virtual_time(), |n| n > 300 && n % 40 < 9);

@@ -583,8 +583,9 @@ fn modules_of_the_library_have_no_circles() {
     while let Some(bottom) = uses.iter().find(|(_, used)| used.is_empty()) {
         let bottom = bottom.0.clone();
         uses.remove(&bottom);
-        uses.values_mut()
-            .for_each(|used| drop(used.remove(&bottom)));
+        for used in uses.values_mut() {
+            used.remove(&bottom);
+        }
     }
     assert!(uses.is_empty(), "modules that use each other: {uses:#?}");
 }
