@@ -340,7 +340,7 @@ fn a_leader_can_neither_home_nor_lose_power() {
         1,
     );
     for (order, part) in [
-        ("home = [\"x\"]", "searches"),
+        ("home = [\"x\"]", "is homing"),
         ("disable = [\"x\"]", "no power"),
     ] {
         let text = format!(
@@ -394,7 +394,7 @@ fn lost_frames_in_a_table_or_wave_fail_the_step() {
         let (outcome, heard) = run(machine, faults(script));
         let error = outcome.result.expect_err("held up").to_string();
         assert!(
-            error.contains("`x`") && error.contains("lost frames held"),
+            error.contains("`x`") && error.contains("lost frames delayed"),
             "{step}: {error}"
         );
         assert_eq!(steps(&heard), ["1"], "{step}");

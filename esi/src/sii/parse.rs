@@ -182,29 +182,7 @@ struct Categories<'a> {
 /// Returns all categories up to the end. `size`: the size of the EEPROM that the image states;
 /// zeros beyond it are not categories.
 fn categories<'a>(body: &'a [u8], size: usize, notes: &mut Warnings) -> Categories<'a> {
-<<<<<<< HEAD
     let mut found = Vec::new();
-=======
-    let (whole, cut) = walk(body);
-    let stated = body.get(..size.saturating_sub(HEADER_BYTES));
-    // Some chips read as ones beyond their end. That does not count as an end mark.
-    let beyond = body.get(size.saturating_sub(HEADER_BYTES)..);
-    let is_blank = beyond.is_some_and(|b| !b.is_empty() && b.iter().all(|byte| *byte == 0xff));
-    let (list, cut) = match (&whole.end, stated) {
-        (End::Mark, _) if !is_blank => (whole, cut),
-        (_, Some(stated)) => walk(stated),
-        _ => (whole, cut),
-    };
-    if let Some((offset, kind, remark)) = cut {
-        notes.add(offset, Some(kind), remark);
-    }
-    list
-}
-
-/// Walks through the list. Returns also the category that exceeds the body: offset, type, problem.
-fn walk(body: &[u8]) -> (Categories<'_>, Option<(usize, u16, WarningKind)>) {
-    let (mut found, mut cut) = (Vec::new(), None);
->>>>>>> 74309e1 (tests: replace rejected phrases)
     let mut rest = body;
     let end = loop {
         let offset = HEADER_BYTES + body.len() - rest.len();

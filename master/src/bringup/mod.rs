@@ -11,11 +11,6 @@
     reason = "an error here carries the whole address and ends the run"
 )]
 
-use std::future::poll_fn;
-use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::pin::pin;
-use std::task::{Context, Poll};
-
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
@@ -31,7 +26,6 @@ use crate::mailbox::worker::EmergencySink;
 use crate::report::{Cause, Error};
 use crate::rt::image::{self, DeviceRegion, ImagePlan};
 use crate::rt::phase::ClockPlan;
-use crate::text::panic_text;
 
 pub mod align;
 pub(crate) mod clocks;
