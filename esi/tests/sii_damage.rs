@@ -252,7 +252,7 @@ const CASES: &[Case] = &[
             let at = data(i, SYNC_MANAGER);
             i[at + 7] = 9;
         },
-        "category 41: 9 is no type of a SyncManager",
+        "category 41: 9 is not a defined SyncManager type",
     ),
     (
         "an FMMU of no use",
@@ -260,7 +260,7 @@ const CASES: &[Case] = &[
             let at = data(i, FMMU);
             i[at] = 0x42;
         },
-        "category 40: 66 is no use of an FMMU",
+        "category 40: 66 is not a defined use of an FMMU",
     ),
     (
         "every PDO byte ones",

@@ -87,6 +87,7 @@ fn device_of_an_image_is_configured_like_that_of_its_esi() {
         }
     }
     println!("{same} devices alike, {} differ: {other:#?}", other.len());
-    assert!(same > 20, "{same}");
+    // Those of our own files, at least.
+    assert!(same >= 12, "{same}");
     assert_eq!(other, Vec::<String>::new());
 }

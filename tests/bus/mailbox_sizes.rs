@@ -68,7 +68,7 @@ fn run_drive(machine: Machine) -> Result<Done, String> {
         let writes = |d: &&Datagram| {
             d.sent && d.command == FPWR && d.register() == register && d.data.get(6) == Some(&1)
         };
-        let last = sent.iter().filter(writes).last().expect("configured");
+        let last = sent.iter().rfind(writes).expect("configured");
         u16::from_le_bytes([last.data[2], last.data[3]])
     };
     Ok(Done {
