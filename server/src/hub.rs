@@ -3,9 +3,9 @@
 //! Clients put commands into a queue. The machine takes them about every millisecond, and finishes
 //! each with an outcome. Nothing here runs in the cycle.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::pin::Pin;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -187,10 +187,29 @@ struct Inner {
     events: VecDeque<Arc<Event>>,
     fault_reports: VecDeque<Value>,
     next_event: u64,
+    counts: Counts,
     /// The time to which virtual time may advance.
     advance_to: Nanos,
     /// The present virtual time.
     now: Nanos,
+}
+
+/// What the server has counted since its start, for the metrics.
+pub type Counts = BTreeMap<(Count, String), u64>;
+
+/// What is counted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Count {
+    /// Events, by kind.
+    Event,
+    /// CoE emergencies, by device.
+    Emergency,
+    /// Faults of a drive, by axis.
+    Fault,
+    /// Trips, by axis.
+    Trip,
+    /// Stops, by group.
+    Stop,
 }
 
 /// The state that all threads of the server share.
@@ -202,8 +221,6 @@ pub struct Hub {
     pub sampler: Sampler,
     pub options: HubOptions,
     pub area: Arc<AreaCounters>,
-    /// Clients connected so far over each transport, for the metrics.
-    pub connections: AtomicU64,
     inner: Mutex<Inner>,
     /// The queue, the time or the wanted state has changed.
     work: Condvar,
@@ -247,6 +264,7 @@ impl Hub {
                 events: VecDeque::new(),
                 fault_reports: VecDeque::new(),
                 next_event: 1,
+                counts: Counts::new(),
                 advance_to: 0,
                 now: 0,
             }),
@@ -254,7 +272,6 @@ impl Hub {
             samples,
             options,
             area: Arc::default(),
-            connections: AtomicU64::new(0),
             work: Condvar::new(),
             events: broadcast::channel(EVENTS).0,
             bus: watch::channel(down).0,
@@ -641,6 +658,8 @@ impl Hub {
         let Value::Object(mut body) = body else {
             return;
         };
+        let kind = body.get("event").and_then(Value::as_str);
+        count(inner, Count::Event, kind.unwrap_or_default());
         let number = inner.next_event;
         inner.next_event += 1;
         let time = match self.options.virtual_time {
@@ -656,6 +675,16 @@ impl Hub {
         }
         // Without a subscriber, the event is only kept.
         let _ = self.events.send(event);
+    }
+
+    /// Counts something of a device, an axis or a group.
+    pub fn count(&self, what: Count, name: &str) {
+        count(&mut self.lock(), what, name);
+    }
+
+    #[must_use]
+    pub fn counts(&self) -> Counts {
+        self.lock().counts.clone()
     }
 
     /// Keeps the fault report of a run, and reports it.
@@ -739,6 +768,10 @@ impl Hub {
             false => clock::now(),
         }
     }
+}
+
+fn count(inner: &mut Inner, what: Count, name: &str) {
+    *inner.counts.entry((what, name.to_owned())).or_default() += 1;
 }
 
 /// Ends one part of a command. The last part gives the answer.

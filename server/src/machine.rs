@@ -10,7 +10,7 @@ use ecaxis_master::session::{self, Attachments, Options};
 use serde_json::json;
 
 use crate::external::{Hold, external};
-use crate::hub::{BusState, BusStatus, Describe, Hub, RunningStep};
+use crate::hub::{BusState, BusStatus, Count, Describe, Hub, RunningStep};
 use crate::operator::ServerOperator;
 
 /// The first and the longest time until the next attempt to bring the bus up.
@@ -122,12 +122,18 @@ impl Observer for Reporter<'_> {
                 "event": "captured", "axis": capture.axis, "input": capture.input,
                 "position": capture.position,
             })),
-            Progress::Emergency(report) => hub.event(json!({
-                "event": "emergency", "device": report.device, "text": report.to_string(),
-            })),
-            Progress::GroupStopped { group, cause } => hub.event(json!({
-                "event": "group_stopped", "group": group, "why": cause.to_string(),
-            })),
+            Progress::Emergency(report) => {
+                hub.count(Count::Emergency, &report.device);
+                hub.event(json!({
+                    "event": "emergency", "device": report.device, "text": report.to_string(),
+                }));
+            }
+            Progress::GroupStopped { group, cause } => {
+                hub.count(Count::Stop, group);
+                hub.event(json!({
+                    "event": "group_stopped", "group": group, "why": cause.to_string(),
+                }));
+            }
             Progress::GroupReleased { group } => {
                 hub.event(json!({"event": "group_released", "group": group}));
             }

@@ -15,7 +15,7 @@ use serde_json::{Map, Value, json};
 
 use crate::error::{ErrorCode, OpError};
 use crate::external::{AreaStop, ExternalClient, MESSAGES_PER_CYCLE, Message, Report, StreamEnd};
-use crate::hub::{Hub, Latest, QueuedWork, RunningStep, Transfer, Work};
+use crate::hub::{Count, Hub, Latest, QueuedWork, RunningStep, Transfer, Work};
 
 /// The pieces of work that one call takes; the machine accepts 64 requests.
 const WORK_PER_CALL: usize = 60;
@@ -234,9 +234,18 @@ impl ServerOperator {
             if *known == trouble {
                 continue;
             }
+            // The text changes once more as the drive's code was read.
+            let first = known.is_none();
             (*known).clone_from(&trouble);
             if let Some(why) = trouble {
                 let axis = view.name(axis);
+                if first {
+                    let count = match status.fault {
+                        Some(_) => Count::Fault,
+                        None => Count::Trip,
+                    };
+                    self.hub.count(count, axis);
+                }
                 self.hub
                     .event(json!({"event": "fault", "axis": axis, "why": why}));
             }

@@ -17,13 +17,14 @@ from .ethercrab import ethercrab
 from .faults import faults
 from .gateway import gateway
 from .mailbox import mailbox
+from .monitoring import monitoring
 from .operation import operation
 from .page import page
 from .parameters import parameters
 from .recordings import judge, recordings
 from .ring import ring
 
-__all__ = ["Bench", "bringup", "eeproms", "ethercrab", "faults", "gateway", "mailbox", "operation", "overlap", "page", "parameters", "recordings", "ring"]
+__all__ = ["Bench", "bringup", "eeproms", "ethercrab", "faults", "gateway", "mailbox", "monitoring", "operation", "overlap", "page", "parameters", "recordings", "ring"]
 
 MAXON = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml"
 OWN = rig.ROOT / "configs/esi"
