@@ -210,7 +210,7 @@ fn a_client_that_never_reads_costs_little() {
         "subscribe",
         json!({"topics": ["samples", "state", "events"], "interval_ms": 10}),
     );
-    // Waits are answered later; here they are answered at once, and nobody reads the answers.
+    // Waits are answered later; here they are answered at once, and no client reads the answers.
     deaf.stream.set_nonblocking(true).unwrap();
     let line = format!(
         "{}\n",

@@ -64,14 +64,18 @@ class Kind:
 
     # SOEM asks what it maps by SoE, which no simulated device speaks, and waits long for each answer.
     soe: bool
-    # Without CoE ethercrab gives SyncManager n FMMU n, unless the EEPROM has details; not every device has one.
+    # Without CoE ethercrab gives SyncManager n FMMU n, unless the EEPROM has details; not every device has one. It also
+    # needs SyncManagers that the EEPROM enables.
     ethercrab_maps: bool
 
     @classmethod
     def of(cls, device):
         last = max((n for n, sm in enumerate(device.sms) if sm[4] in (3, 4)), default=0)
         maps = device.protocols & sii.PROTOCOLS["CoE"] or device.fmmu_sms or last < max(len(device.fmmus), 1)
-        return cls(bool(device.protocols & sii.PROTOCOLS["SoE"]), bool(maps))
+        # ethercrab enables a SyncManager only if the EEPROM does.
+        process_data = [(n, sm) for n, sm in enumerate(device.sms) if sm[4] in (3, 4)]
+        enabled = all(sm[3] & 1 or not device.sm_bits(n) for n, sm in process_data)
+        return cls(bool(device.protocols & sii.PROTOCOLS["SoE"]), bool(maps and enabled))
 
 
 def served(device):
