@@ -1,0 +1,132 @@
+#!/usr/bin/env python3
+"""Real-time clients of `ecaxis serve`, written from docs/server.md alone, and what their death does.
+
+    python tests/judges/realtime_clients.py [--seconds 60] [--trials 200]
+
+Runs examples/clients/realtime.c and realtime.py on the simulated bus, then ends them with SIGKILL
+or SIGSTOP at random moments. The samples show whether the axis stayed within its limits and rests.
+"""
+
+import argparse
+import array
+import json
+import mmap
+import pathlib
+import random
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+
+import rig
+from report import Report
+
+CLIENTS = rig.ROOT / "examples/clients"
+VELOCITY, ACCELERATION, RANGE = 250.0, 2500.0, 60.0  # configs/demo.toml
+TTL_S = 0.5
+
+
+class Watcher:
+    """Reads events, and the samples in shared memory."""
+
+    def __init__(self, path):
+        self.socket = socket.socket(socket.AF_UNIX)
+        self.socket.settimeout(30)
+        self.socket.connect(str(path))
+        self.lines = self.socket.makefile("r")
+
+    def ask(self, op, **keys):
+        self.socket.sendall(json.dumps({"op": op, "id": op, **keys}).encode() + b"\n")
+        while (answer := json.loads(self.lines.readline())).get("id") != op:
+            pass
+        if not answer["ok"]:
+            raise RuntimeError(answer["error"]["message"])
+        return answer
+
+    def map_samples(self):
+        """The area goes to an owner only; this one gives the lease back."""
+        self.ask("take", name="judge")
+        self.socket.sendall(b'{"op": "area"}\n')
+        _, control, _, _ = self.socket.recvmsg(65536, socket.CMSG_SPACE(8))
+        descriptors = array.array("i")
+        descriptors.frombytes(control[0][2])
+        self.map = mmap.mmap(descriptors[0], 0, prot=mmap.PROT_READ)
+        self.words, self.numbers = memoryview(self.map).cast("Q"), memoryview(self.map).cast("d")
+        signals = json.loads(self.map[self.words[8] : self.words[8] + self.words[9]])["signals"]
+        self.target = next(s["word"] for s in signals if s["name"] == "x.target_position")
+        self.ask("release")
+
+    def targets(self, first):
+        words = self.words
+        for row in range(first, words[6]):
+            yield self.numbers[words[2] + row % words[4] * words[3] + self.target]
+
+
+def within_limits(targets, dt=1e-3):
+    """Returns what exceeds the limits of the machine file, or None."""
+    for a, b, c in zip(targets, targets[1:], targets[2:]):
+        velocity, change = (c - b) / dt, abs(c - 2 * b + a) / dt**2
+        if abs(velocity) > VELOCITY * 1.000001 or change > ACCELERATION * 1.0001 or abs(c) > RANGE:
+            return f"{a}, {b}, {c}: {velocity:.1f} mm/s, {change:.0f} mm/s²"
+    return None
+
+
+def trial(report, watcher, name, command, kill):
+    first, events = watcher.words[6], watcher.ask("state")["events"]
+    with rig.process(command, stdout=subprocess.PIPE) as child:
+        child.stdout.readline()
+        time.sleep(random.uniform(0.2, 1.2))
+        child.send_signal(kill)
+        time.sleep(TTL_S + 0.5)
+        axis = watcher.ask("state")["axes"][0]
+        rows = list(watcher.targets(first))
+        ended = [e for e in watcher.ask("events", after=events)["events"] if e["event"] in ("lease", "area")]
+    moved, wrong = max(rows) - min(rows), within_limits(rows)
+    names = any(name in json.dumps(event) and event.get("why") in ("expired", "disconnected") for event in ended)
+    ok = axis["at_rest"] and axis["enabled"] and rows[-1] == rows[-50] and names and not wrong
+    if not ok:
+        report.note(f"{wrong}; {axis}; {ended}")
+    return ok, moved
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=5)
+    parser.add_argument("--trials", type=int, default=10)
+    arguments = parser.parse_args()
+    report, program = Report(), rig.binary()
+    with tempfile.TemporaryDirectory(prefix="ecaxis-judge-") as temporary:
+        folder = pathlib.Path(temporary)
+        native, path = folder / "realtime", folder / "s.sock"
+        subprocess.run(["gcc", "-O2", "-Wall", "-o", native, CLIENTS / "realtime.c", "-lm"], check=True)
+        clients = {"realtime.c": [str(native), str(path)], "realtime.py": [sys.executable, str(CLIENTS / "realtime.py"), str(path)]}
+        serve = [str(program), "serve", str(rig.ROOT / "configs/demo.toml"), "--sim", "--socket", str(path)]
+        with rig.process(serve, stderr=subprocess.DEVNULL):
+            while not path.exists():
+                time.sleep(0.05)
+            watcher = Watcher(path)
+            watcher.ask("await", bus="op")
+            watcher.map_samples()
+            report.section("sine")
+            for name, command in clients.items():
+                # Real-time priority, as such a client has it; without the right to it, normal.
+                privileged = ["chrt", "-f", "40"] if subprocess.run(["chrt", "-f", "40", "true"]).returncode == 0 else []
+                done = subprocess.run([*privileged, *command, str(arguments.seconds)], capture_output=True, text=True)
+                used = re.search(r"used (\d+)", done.stdout)
+                report.check(f"{name} runs", done.returncode == 0 and used and int(used[1]) > 0, done.stdout + done.stderr)
+            report.section("kill -9 and SIGSTOP")
+            good, far = 0, 0.0
+            for number in range(arguments.trials):
+                name = list(clients)[number % 2]
+                ok, moved = trial(report, watcher, name, clients[name], random.choice([signal.SIGKILL, signal.SIGSTOP]))
+                good, far = good + ok, max(far, moved)
+            report.equal("trials at rest within limits, with the owner named", good, arguments.trials)
+            report.check("the axis moved", far > 0.1, f"{far:.2f} mm")
+    return report.finish()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
