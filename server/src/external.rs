@@ -6,14 +6,19 @@ use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering, fence};
 
-use ecaxis_axis::setpoint::{
-    Gear, GearConfig, GearInMode, Knot, Motion, MotionLimits, Setpoint, SetpointError, Stream,
-    StreamConfig, StreamState,
-};
-use ecaxis_axis::{AxisStatus, Command, CommandError};
+use ecaxis_axis::setpoint::{Motion, MotionLimits, Setpoint, Stream, StreamConfig, StreamState};
+use ecaxis_axis::{AxisStatus, Command};
 use ecaxis_master::config::{AxisRef, Machine};
 use ecaxis_master::rt::controller::{Controller, CycleContext};
 use ecaxis_master::sys::shared_memory::SharedMemory;
+
+use follower::{Follower, Wanted};
+pub use messages::{
+    AreaCounters, AreaStop, Message, Report, StreamEnd, StreamError, StreamPoint, words,
+};
+
+mod follower;
+mod messages;
 
 /// The number of points that a stream keeps.
 pub const STREAM_POINTS: usize = 256;
@@ -32,179 +37,6 @@ const ROUNDING: f64 = 1.0 + 1e-9;
 /// The attempts to read a complete set in one cycle.
 const ATTEMPTS: usize = 4;
 
-/// The words of the commands, see docs/server.md.
-pub mod words {
-    pub const MAGIC: [u8; 8] = *b"ECAXCMDS";
-    pub const VERSION: u64 = 1;
-    pub const VERSION_AT: usize = 1;
-    pub const AXES_AT: usize = 2;
-    pub const AXIS_WORDS: usize = 3;
-    pub const AXES: usize = 4;
-    pub const SEQUENCE: usize = 5;
-    pub const COUNTER: usize = 6;
-    pub const LAST_USED: usize = 8;
-    pub const USED: usize = 9;
-    pub const LATE: usize = 10;
-    pub const REFUSED: usize = 11;
-    pub const BLOCKED: usize = 12;
-    pub const HEADER: usize = 16;
-    /// The words of one axis.
-    pub const OF_AXIS: usize = 4;
-}
-
-/// A point of a stream.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct StreamPoint {
-    pub knot: Knot,
-    /// Torque feed-forward in percent of rated torque.
-    pub torque: f64,
-}
-
-/// A message to the cycle.
-#[derive(Debug)]
-pub enum Message {
-    /// The axes follow no client from now on; `None`: all axes.
-    Release(Option<usize>),
-    /// The memory of the client that owns the motion.
-    Attach(Arc<SharedMemory>),
-    /// No client writes set-points.
-    Detach,
-    Open {
-        ticket: u64,
-        axis: usize,
-        config: StreamConfig,
-    },
-    Push {
-        ticket: u64,
-        axis: usize,
-        points: Box<[StreamPoint]>,
-    },
-    Close {
-        ticket: u64,
-        axis: usize,
-    },
-}
-
-/// A report of the cycle.
-#[derive(Debug)]
-pub enum Report {
-    Opened {
-        ticket: u64,
-        result: Result<(), StreamError>,
-    },
-    Pushed {
-        ticket: u64,
-        accepted: usize,
-        free: usize,
-        error: Option<StreamError>,
-        /// Returned to be freed outside the cycle.
-        points: Box<[StreamPoint]>,
-    },
-    Closed {
-        ticket: u64,
-        result: Result<(), StreamError>,
-    },
-    StreamEnded {
-        axis: usize,
-        end: StreamEnd,
-    },
-    AreaStopped {
-        axis: usize,
-        cause: AreaStop,
-    },
-    /// Memory that is no longer used, to be freed outside the cycle.
-    Detached(Arc<SharedMemory>),
-}
-
-/// Why a request to a stream was refused.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum StreamError {
-    #[error("the axis is not ready: enable it first")]
-    NotReady,
-    #[error("the axis has no open stream")]
-    NotOpen,
-    #[error("the axis follows set-points of the cyclic area")]
-    Follows,
-    #[error(transparent)]
-    Setpoint(#[from] SetpointError),
-}
-
-/// How a stream has ended.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum StreamEnd {
-    /// The axis stands at the last point.
-    Done,
-    /// The points ran out.
-    Underrun,
-    /// The axis refused a set-point.
-    Refused(CommandError),
-}
-
-/// Why an axis no longer follows the cyclic area.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum AreaStop {
-    #[error("no new set-point came for {0} cycles")]
-    Stale(u32),
-    #[error("a set-point was refused: {0}")]
-    Refused(CommandError),
-    #[error("a set-point is not a finite number")]
-    NotFinite,
-    #[error("{0} is not a kind of set-point")]
-    Kind(u64),
-    #[error("the kind of set-point has changed without 0 between")]
-    KindChanged,
-    #[error("the axis is not ready, or moves: enable it and wait until it stands")]
-    NotReady,
-}
-
-/// What the area has done so far, for everybody outside the cycle.
-#[derive(Debug, Default)]
-pub struct AreaCounters {
-    /// Leases that have ended. The axes then follow no client, also if the supervisor is busy.
-    pub leases_ended: AtomicU64,
-    /// 1 while memory is attached.
-    pub attached: AtomicU64,
-    /// Sets that were used.
-    pub used: AtomicU64,
-    /// Cycles without a new set while an axis follows.
-    pub late: AtomicU64,
-    /// Refused set-points.
-    pub refused: AtomicU64,
-    /// Axes that were stopped because set-points were late or refused.
-    pub stopped: AtomicU64,
-}
-
-/// The kind of a set-point, and its value.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Wanted {
-    Nothing,
-    Position(f64),
-    Velocity(f64),
-    Torque(f64),
-}
-
-impl Wanted {
-    fn new(kind: u64, bits: u64) -> Result<Self, AreaStop> {
-        let value = f64::from_bits(bits);
-        let wanted = match kind {
-            0 => return Ok(Self::Nothing),
-            1 => Self::Position(value),
-            2 => Self::Velocity(value),
-            3 => Self::Torque(value),
-            other => return Err(AreaStop::Kind(other)),
-        };
-        if value.is_finite() {
-            Ok(wanted)
-        } else {
-            Err(AreaStop::NotFinite)
-        }
-    }
-
-    fn same_kind(self, other: Self) -> bool {
-        std::mem::discriminant(&self) == std::mem::discriminant(&other)
-    }
-}
-
 /// What an axis follows.
 #[derive(Debug)]
 enum Source {
@@ -215,21 +47,6 @@ enum Source {
     Area(Follower),
     /// `path` is the motion of the stream.
     Stream(Follower),
-}
-
-/// An axis that follows set-points of a client.
-#[derive(Debug, Clone, Copy)]
-struct Follower {
-    /// The last set-point of the cyclic area.
-    last: Wanted,
-    /// The set-points of the client: the last position and its velocity.
-    path: Motion,
-    /// Catches up after missing set-points or lost frames.
-    gear: Option<Gear>,
-    /// Cycles in which the gear was engaged since the last irregular set.
-    regular: u32,
-    /// The last accepted set-point of the axis.
-    commanded: f64,
 }
 
 #[derive(Debug)]
@@ -701,162 +518,6 @@ impl FollowedAxis {
         self.stream = None;
         if !matches!(self.source, Source::Nothing { .. }) {
             self.source = Source::Nothing { blocked: true };
-        }
-    }
-}
-
-impl Follower {
-    fn new(path: Motion) -> Self {
-        Self {
-            last: Wanted::Nothing,
-            path,
-            gear: None,
-            regular: 0,
-            commanded: path.position,
-        }
-    }
-
-    /// Gives the axis a new set-point of the client, `steps` cycles after the one before.
-    fn apply(
-        &mut self,
-        axis: &FollowedAxis,
-        wanted: Wanted,
-        steps: u32,
-        machine: &mut CycleContext<'_>,
-    ) -> Result<(), AreaStop> {
-        let previous = std::mem::replace(&mut self.last, wanted);
-        let command = match wanted {
-            Wanted::Nothing => return Ok(()),
-            Wanted::Position(position) => {
-                let (at, dt_s) = (motion_of(&machine.axis(axis.axis)), machine.dt_s());
-                if steps > 1 {
-                    self.catch_up(axis, at);
-                }
-                if self.gear.is_some() {
-                    self.check_after_gap(axis, previous, position, f64::from(steps) * dt_s)?;
-                }
-                let from = match previous {
-                    Wanted::Position(from) => from,
-                    _ => at.position,
-                };
-                let velocity = (position - from) / (f64::from(steps) * dt_s);
-                self.path = self.path.then(position, velocity, dt_s);
-                return self.follow(axis, at, machine);
-            }
-            Wanted::Velocity(velocity) => Command::Velocity {
-                velocity,
-                ramp: 1.0,
-            },
-            Wanted::Torque(percent) => Command::Torque {
-                percent,
-                ramp_s: 0.0,
-            },
-        };
-        if previous == wanted {
-            return Ok(());
-        }
-        machine
-            .command(axis.axis, command)
-            .map_err(AreaStop::Refused)
-    }
-
-    /// Checks a position that does not follow the one before in the next cycle: the axis catches up
-    /// within its limits, so it would reach any position.
-    fn check_after_gap(
-        &self,
-        axis: &FollowedAxis,
-        previous: Wanted,
-        position: f64,
-        time_s: f64,
-    ) -> Result<(), AreaStop> {
-        let Wanted::Position(from) = previous else {
-            return Ok(());
-        };
-        let (step, most) = (position - from, axis.limits.velocity * time_s);
-        if step.abs() > most * ROUNDING {
-            return Err(AreaStop::Refused(CommandError::Step { step, most }));
-        }
-        match axis.range {
-            Some([low, high]) if !(low..=high).contains(&position) => {
-                Err(AreaStop::Refused(CommandError::OutsideRange {
-                    position,
-                    low,
-                    high,
-                }))
-            }
-            _ => Ok(()),
-        }
-    }
-
-    /// Continues a position at its last velocity. A velocity or torque needs nothing.
-    fn extrapolate(
-        &mut self,
-        axis: &FollowedAxis,
-        machine: &mut CycleContext<'_>,
-    ) -> Result<(), AreaStop> {
-        if !matches!(self.last, Wanted::Position(_)) {
-            return Ok(());
-        }
-        let (path, dt_s) = (self.path, machine.dt_s());
-        let at = motion_of(&machine.axis(axis.axis));
-        let mut position = path.position + path.velocity * dt_s;
-        if let Some([low, high]) = axis.range {
-            // Not `clamp`: it panics if a bound is NaN.
-            position = position.max(low).min(high);
-        }
-        let velocity = (position - path.position) / dt_s;
-        self.path = path.then(position, velocity, dt_s);
-        // The next set-point of the client may need some cycles to be reached.
-        self.catch_up(axis, at);
-        self.follow(axis, at, machine)
-    }
-
-    fn catch_up(&mut self, axis: &FollowedAxis, at: Motion) {
-        self.regular = 0;
-        if self.gear.is_none() {
-            let config = GearConfig {
-                ratio: 1.0,
-                engage: GearInMode::At { offset: 0.0 },
-                smoothing_s: 0.0,
-                limits: axis.limits,
-                range: axis.range,
-            };
-            self.gear = Gear::new(config, self.path, at).ok();
-        }
-    }
-
-    fn follow(
-        &mut self,
-        axis: &FollowedAxis,
-        at: Motion,
-        machine: &mut CycleContext<'_>,
-    ) -> Result<(), AreaStop> {
-        // Without frames, the axis may not have followed.
-        if at.position != self.commanded {
-            self.catch_up(axis, at);
-        }
-        let position = match &mut self.gear {
-            None => self.path.position,
-            Some(gear) => {
-                let next = gear.advance(self.path, at, machine.dt_s());
-                self.regular += u32::from(gear.engaged());
-                // The velocity of the set-points is regular again, too.
-                if gear.engaged() && self.regular >= REGULAR {
-                    self.gear = None;
-                }
-                next.position
-            }
-        };
-        match machine.set_point(axis.axis, position) {
-            Ok(()) => {
-                self.commanded = position;
-                Ok(())
-            }
-            Err(CommandError::FramesLost) => {
-                self.catch_up(axis, at);
-                Ok(())
-            }
-            Err(error) => Err(AreaStop::Refused(error)),
         }
     }
 }

@@ -1,5 +1,7 @@
 //! The server as its clients see it, on the simulated bus.
 
+#![allow(clippy::print_stdout, reason = "tests print what they measured")]
+
 mod area;
 mod commands;
 mod faults;

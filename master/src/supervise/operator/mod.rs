@@ -3,6 +3,7 @@
 //! | file | |
 //! |---|---|
 //! | here | the operator interface and its requests |
+//! | `activity` | what an axis does |
 //! | `requests` | requests, time and status → commands: hold-to-run, speed limits, results |
 //! | `run` | the loop that serves the operator, and the program that the operator starts |
 //!
@@ -19,10 +20,12 @@ use crate::clock::Nanos;
 use crate::config::{GroupStopScope, Machine, OutputRef, StopGroup};
 use crate::rt::channel::Snapshot;
 
+mod activity;
 mod requests;
 mod run;
 
-pub use requests::{Activity, AxisActivity};
+pub use activity::Activity;
+pub use requests::AxisActivity;
 pub(crate) use run::Attendance;
 
 /// The time in ns after the last jog request at which the axis brakes within its limits.

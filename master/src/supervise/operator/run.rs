@@ -5,7 +5,8 @@ use std::sync::Arc;
 use ecaxis_axis::Command;
 use ecaxis_ecat::index::{AxisIndex, GroupIndex};
 
-use super::requests::{Activity, Commands, RequestContext, RequestController};
+use super::activity::Activity;
+use super::requests::{Commands, RequestContext, RequestController};
 use super::{Operator, Presence, ProgramRequest, ProgramStatus, Request, RequestEvent, View};
 use crate::clock;
 use crate::config::steps::enables;

@@ -1,0 +1,238 @@
+//! Commands of a client as work of the machine.
+
+use super::*;
+
+impl Client {
+    /// Returns the parts of a command.
+    pub(super) fn parts(&self, op: Op) -> Result<Vec<Work>, OpError> {
+        let each = |axis: &str, request: &dyn Fn(AxisIndex) -> MachineRequest| {
+            let axes = self.axes(axis)?;
+            let parts = axes.into_iter().map(|axis| Work::Request(request(axis)));
+            Ok(parts.collect())
+        };
+        let one = |axis: &str, request: &dyn Fn(AxisIndex) -> MachineRequest| {
+            Ok(vec![Work::Request(request(self.axis(axis)?))])
+        };
+        match op {
+            Op::Enable { axis } => each(&axis, &|axis| MachineRequest::Enable { axis }),
+            Op::Disable { axis } => each(&axis, &|axis| MachineRequest::Disable { axis }),
+            Op::Halt { axis } => each(&axis, &|axis| MachineRequest::Stop { axis }),
+            Op::QuickStop { axis } => each(&axis, &|axis| MachineRequest::QuickStop { axis }),
+            Op::Reset { axis } => each(&axis, &|axis| MachineRequest::Reset { axis }),
+            Op::Move {
+                axis,
+                to,
+                by,
+                speed,
+            } => match (to, by) {
+                (Some(position), None) => one(&axis, &|axis| MachineRequest::MoveTo {
+                    axis,
+                    position,
+                    speed,
+                }),
+                (None, Some(distance)) => one(&axis, &|axis| MachineRequest::MoveBy {
+                    axis,
+                    distance,
+                    speed,
+                }),
+                _ => Err(OpError::new(
+                    ErrorCode::BadRequest,
+                    "`move` needs either `to` or `by`",
+                )),
+            },
+            Op::Velocity { axis, velocity } => {
+                one(&axis, &|axis| MachineRequest::Velocity { axis, velocity })
+            }
+            Op::Jog {
+                seen_ns: Some(seen),
+                ..
+            } if self.is_old(seen) => {
+                let message = "the client has not seen the machine for 500 ms";
+                Err(OpError::new(ErrorCode::Refused, message)
+                    .help("let the button go, and hold it again"))
+            }
+            Op::Jog { axis, velocity, .. } => {
+                one(&axis, &|axis| MachineRequest::Jog { axis, velocity })
+            }
+            Op::Torque {
+                axis,
+                torque,
+                ramp_s,
+            } => one(&axis, &|axis| MachineRequest::Torque {
+                axis,
+                percent: torque,
+                ramp_s,
+            }),
+            Op::Home { axis } => one(&axis, &|axis| MachineRequest::Home { axis }),
+            Op::Mode { axis, mode } => {
+                let at = self.axis(&axis)?;
+                let mode = self.mode(at, &mode)?;
+                one(&axis, &|axis| MachineRequest::SetMode { axis, mode })
+            }
+            Op::Output {
+                device,
+                output,
+                value,
+            } => self.output(&device, &output, value),
+            Op::Override { factor } if factor > 0.0 && factor <= 1.0 => {
+                Ok(vec![Work::Request(MachineRequest::Override { factor })])
+            }
+            Op::Override { factor } => {
+                let message = format!("`factor` is {factor}: it must be above 0 and at most 1");
+                Err(OpError::new(ErrorCode::BadRequest, message))
+            }
+            Op::Program { action } => {
+                let request = match action {
+                    ProgramAction::Start => ProgramRequest::Start,
+                    ProgramAction::Pause => ProgramRequest::Pause,
+                    ProgramAction::Resume => ProgramRequest::Resume,
+                    ProgramAction::Step => ProgramRequest::Step,
+                    ProgramAction::Stop => ProgramRequest::Stop,
+                };
+                Ok(vec![Work::Request(MachineRequest::Program(request))])
+            }
+            Op::StreamOpen {
+                axis,
+                interval_ms,
+                interpolation,
+                prefill,
+            } => {
+                let axis = self.axis(&axis)?.0;
+                let config = self.stream(interval_ms, interpolation, prefill);
+                Ok(vec![Work::Open { axis, config }])
+            }
+            Op::StreamPush { axis, points } if points.len() <= STREAM_POINTS => {
+                let axis = self.axis(&axis)?;
+                if points
+                    .iter()
+                    .any(|point| matches!(point, Point::WithTorque(_)))
+                {
+                    self.check_torque_offset(axis)?;
+                }
+                let points = points.iter().map(|point| {
+                    let (position, velocity, torque) = match *point {
+                        Point::Position([position]) => (position, 0.0, 0.0),
+                        Point::WithVelocity([position, velocity]) => (position, velocity, 0.0),
+                        Point::WithTorque([position, velocity, torque]) => {
+                            (position, velocity, torque)
+                        }
+                    };
+                    let knot = Knot { position, velocity };
+                    StreamPoint { knot, torque }
+                });
+                let (axis, points) = (axis.0, points.collect());
+                Ok(vec![Work::Push { axis, points }])
+            }
+            Op::StreamPush { points, .. } => {
+                let message = format!("{} points at once; at most {STREAM_POINTS}", points.len());
+                Err(OpError::new(ErrorCode::BadRequest, message))
+            }
+            Op::StreamClose { axis } => Ok(vec![Work::Close {
+                axis: self.axis(&axis)?.0,
+            }]),
+            _ => Err(OpError::new(ErrorCode::BadRequest, "not a command")),
+        }
+    }
+
+    fn check_torque_offset(&self, axis: AxisIndex) -> Result<(), OpError> {
+        let machine = &self.hub.machine;
+        let mapped = machine.axes.get(axis).is_some_and(|setup| {
+            let object = ecaxis_esi::axis::object(TORQUE_OFFSET, setup.number);
+            let device = machine.devices.get(setup.device);
+            device.is_some_and(|d| d.selection.layout.rx_field(object, 0).is_some())
+        });
+        mapped.then_some(()).ok_or_else(|| {
+            let message = "a torque feed-forward needs 0x60B2 in the process data";
+            OpError::new(ErrorCode::Refused, message)
+                .help("add it with `pdo.rx` in the machine file")
+        })
+    }
+
+    fn is_old(&self, seen_ns: u64) -> bool {
+        self.hub.now().saturating_sub(seen_ns) > OLD_NS
+    }
+
+    fn axis(&self, name: &str) -> Result<AxisIndex, OpError> {
+        let mut axes = self.hub.machine.axes.enumerate();
+        let found = axes.find(|(_, axis)| axis.name == name);
+        found.map(|(index, _)| index).ok_or_else(|| {
+            let names = self.hub.machine.axes.iter().map(|axis| axis.name.as_str());
+            let names: Vec<_> = names.collect();
+            OpError::new(
+                ErrorCode::UnknownName,
+                format!("no axis is called `{name}`"),
+            )
+            .help(format!("the axes are {}", names.join(", ")))
+        })
+    }
+
+    fn axes(&self, name: &str) -> Result<Vec<AxisIndex>, OpError> {
+        match name {
+            ALL => Ok(self.hub.machine.axes.indices().collect()),
+            name => Ok(vec![self.axis(name)?]),
+        }
+    }
+
+    fn mode(&self, axis: AxisIndex, name: &str) -> Result<Mode, OpError> {
+        let setup = self.hub.machine.axes.get(axis);
+        let modes: Vec<_> = setup
+            .map(|setup| state::modes(setup).collect())
+            .unwrap_or_default();
+        let mut known = modes.iter();
+        let found = known.find(|mode: &&Mode| mode.to_string().eq_ignore_ascii_case(name));
+        found.copied().ok_or_else(|| {
+            let modes = modes.iter().map(|mode| mode.to_string().to_lowercase());
+            let modes: Vec<_> = modes.collect();
+            OpError::new(
+                ErrorCode::UnknownName,
+                format!("the axis has no mode `{name}`"),
+            )
+            .help(format!("the machine file prepares {}", modes.join(", ")))
+        })
+    }
+
+    fn output(&self, device: &str, name: &str, value: f64) -> Result<Vec<Work>, OpError> {
+        let machine = &self.hub.machine;
+        let mut outputs = self.hub.outputs.iter();
+        let found = outputs.find(|(_, signal)| {
+            let address = address(signal.field.index, signal.field.sub).to_string();
+            let (of, own) = state::split(machine, signal);
+            of == device && (own.eq_ignore_ascii_case(name) || address.eq_ignore_ascii_case(name))
+        });
+        let Some((output, _)) = found else {
+            let message = format!("`{device}` has no output `{name}` that a client may set");
+            return Err(
+                OpError::new(ErrorCode::UnknownName, message).help("`machine` lists the outputs")
+            );
+        };
+        let output = *output;
+        Ok(vec![Work::Request(MachineRequest::SetOutput {
+            output,
+            value,
+        })])
+    }
+
+    fn stream(
+        &self,
+        interval_ms: f64,
+        interpolation: InterpolationName,
+        prefill: usize,
+    ) -> StreamConfig {
+        StreamConfig {
+            interpolation: match interpolation {
+                InterpolationName::Cubic => Interpolation::Cubic,
+                InterpolationName::Linear => Interpolation::Linear,
+            },
+            interval_s: interval_ms * 1e-3,
+            prefill,
+            // The cycle knows the limits of the axis.
+            limits: MotionLimits {
+                velocity: 0.0,
+                acceleration: 0.0,
+                jerk: 0.0,
+            },
+            range: None,
+            dt_s: self.hub.machine.bus.cycle_ns as f64 * 1e-9,
+        }
+    }
+}

@@ -1,0 +1,150 @@
+//! What goes between the cycle and the threads outside.
+
+use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
+
+use ecaxis_axis::CommandError;
+use ecaxis_axis::setpoint::{Knot, SetpointError, StreamConfig};
+use ecaxis_master::sys::shared_memory::SharedMemory;
+
+/// The words of the commands, see docs/server.md.
+pub mod words {
+    pub const MAGIC: [u8; 8] = *b"ECAXCMDS";
+    pub const VERSION: u64 = 1;
+    pub const VERSION_AT: usize = 1;
+    pub const AXES_AT: usize = 2;
+    pub const AXIS_WORDS: usize = 3;
+    pub const AXES: usize = 4;
+    pub const SEQUENCE: usize = 5;
+    pub const COUNTER: usize = 6;
+    pub const LAST_USED: usize = 8;
+    pub const USED: usize = 9;
+    pub const LATE: usize = 10;
+    pub const REFUSED: usize = 11;
+    pub const BLOCKED: usize = 12;
+    pub const HEADER: usize = 16;
+    /// The words of one axis.
+    pub const OF_AXIS: usize = 4;
+}
+
+/// A point of a stream.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StreamPoint {
+    pub knot: Knot,
+    /// Torque feed-forward in percent of rated torque.
+    pub torque: f64,
+}
+
+/// A message to the cycle.
+#[derive(Debug)]
+pub enum Message {
+    /// The axes follow no client from now on; `None`: all axes.
+    Release(Option<usize>),
+    /// The memory of the client that owns the motion.
+    Attach(Arc<SharedMemory>),
+    /// No client writes set-points.
+    Detach,
+    Open {
+        ticket: u64,
+        axis: usize,
+        config: StreamConfig,
+    },
+    Push {
+        ticket: u64,
+        axis: usize,
+        points: Box<[StreamPoint]>,
+    },
+    Close {
+        ticket: u64,
+        axis: usize,
+    },
+}
+
+/// A report of the cycle.
+#[derive(Debug)]
+pub enum Report {
+    Opened {
+        ticket: u64,
+        result: Result<(), StreamError>,
+    },
+    Pushed {
+        ticket: u64,
+        accepted: usize,
+        free: usize,
+        error: Option<StreamError>,
+        /// Returned to be freed outside the cycle.
+        points: Box<[StreamPoint]>,
+    },
+    Closed {
+        ticket: u64,
+        result: Result<(), StreamError>,
+    },
+    StreamEnded {
+        axis: usize,
+        end: StreamEnd,
+    },
+    AreaStopped {
+        axis: usize,
+        cause: AreaStop,
+    },
+    /// Memory that is no longer used, to be freed outside the cycle.
+    Detached(Arc<SharedMemory>),
+}
+
+/// Why a request to a stream was refused.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum StreamError {
+    #[error("the axis is not ready: enable it first")]
+    NotReady,
+    #[error("the axis has no open stream")]
+    NotOpen,
+    #[error("the axis follows set-points of the cyclic area")]
+    Follows,
+    #[error(transparent)]
+    Setpoint(#[from] SetpointError),
+}
+
+/// How a stream has ended.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum StreamEnd {
+    /// The axis stands at the last point.
+    Done,
+    /// The points ran out.
+    Underrun,
+    /// The axis refused a set-point.
+    Refused(CommandError),
+}
+
+/// Why an axis no longer follows the cyclic area.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum AreaStop {
+    #[error("no new set-point came for {0} cycles")]
+    Stale(u32),
+    #[error("a set-point was refused: {0}")]
+    Refused(CommandError),
+    #[error("a set-point is not a finite number")]
+    NotFinite,
+    #[error("{0} is not a kind of set-point")]
+    Kind(u64),
+    #[error("the kind of set-point has changed without 0 between")]
+    KindChanged,
+    #[error("the axis is not ready, or moves: enable it and wait until it stands")]
+    NotReady,
+}
+
+/// What the area has done so far, for everybody outside the cycle.
+#[derive(Debug, Default)]
+pub struct AreaCounters {
+    /// Leases that have ended. The axes then follow no client, also if the supervisor is busy.
+    pub leases_ended: AtomicU64,
+    /// 1 while memory is attached.
+    pub attached: AtomicU64,
+    /// Sets that were used.
+    pub used: AtomicU64,
+    /// Cycles without a new set while an axis follows.
+    pub late: AtomicU64,
+    /// Refused set-points.
+    pub refused: AtomicU64,
+    /// Axes that were stopped because set-points were late or refused.
+    pub stopped: AtomicU64,
+}
