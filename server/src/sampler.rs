@@ -152,7 +152,7 @@ impl Sampler {
         slot * self.signals..(slot + 1) * self.signals
     }
 
-    /// Returns the distribution of the times since the last [`Sampler::clear_timing`].
+    /// Returns the distribution of the times since the start of the server.
     #[must_use]
     pub fn timing(&self) -> Timing {
         self.lock().timing.clone()
