@@ -122,7 +122,7 @@ fn router(http: Arc<Http>) -> Router {
         router.route(file.path, get(move || async move { file.response() }))
     });
     Router::new()
-        .route("/", get(crate::foxglove::root))
+        .route("/", get(|| async { page::index() }))
         .route("/metrics", get(metrics))
         .route(
             "/openapi.json",

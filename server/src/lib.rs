@@ -16,7 +16,6 @@ pub mod connection;
 pub mod error;
 pub mod export;
 pub mod external;
-pub mod foxglove;
 pub mod http;
 pub mod hub;
 pub mod lease;
