@@ -63,7 +63,7 @@ fn program_check_rejects_steps_certain_to_fail() {
         (&["mode = { x = \"pp\" }", "move = { x = 1.0 }\narrive = \"together\""], "`arrive = \"together\"` is not possible for `x` in mode \"pp\"", "\"csp\" }`"),
         (&["mode = { x = \"pp\" }", "sine = { x = { amplitude = 1, frequency = 1, periods = 1 } }"], "`sine` or `square` is not possible", "\"csp\" }`"),
         (&["mode = { x = \"pv\" }", "gear = { x = { to = \"y\" } }"], "`gear` is not possible for `x` in mode \"pv\"", "\"csp\" }`"),
-        (&["repeat = 3", "  move = { x = 1.0 }", "  mode = { x = \"pv\" }"], "does in mode \"pv\", to which step 1.2 has switched it, when it is repeated", "\"csp\""),
+        (&["repeat = 3", "  move = { x = 1.0 }", "  mode = { x = \"pv\" }"], "is not possible for `x` in mode \"pv\", to which step 1.2 has switched it, when it is repeated", "\"csp\""),
         (&["all 2", "move = { x = 1.0 }", "mode = { x = \"pv\" }"], "to which step 2 has switched it, when it is repeated", "\"csp\""),
         (&["enable = [\"y\"]", "move = { x = 1.0 }"], "`move` needs `x` to have power, and no step before has enabled it", "enable = [\"x\"]"),
         (&["disable = true", "home = true"], "`home` needs `x` to have power, which step 1 has taken away", "enable = [\"x\"]"),
