@@ -191,7 +191,7 @@ fn script_errors_name_line_and_field() {
         ("kind = \"sync-late\"\n", "`delay` is missing"),
         ("kind = \"sdo-ignored\"\n", "`index` is missing"),
         ("kind = \"other-main-device\"\n", "needs either"),
-        ("kind = \"mailbox-silent\"\nport = 1\n", "what it knows is `device`"),
+        ("kind = \"mailbox-silent\"\nport = 1\n", "known: `device`"),
         ("at = \"soon\"\nkind = \"absent\"\n", "not a duration"),
         ("kind = \"silent\"\nwhen = 1\n", "when"),
     ];
