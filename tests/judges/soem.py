@@ -17,7 +17,8 @@ TIMEOUTS = re.compile(r"(#define EC_TIMEOUT(?:RET|SAFE|EEP|TXM) +)\d+")
 
 
 def requirement():
-    return (rig.HERE / "requirements.txt").read_text().strip()
+    lines = (rig.HERE / "requirements.txt").read_text().split()
+    return next(line for line in lines if line.startswith("pysoem"))
 
 
 def sources(folder, python):
