@@ -65,7 +65,7 @@ class Kind:
     # SOEM asks what it maps by SoE, which no simulated device speaks, and waits long for each answer.
     soe: bool
     # Without CoE ethercrab gives SyncManager n FMMU n, unless the EEPROM has details; not every device has one. It also
-    # needs SyncManagers that the EEPROM enables.
+    # needs SyncManagers that the EEPROM enables, and cannot know the PDOs of modules.
     ethercrab_maps: bool
 
     @classmethod
@@ -75,7 +75,7 @@ class Kind:
         # ethercrab enables a SyncManager only if the EEPROM does.
         process_data = [(n, sm) for n, sm in enumerate(device.sms) if sm[4] in (3, 4)]
         enabled = all(sm[3] & 1 or not device.sm_bits(n) for n, sm in process_data)
-        return cls(bool(device.protocols & sii.PROTOCOLS["SoE"]), bool(maps and enabled))
+        return cls(bool(device.protocols & sii.PROTOCOLS["SoE"]), bool(maps and enabled and not device.of_modules and not device.modules))
 
 
 def served(device):
