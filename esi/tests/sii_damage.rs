@@ -273,6 +273,39 @@ const CASES: &[Case] = &[
     ),
 ];
 
+/// Word 0x3E: the size of the EEPROM in KiBit minus one (ETG.1000.6, table 16).
+fn set_size(image: &mut [u8], bytes: usize) {
+    put(image, 0x7c, u16::try_from(bytes / 128 - 1).unwrap());
+}
+
+/// Without an end mark, the list of categories ends at the size in word 0x3E. An image
+/// whose size word is too small has an end mark.
+#[test]
+fn size_word_bounds_a_list_without_end_mark() {
+    let _alone = crate::measure();
+    let whole = whole();
+    let expected = sii::parse(&whole).unwrap();
+    let end = head(&whole, 0xffff);
+    let size = end.next_multiple_of(128);
+    let mut image = whole[..size].to_vec();
+    image[end..].fill(0);
+    set_size(&mut image, size);
+    // The remains of another image behind the size.
+    image.extend(
+        [SYNC_MANAGER, 4, 1, 2, 3, 4, 60, 0x4000]
+            .map(u16::to_le_bytes)
+            .concat(),
+    );
+    let sii = sii::parse(&image).unwrap();
+    assert_eq!(sii.sync_managers, expected.sync_managers);
+    assert_eq!((&sii.damage, sii.ended), (&Vec::new(), false));
+    // A size that is too small, as some vendors have it.
+    let mut image = whole;
+    set_size(&mut image, 256);
+    let sii = sii::parse(&image).unwrap();
+    assert_eq!((&sii.rx_pdos, sii.ended), (&expected.rx_pdos, true));
+}
+
 fn said(image: &[u8]) -> Vec<String> {
     match sii::inspect(image) {
         Ok((_, warnings)) => warnings.iter().map(ToString::to_string).collect(),
@@ -376,11 +409,15 @@ fn the_first_of_equal_categories_counts_and_pdo_categories_add_up() {
     let mut image = whole();
     let (at, end) = (head(&image, TX_PDO), head(&image, 0xffff));
     let length = 4 + 2 * usize::from(word(&image, at + 2));
-    let again = image[at..at + length].to_vec();
+    let mut again = image[at..at + length].to_vec();
+    // The first PDO of the second category is another one; the rest is there already.
+    again[4] ^= 0x80;
     insert(&mut image, end, &again);
     let (sii, warnings) = sii::inspect(&image).unwrap();
-    assert_eq!(sii.tx_pdos.len(), 2 * good.tx_pdos.len());
-    assert_eq!(warnings, []);
+    assert_eq!(sii.tx_pdos.len(), good.tx_pdos.len() + 1);
+    assert_eq!(sii.tx_pdos[..good.tx_pdos.len()], good.tx_pdos);
+    assert_eq!(warnings.len(), 1);
+    assert!(warnings[0].to_string().contains("the first counts"));
 }
 
 /// ETG.1000.6 and ETG.2010: the identity is in words 8 to 15, before all categories.

@@ -10,6 +10,7 @@ mod clocks;
 mod controller;
 mod copy;
 mod cycles;
+mod damaged_eeprom;
 mod demo;
 mod fsoe;
 mod homing;

@@ -70,8 +70,8 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
                 .hint("`ecaxis scan` shows the devices on the bus");
         }
         Cause::Eeprom(error) => eeprom(*error).to_owned(),
-        Cause::Sii(_) => {
-            "the image in its EEPROM is damaged: `ecaxis eeprom verify` shows the problems, `ecaxis esi sii` generates an image from an ESI file".to_owned()
+        Cause::Sii(_) | Cause::DamagedEeprom(_) => {
+            "`ecaxis eeprom verify` shows the problems, `ecaxis esi sii` generates an image from an ESI file, `ecaxis eeprom write` repairs the EEPROM".to_owned()
         }
         Cause::NoMailbox => {
             "devices without a mailbox, such as digital terminals, have no parameters".to_owned()

@@ -1,5 +1,7 @@
 //! Bytes → image contents. All offsets come from outside and may point anywhere.
 
+use std::collections::BTreeSet;
+
 use super::warning::{
     SiiWarning, StringRefs, WarningKind, Warnings, occurs_once, strings_of, trailing_bytes,
 };
@@ -77,8 +79,8 @@ pub(super) fn image(bytes: &[u8]) -> Result<(Sii, Vec<SiiWarning>), SiiError> {
                 sii.sync_managers = data.chunks_exact(8).map(sync_manager).collect()
             }
             // PDOs may be spread over several categories.
-            category::TX_PDO => sii.tx_pdos.extend(pdos(data, &mut strings)),
-            category::RX_PDO => sii.rx_pdos.extend(pdos(data, &mut strings)),
+            category::TX_PDO => add_pdos(&mut sii.tx_pdos, data, &mut strings),
+            category::RX_PDO => add_pdos(&mut sii.rx_pdos, data, &mut strings),
             category::DC => {
                 sii.dc = data
                     .chunks_exact(24)
@@ -179,10 +181,29 @@ struct Categories<'a> {
     length: usize,
 }
 
-/// Returns all categories up to the end. `size`: the size of the EEPROM that the image states;
-/// zeros beyond it are not categories.
+/// Returns all categories up to the end. `size`: the size of the EEPROM that the image states. Some
+/// are too small, but then the list has an end. Without one, what follows the size are the remains
+/// of another image.
 fn categories<'a>(body: &'a [u8], size: usize, notes: &mut Warnings) -> Categories<'a> {
-    let mut found = Vec::new();
+    let (whole, cut) = walk(body);
+    let stated = body.get(..size.saturating_sub(HEADER_BYTES));
+    // Some chips read as ones beyond their end. Those are not an end mark.
+    let beyond = body.get(size.saturating_sub(HEADER_BYTES)..);
+    let is_blank = beyond.is_some_and(|b| !b.is_empty() && b.iter().all(|byte| *byte == 0xff));
+    let (list, cut) = match (&whole.end, stated) {
+        (End::Mark, _) if !is_blank => (whole, cut),
+        (_, Some(stated)) => walk(stated),
+        _ => (whole, cut),
+    };
+    if let Some((offset, kind, remark)) = cut {
+        notes.add(offset, Some(kind), remark);
+    }
+    list
+}
+
+/// Walks through the list. Returns also the category that exceeds the body: offset, type, problem.
+fn walk(body: &[u8]) -> (Categories<'_>, Option<(usize, u16, WarningKind)>) {
+    let (mut found, mut cut) = (Vec::new(), None);
     let mut rest = body;
     let end = loop {
         let offset = HEADER_BYTES + body.len() - rest.len();
@@ -198,13 +219,9 @@ fn categories<'a>(body: &'a [u8], size: usize, notes: &mut Warnings) -> Categori
             break End::Missing;
         };
         let claimed = usize::from(word(length, 0)) * 2;
-        if kind == 0 && claimed == 0 && offset >= size {
-            break End::Missing;
-        }
         let Some((data, after)) = after.split_at_checked(claimed) else {
             let left = after.len();
-            let remark = WarningKind::Truncated { claimed, left };
-            notes.add(offset, Some(kind), remark);
+            cut = Some((offset, kind, WarningKind::Truncated { claimed, left }));
             break End::Damage;
         };
         let offset = offset + 4;
@@ -212,7 +229,7 @@ fn categories<'a>(body: &'a [u8], size: usize, notes: &mut Warnings) -> Categori
         rest = after;
     };
     let length = HEADER_BYTES + body.len() - rest.len();
-    Categories { found, end, length }
+    (Categories { found, end, length }, cut)
 }
 
 fn general(data: &[u8], strings: &mut StringRefs<'_>) -> General {
@@ -257,6 +274,17 @@ fn sync_manager(data: &[u8]) -> SiiSyncManager {
         enable: byte(data, 6),
         usage: sm_use(byte(data, 7)),
     }
+}
+
+/// Adds the PDOs of one more category. The first description of a PDO counts.
+fn add_pdos(all: &mut Vec<SiiPdo>, data: &[u8], strings: &mut StringRefs<'_>) {
+    let known: BTreeSet<u16> = all.iter().map(|pdo| pdo.index).collect();
+    let added = pdos(data, strings);
+    if added.iter().any(|pdo| known.contains(&pdo.index)) {
+        let Category { kind, offset, .. } = strings.here;
+        strings.notes.add(offset, Some(kind), WarningKind::Repeated);
+    }
+    all.extend(added.into_iter().filter(|pdo| !known.contains(&pdo.index)));
 }
 
 /// Returns the PDOs up to the first that exceeds the category.

@@ -36,6 +36,9 @@ pub struct Transition<'d> {
     pub timeout: Duration,
 }
 
+/// AL status code: invalid mailbox configuration for PreOp.
+pub(crate) const INVALID_MAILBOX: u16 = 0x0016;
+
 /// Returns AL status and AL status code; `None` if the device does not answer.
 pub async fn read_status(
     wire: &impl MailboxTransport,

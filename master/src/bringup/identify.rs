@@ -6,7 +6,7 @@ use ecaxis_esi::model::{Identification, Identity};
 use ethercrab::error::{Error, TimeoutError};
 use ethercrab::{MainDevice, SubDeviceIdentity};
 
-use super::{Group, Step, align, scan_error};
+use super::{Group, ScanFailure, Step, align, scan_error};
 use crate::acyclic::device::read_sii;
 use crate::acyclic::eeprom::EepromAccess;
 use crate::acyclic::enumerate::{EnumeratedDevice, FIRST_STATION, count, read_device};
@@ -27,7 +27,7 @@ struct ScannedDevice {
 pub(super) async fn explain_scan(
     wire: &DatagramClient,
     machine: &Machine,
-    error: Error,
+    failure: ScanFailure,
 ) -> report::Error {
     let Ok(count) = count(wire).await else {
         return Cause::NoAnswer.into();
@@ -55,6 +55,12 @@ pub(super) async fn explain_scan(
         if found.station != device.station {
             unaddressed.get_or_insert(device);
         } else if found.error && (code != 0 || !al::emulated(wire, device.station).await) {
+            // Its mailbox may be in the damaged part.
+            if code == al::INVALID_MAILBOX
+                && let Some(damaged) = damaged_eeprom(wire, &device, state).await
+            {
+                return damaged;
+            }
             let refused = al::StateError::Refused {
                 wanted: al::AlState::PreOp,
                 actual: state,
@@ -74,21 +80,51 @@ pub(super) async fn explain_scan(
         let missing = missing_devices(machine, &there);
         return devices_missing(machine, usize::from(count), missing);
     }
-    if matches!(error, Error::Topology)
+    if matches!(failure, ScanFailure::Failed(Error::Topology))
         && let Some(at) = topology::reversed(all.iter().map(|found| found.dl_status))
     {
         return reversed(machine, at, &present(wire, machine, &all).await);
     }
-    match (error, behind) {
-        (Error::Timeout(TimeoutError::StateTransition), Some((device, actual))) => {
-            let timeout = al::StateError::Timeout {
-                wanted: al::AlState::PreOp,
-                actual,
-                timeout: machine.pre_op_timeout(),
-            };
-            timeout.with_device(&device)
+    let late = Error::Timeout(TimeoutError::StateTransition);
+    if let (ScanFailure::Failed(error), Some((device, actual))) = (&failure, behind)
+        && *error == late
+    {
+        let timeout = al::StateError::Timeout {
+            wanted: al::AlState::PreOp,
+            actual,
+            timeout: machine.pre_op_timeout(),
+        };
+        return timeout.with_device(&device);
+    }
+    // Not for errors of the wire: they have nothing to do with what an EEPROM contains.
+    let by_content = !matches!(
+        failure,
+        ScanFailure::Failed(Error::Timeout(_) | Error::Pdu(_) | Error::WorkingCounter { .. })
+    );
+    for found in all.iter().filter(|_| by_content) {
+        let device = found.named(name_at(machine, found.position));
+        if let Some(damaged) = damaged_eeprom(wire, &device, found.state).await {
+            return damaged;
         }
-        (error, _) => scan_error("scanning the segment and going to PreOp", &error),
+    }
+    match failure {
+        ScanFailure::Failed(error) => scan_error("scanning the segment and going to PreOp", &error),
+        ScanFailure::Panicked(text) => Cause::Panicked(text).into(),
+    }
+}
+
+/// Returns what is wrong with a device's EEPROM; `None` if nothing is, or it cannot be read.
+async fn damaged_eeprom(
+    wire: &DatagramClient,
+    device: &DeviceRef,
+    state: al::AlState,
+) -> Option<report::Error> {
+    match read_sii(wire, device, EepromAccess::of(state)).await {
+        Ok(sii) => {
+            let damage = sii.damage.into_iter().next()?;
+            Some(Cause::DamagedEeprom(damage).with_device(device))
+        }
+        Err(error) => matches!(*error.cause, Cause::Sii(_)).then_some(error),
     }
 }
 

@@ -212,10 +212,8 @@ async fn repair(wire: &DatagramClient, machine: &Machine) {
 
 /// Returns `None` if the device does not need a repair, or none is known.
 async fn repair_one(wire: &DatagramClient, machine: &Machine, position: u16) -> Option<()> {
-    /// Invalid mailbox configuration in PreOp.
-    const INVALID_MAILBOX: u16 = 0x0016;
     let found = read_device(wire, position).await.ok()?;
-    if found.code != INVALID_MAILBOX || found.state != AlState::Init {
+    if found.code != al::INVALID_MAILBOX || found.state != AlState::Init {
         return None;
     }
     let device = found.named(name_at(machine, position));

@@ -11,6 +11,11 @@
     reason = "an error here carries the whole address and ends the run"
 )]
 
+use std::future::poll_fn;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::pin::pin;
+use std::task::{Context, Poll};
+
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
@@ -26,6 +31,7 @@ use crate::mailbox::worker::EmergencySink;
 use crate::report::{Cause, Error};
 use crate::rt::image::{self, DeviceRegion, ImagePlan};
 use crate::rt::phase::ClockPlan;
+use crate::text::panic_text;
 
 pub mod align;
 pub(crate) mod clocks;
@@ -113,10 +119,13 @@ pub async fn bring_up(
         al::acknowledge_errors_in_init(&wire).await;
         // ethercrab's tables are large, and futures hold them by value.
         let scan = Box::pin(main_device.init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now));
-        match mailbox::repair_during(&wire, machine, scan).await {
-            Ok(group) => Ok(group),
-            Err(error) => Err(identify::explain_scan(&wire, machine, error).await),
-        }
+        let scan = caught(mailbox::repair_during(&wire, machine, scan)).await;
+        let failure = match scan {
+            Ok(Ok(group)) => return Ok(group),
+            Ok(Err(error)) => ScanFailure::Failed(error),
+            Err(panic) => ScanFailure::Panicked(panic),
+        };
+        Err(identify::explain_scan(&wire, machine, failure).await)
     };
     let scan = times.measure("scan, EEPROM, PreOp", None, Box::pin(scan));
     let group = scan.await?;
@@ -356,6 +365,26 @@ async fn without_lrw(
         Cause::TooLarge(error).with_device(at)
     })?;
     Ok(Some(image))
+}
+
+/// Why ethercrab's scan failed.
+enum ScanFailure {
+    Failed(ethercrab::error::Error),
+    /// ethercrab panics on some damaged EEPROMs.
+    Panicked(String),
+}
+
+/// Returns the output of a future, or the text of its panic.
+async fn caught<T>(future: impl Future<Output = T>) -> Result<T, String> {
+    let mut future = pin!(future);
+    let poll = |context: &mut Context<'_>| {
+        let polled = catch_unwind(AssertUnwindSafe(|| future.as_mut().poll(context)));
+        match polled {
+            Ok(polled) => polled.map(Ok),
+            Err(panic) => Poll::Ready(Err(panic_text(&*panic))),
+        }
+    };
+    poll_fn(poll).await
 }
 
 fn scan_error(step: &'static str, error: &ethercrab::error::Error) -> Error {

@@ -57,6 +57,9 @@ pub(crate) fn check(
     let mailbox = raw.mailbox.value().unwrap_or_default();
     let axes = axes::check(&raw, &numbers, mode.ok().flatten(), chosen.as_mut(), p);
     if let Some(chosen) = chosen.as_mut() {
+        let damage = image.iter().filter_map(|image| image.sii.damage.first());
+        let damage = damage.map(|damage| format!("the EEPROM image is damaged: {damage}"));
+        chosen.notes.extend(damage);
         chosen
             .notes
             .extend(mailbox_note(device, image.as_deref(), mailbox));

@@ -18,7 +18,7 @@ use super::{DeviceRef, DiagnosisMessage, EepromError, EmergencyReport, StateErro
 use ecaxis_ecat::al_state::AlState;
 use ecaxis_ecat::al_status_code::al_status_text;
 use ecaxis_esi::address;
-use ecaxis_esi::sii::SiiError;
+use ecaxis_esi::sii::{SiiError, SiiWarning};
 
 /// An error of the master: the step and the place at which it occurred, and its cause.
 #[derive(Debug, thiserror::Error)]
@@ -121,6 +121,8 @@ pub enum Cause {
     Eeprom(EepromError),
     #[error("its EEPROM: {0}")]
     Sii(#[source] SiiError),
+    #[error("its EEPROM is damaged: {0}")]
+    DamagedEeprom(SiiWarning),
     #[error("the EEPROM describes no mailbox")]
     NoMailbox,
     #[error("is in {state}, where it has no CoE mailbox")]

@@ -192,8 +192,11 @@ impl Eeprom {
         Some(match self.job.take()?.0 {
             Job::Read(word) => {
                 let mut out = [0xff; 8];
+                // At its end, a chip goes on with its beginning (AT24C16 data sheet, "sequential
+                // read").
                 for (n, pair) in (0..4).zip(out.chunks_exact_mut(2)) {
-                    pair.copy_from_slice(&self.word(word.wrapping_add(n)).to_le_bytes());
+                    let word = self.address(word.wrapping_add(n));
+                    pair.copy_from_slice(&self.word(word).to_le_bytes());
                 }
                 let eight = self.features & EIGHT_BYTES != 0;
                 Finished::Read(out, if eight { 8 } else { 4 })
