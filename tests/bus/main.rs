@@ -5,6 +5,7 @@
 
 mod axes;
 mod bring_up;
+mod cabling;
 mod clock_wrap;
 mod clocks;
 mod controller;

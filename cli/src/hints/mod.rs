@@ -84,7 +84,7 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
             "check the power of the first one missing and the cable to it, or remove its [[device]] from the file; `ecaxis compare` shows all differences".to_owned()
         }
         Cause::Reversed { .. } => {
-            "connect its IN (port 0) to the device before it, towards this computer; `ecaxis scan` shows the ports".to_owned()
+            "swap its two cables: its IN (port 0) leads towards this computer; `ecaxis scan` shows the ports".to_owned()
         }
         Cause::Unexpected { position, .. } => {
             format!("add a [[device]] with `position = {position}`, or disconnect it")

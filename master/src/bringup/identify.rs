@@ -83,7 +83,13 @@ pub(super) async fn explain_scan(
     if matches!(failure, ScanFailure::Failed(Error::Topology))
         && let Some(at) = topology::reversed(all.iter().map(|found| found.dl_status))
     {
-        return reversed(machine, at, &present(wire, machine, &all).await);
+        let status = all.get(at).map_or(0, |found| found.dl_status);
+        let open = (0..).zip(topology::open_ports(status)).skip(1);
+        let port = open
+            .into_iter()
+            .find_map(|(port, open)| open.then_some(port));
+        let there = present(wire, machine, &all).await;
+        return reversed(machine, at, port.unwrap_or(0), &there);
     }
     let late = Error::Timeout(TimeoutError::StateTransition);
     if let (ScanFailure::Failed(error), Some((device, actual))) = (&failure, behind)
@@ -156,14 +162,16 @@ async fn present(
     products
 }
 
-/// Names the device whose IN and OUT are swapped. `at`: its index on the bus.
-fn reversed(machine: &Machine, at: usize, there: &[Product]) -> report::Error {
+/// Names the device whose IN and OUT are swapped. `at`: its index on the bus; `port`: the port at which
+/// frames enter.
+fn reversed(machine: &Machine, at: usize, port: u8, there: &[Product]) -> report::Error {
     let expected: Vec<_> = positions(machine).collect();
     let same = |wanted: usize, found: usize| is_product(expected.get(wanted), there.get(found));
     let places = align::moved_from(expected.len(), there.len(), at, same);
     let candidates = places.into_iter().filter_map(|index| expected.get(index));
     let cause = Cause::Reversed {
         position: u16::try_from(at).unwrap_or(u16::MAX),
+        port,
         candidates: candidates.copied().map(named).collect(),
     };
     cause.into()

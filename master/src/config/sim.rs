@@ -21,6 +21,8 @@ pub struct SimSetup {
     pub port: Option<u8>,
     /// The propagation delay on the cable to it, one way.
     pub cable_ns: Option<u64>,
+    /// True if the cables at its IN and OUT are swapped.
+    pub reversed: bool,
     /// The drift of its clock against true time.
     pub drift_ppm: Option<f64>,
     /// The time of its clock at power-on.
@@ -70,6 +72,7 @@ pub(crate) fn check(
         after: raw.after.as_ref().map(|a| a.get_ref().clone()),
         port: raw.port.value(),
         cable_ns: raw.cable.value(),
+        reversed: raw.reversed.value().unwrap_or(false),
         drift_ppm: raw.drift_ppm.value(),
         offset_ns: raw.offset.value().unwrap_or(0),
         jitter_ns: raw
@@ -122,8 +125,12 @@ pub fn topology(devices: &[DeviceConfig]) -> Result<Topology, Vec<TopologyError>
             })
         })
         .collect();
-    let mut topology = Topology::connect(&media(&order), &requests)?;
+    let media = media(&order);
+    let mut topology = Topology::connect(&media, &requests)?;
     for (n, device) in order.iter().enumerate() {
+        if device.sim.reversed {
+            topology = topology.reversed(&media, n).map_err(|error| vec![error])?;
+        }
         if let Some(ns) = device.sim.cable_ns {
             topology = topology.with_cable(n, ns);
         }
@@ -224,6 +231,10 @@ pub fn topology_message(error: &TopologyError, devices: &[DeviceConfig]) -> (Str
         E::NoPort { device } => (
             format!("no device before \"{}\" has a port left", name(device)),
             "devices are connected in the order of their positions".to_owned(),
+        ),
+        E::NoSecondPort { device } => (
+            format!("\"{}\" has no second port to swap its cables", name(device)),
+            ports(device),
         ),
         E::NoPortForRing => (error.to_string(), String::new()),
     }

@@ -146,10 +146,16 @@ pub enum Cause {
         missing: Vec<String>,
     },
     /// Frames do not enter a SubDevice at port 0.
-    #[error("scanning: IN and OUT are swapped at {}", reversed(candidates, *position))]
+    #[error(
+        "scanning: IN and OUT are swapped at {}: frames enter at its port {port} instead of port 0 \
+         and reach it at position {position}",
+        reversed(candidates)
+    )]
     Reversed {
         /// Its position on the bus, after the devices behind it.
         position: u16,
+        /// The port at which frames enter.
+        port: u8,
         /// Devices of the file that may be the one, with positions.
         candidates: Vec<String>,
     },
@@ -526,9 +532,9 @@ impl fmt::Display for DriveReport {
     }
 }
 
-fn reversed(candidates: &[String], position: u16) -> String {
+fn reversed(candidates: &[String]) -> String {
     match candidates {
-        [] => format!("the SubDevice that frames reach at position {position}"),
+        [] => "a SubDevice".to_owned(),
         [device] => device.clone(),
         several => format!("one of {}", several.join(", ")),
     }

@@ -40,11 +40,13 @@ pub struct Uplink {
 }
 
 /// A tree of devices. Port 0 of each device connects to an earlier device, that of the first to the
-/// MainDevice.
+/// MainDevice. A device with swapped cables has another port there.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Topology {
     pub(super) uplinks: Vec<Option<Uplink>>,
-    /// One-way delay of the cable at port 0 in ns; `None`: the default of all cables.
+    /// The port that leads to the MainDevice.
+    pub(super) inlets: Vec<u8>,
+    /// One-way delay of the cable at that port in ns; `None`: the default of all cables.
     pub(super) cable_ns: Vec<Option<u64>>,
     pub(super) ring: Option<(Uplink, SecondPort)>,
 }
@@ -139,6 +141,12 @@ pub enum TopologyError {
         /// The device that cannot be connected.
         device: usize,
     },
+    /// A device with one port has no cables to swap.
+    #[error("device {device}: it has no second port to swap its cables")]
+    NoSecondPort {
+        /// The device.
+        device: usize,
+    },
     /// No free port can close the ring.
     #[error("no port is left to close the ring at")]
     NoPortForRing,
@@ -156,7 +164,8 @@ impl TopologyError {
             | Self::OutOfOrder { device, .. }
             | Self::OtherMedium { device, .. }
             | Self::NoPortAt { device, .. }
-            | Self::NoPort { device } => Some(device),
+            | Self::NoPort { device }
+            | Self::NoSecondPort { device } => Some(device),
             Self::NoPortForRing => None,
         }
     }
@@ -269,6 +278,7 @@ impl Topology {
         }
         let topology = Self {
             cable_ns: vec![None; uplinks.len()],
+            inlets: vec![0; uplinks.len()],
             uplinks,
             ring: None,
         };
@@ -299,7 +309,31 @@ impl Topology {
         Ok(self)
     }
 
-    /// Sets the one-way delay of the cable at port 0 of a device.
+    /// Swaps the cables at IN (port 0) and OUT of a device. OUT is the port of the next device, or
+    /// the first port that frames pass. Frames then reach the device after those behind it.
+    ///
+    /// # Errors
+    /// [`TopologyError::NoSecondPort`]
+    pub fn reversed(mut self, media: &[Media], device: usize) -> Result<Self, TopologyError> {
+        let there = media.get(device).copied().unwrap_or_default();
+        let fits = |port: &u8| there.get(usize::from(*port)) == Some(&there[0]);
+        let used = |port: &u8| self.has_cable(device, *port);
+        let ports = || DOWNSTREAM.into_iter().filter(fits);
+        let out = ports().find(used).or_else(|| ports().next());
+        let out = out.ok_or(TopologyError::NoSecondPort { device })?;
+        let end = Uplink { device, port: out };
+        let next = self.uplinks.iter_mut().flatten();
+        let ring = self.ring.iter_mut().map(|(last, _)| last);
+        for upper in next.chain(ring).filter(|upper| **upper == end) {
+            upper.port = 0;
+        }
+        if let Some(inlet) = self.inlets.get_mut(device) {
+            *inlet = out;
+        }
+        Ok(self)
+    }
+
+    /// Sets the one-way delay of the cable from a device towards the MainDevice.
     #[must_use]
     pub fn with_cable(mut self, device: usize, ns: u64) -> Self {
         if let Some(cable) = self.cable_ns.get_mut(device) {
@@ -323,15 +357,15 @@ impl Topology {
     /// True if a cable is connected to the port.
     #[must_use]
     pub fn has_cable(&self, device: usize, port: u8) -> bool {
-        if port == 0 {
-            return device == 0 && !self.is_empty() || self.uplink(device).is_some();
+        if self.inlets.get(device) == Some(&port) {
+            return device == 0 || self.uplink(device).is_some();
         }
         let end = Uplink { device, port };
         self.uplinks.contains(&Some(end)) || self.ring.is_some_and(|(last, _)| last == end)
     }
 
-    /// Returns the port that port 0 of a device connects to; `None` for the device at the
-    /// MainDevice.
+    /// Returns the port that a device connects to towards the MainDevice; `None` for the device at
+    /// the MainDevice.
     #[must_use]
     pub fn uplink(&self, device: usize) -> Option<Uplink> {
         self.uplinks.get(device).copied().flatten()

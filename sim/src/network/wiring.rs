@@ -68,7 +68,8 @@ impl Wiring {
                 cable_ns
             };
             let own = topology.cable_ns.get(device).copied().flatten();
-            wiring.lay(upper, End::Port { device, port: 0 }, own.unwrap_or(usual));
+            let port = topology.inlets.get(device).copied().unwrap_or(0);
+            wiring.lay(upper, End::Port { device, port }, own.unwrap_or(usual));
         }
         if let Some((last, second)) = topology.ring {
             let last = End::Port {
