@@ -10,4 +10,5 @@ mod harness;
 mod hostile;
 mod http;
 mod lease;
+mod samples;
 mod streams;
