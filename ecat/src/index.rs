@@ -1,4 +1,12 @@
 //! Typed indices of a machine's lists, and vectors that accept only their own index.
+//!
+//! ```
+//! use ecaxis_ecat::index::{AxisIndex, IndexVec};
+//!
+//! let names: IndexVec<AxisIndex, &str> = vec!["x", "y"].into();
+//! assert_eq!(names[AxisIndex(1)], "y");
+//! assert_eq!(names.get(AxisIndex(2)), None);
+//! ```
 
 use alloc::vec::Vec;
 use core::marker::PhantomData;

@@ -3,6 +3,16 @@
 //!
 //! A value whose length or bits do not fit its type is printed as raw bytes in brackets, `[01 02]`.
 //! This form is accepted for every type.
+//!
+//! ```
+//! use ecaxis_ecat::data_type::DataType;
+//!
+//! let velocity = DataType::named("DINT", 0).expect("a base type");
+//! let bytes = velocity.read("-2").expect("a number of 32 bits");
+//! assert_eq!(bytes, [0xfe, 0xff, 0xff, 0xff]);
+//! assert_eq!(velocity.show(&bytes), "-2");
+//! assert!(velocity.read("0x1_0000_0000").is_err());
+//! ```
 
 use alloc::borrow::ToOwned;
 use alloc::format;

@@ -1,4 +1,18 @@
 //! CoE messages (ETG.1000.6 clause 5.6): SDO, SDO Information, emergencies.
+//!
+//! ```
+//! use ecaxis_ecat::mailbox::Encode;
+//! use ecaxis_ecat::mailbox::coe::{Message, Request};
+//!
+//! let request = Request::Upload { index: 0x6041, sub: 0, complete: false };
+//! let mut bytes = Vec::new();
+//! request.emit(1, 32, &mut bytes);
+//! // The header of ETG.1000.4: 10 bytes follow, type CoE, counter 1; then the command of an upload.
+//! assert_eq!(bytes[..6], [10, 0, 0, 0, 0, 0x13]);
+//! assert_eq!(bytes[8..12], [0x40, 0x41, 0x60, 0]);
+//! assert_eq!(Request::parse(&bytes), Ok(Some(request)));
+//! assert!(Message::parse(&bytes[..4]).is_err());
+//! ```
 
 use alloc::vec::Vec;
 

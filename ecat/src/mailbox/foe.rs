@@ -1,4 +1,14 @@
 //! FoE messages (ETG.1000.6 clause 5.8). Both sides send the same messages.
+//!
+//! ```
+//! use ecaxis_ecat::mailbox::Encode;
+//! use ecaxis_ecat::mailbox::foe::Message;
+//!
+//! let read = Message::Read { password: 0, name: b"firmware.bin" };
+//! let mut bytes = Vec::new();
+//! read.emit(2, 64, &mut bytes);
+//! assert_eq!(Message::parse(&bytes), Ok(read));
+//! ```
 
 use alloc::vec::Vec;
 
