@@ -336,7 +336,7 @@ impl Client {
         let why = bus
             .error
             .map_or_else(String::new, |error| format!(": {error}"));
-        let now = format!("{:?}", bus.state).to_lowercase();
+        let now = bus.state.name();
         let error = OpError::new(ErrorCode::Timeout, format!("the bus is {now}{why}"));
         Err(match bus.help {
             Some(help) => error.help(help),

@@ -9,6 +9,12 @@ use ecaxis_master::samples::Samples;
 use serde_json::json;
 
 use crate::connection::Batch;
+use crate::error::{ErrorCode, OpError};
+
+/// The rows that are read at once.
+const PART: u64 = 4096;
+/// The most values of a file: its text is in memory.
+const VALUES: usize = 8 << 20;
 
 /// Rows of some signals with their names.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,33 +26,44 @@ pub struct Rows {
 
 impl Rows {
     /// Reads all kept rows between both times.
-    #[must_use]
-    pub fn read(samples: &Samples, words: &[usize], [from_ns, to_ns]: [Nanos; 2]) -> Self {
+    ///
+    /// # Errors
+    /// Fails if they have more than 8 million values.
+    pub fn read(
+        samples: &Samples,
+        words: &[usize],
+        [from_ns, to_ns]: [Nanos; 2],
+    ) -> Result<Self, OpError> {
         let signals = &samples.layout().signals;
         let known = |word: &usize| signals.iter().find(|signal| signal.word == *word);
         let names = words.iter().filter_map(known);
         let names = names
             .map(|signal| (signal.name.clone(), signal.unit.clone()))
             .collect();
+        let mut batch = Batch {
+            signals: vec![Vec::new(); words.len()],
+            ..Batch::default()
+        };
         let mut next = samples.written().saturating_sub(samples.capacity());
-        let mut batch = Batch::read(samples, words, &mut next, u64::MAX);
-        let keep: Vec<bool> = batch
-            .times_ns
-            .iter()
-            .map(|time| (from_ns..=to_ns).contains(time))
-            .collect();
-        retain(&mut batch.rows, &keep);
-        retain(&mut batch.times_ns, &keep);
-        for values in &mut batch.signals {
-            retain(values, &keep);
+        let end = samples.written();
+        while next < end {
+            let count = PART.min(end - next);
+            let part = Batch::read(samples, words, &mut next, count);
+            let wanted = |row: &usize| (from_ns..=to_ns).contains(&part.times_ns[*row]);
+            for row in (0..part.rows.len()).filter(wanted) {
+                batch.rows.push(part.rows[row]);
+                batch.times_ns.push(part.times_ns[row]);
+                for (to, from) in batch.signals.iter_mut().zip(&part.signals) {
+                    to.push(from[row]);
+                }
+            }
+            if batch.rows.len().saturating_mul(words.len().max(1)) > VALUES {
+                let error = OpError::new(ErrorCode::TooLarge, "more than 8 million values");
+                return Err(error.help("choose fewer signals or a shorter time"));
+            }
         }
-        Self { names, batch }
+        Ok(Self { names, batch })
     }
-}
-
-fn retain<T>(values: &mut Vec<T>, keep: &[bool]) {
-    let mut each = keep.iter();
-    values.retain(|_| each.next().copied().unwrap_or(false));
 }
 
 /// Returns the rows as CSV (RFC 4180). Values are exact; a value that does not exist is empty.

@@ -64,6 +64,8 @@ pub struct External {
     reports: rtrb::Producer<Report>,
     counters: Arc<AreaCounters>,
     memory: Option<Arc<SharedMemory>>,
+    /// The memory is that of the owner.
+    reads: bool,
     /// Kind and value of each axis in the last complete set.
     set: Box<[[u64; 2]]>,
     scratch: Box<[[u64; 2]]>,
@@ -131,6 +133,7 @@ pub fn external(
         reports: report_in,
         counters: Arc::clone(counters),
         memory: None,
+        reads: false,
         set: vec![[0; 2]; axes.len()].into(),
         scratch: vec![[0; 2]; axes.len()].into(),
         counter: 0,
@@ -223,10 +226,8 @@ impl External {
             }
             axis.release();
         }
-        // The report of each message has its own room.
-        if self.reports.slots() > self.axes.len() * REPORTS_PER_AXIS {
-            self.exchange(None, machine);
-        }
+        // `Detach` follows and takes the memory away.
+        self.reads = false;
     }
 
     fn take_messages(&mut self, machine: &mut CycleContext<'_>) {
@@ -280,6 +281,7 @@ impl External {
     }
 
     fn exchange(&mut self, memory: Option<Arc<SharedMemory>>, machine: &mut CycleContext<'_>) {
+        self.reads = memory.is_some();
         let old = std::mem::replace(&mut self.memory, memory);
         // A set of the previous client is not one of the next.
         self.set.fill([0; 2]);
@@ -351,7 +353,7 @@ impl External {
 
     /// Copies a complete set. Returns true if it is new.
     fn read_area(&mut self) -> bool {
-        let Some(memory) = &self.memory else {
+        let Some(memory) = self.memory.as_ref().filter(|_| self.reads) else {
             return false;
         };
         let area = memory.words();
@@ -425,7 +427,10 @@ impl External {
             let _ = machine.command(axis.axis, Command::Stop);
             return Err(AreaStop::Stale(self.missing));
         }
-        let result = if fresh {
+        let result = if !machine.axis(axis.axis).ready {
+            // Otherwise the axis would move again as soon as it is enabled again.
+            Err(AreaStop::NotReady)
+        } else if fresh {
             match Wanted::new(kind, value) {
                 Ok(Wanted::Nothing) => {
                     axis.source = Source::Nothing { blocked: false };

@@ -1,5 +1,6 @@
 //! HTTP and WebSocket: the page, the operations, samples, history and metrics.
 
+use std::io::Read as _;
 use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -32,6 +33,8 @@ use crate::socket::LINE;
 const BUCKETS: usize = 20_000;
 /// The most values of one answer.
 const VALUES: u64 = 1 << 22;
+/// The bytes of a recording that are read at once.
+const PIECE: usize = 256 * 1024;
 /// The silence after which a WebSocket client is asked for a sign of life.
 const PING: Duration = Duration::from_secs(10);
 
@@ -129,14 +132,8 @@ fn router(http: Arc<Http>) -> Router {
             get(|| async { axum::Json(openapi::document()) }),
         )
         .route("/api/ws", get(websocket))
-        .route(
-            "/api/machine",
-            get(|state, headers| read(state, headers, "machine")),
-        )
-        .route(
-            "/api/state",
-            get(|state, headers| read(state, headers, "state")),
-        )
+        .route("/api/machine", get(machine))
+        .route("/api/state", get(state))
         .route("/api/events", get(events))
         .route("/api/samples", get(samples))
         .route("/api/history", get(history))
@@ -267,21 +264,26 @@ async fn operation(
         }
     };
     map.insert("op".to_owned(), Value::String(op));
-    let Answer { body, status, .. } = http
-        .client(&headers)
-        .answer(Request::from_object(map))
-        .await;
+    read(&http, &headers, map).await
+}
+
+/// Carries out an operation without a body.
+async fn read(http: &Http, headers: &HeaderMap, op: Map<String, Value>) -> Response {
+    let request = Request::from_object(op);
+    let Answer { body, status, .. } = http.client(headers).answer(request).await;
     respond(body, status)
 }
 
-async fn read(State(http): Shared, headers: HeaderMap, op: &'static str) -> Response {
-    let mut map = Map::new();
-    map.insert("op".to_owned(), json!(op));
-    let answer = http
-        .client(&headers)
-        .answer(Request::from_object(map))
-        .await;
-    respond(answer.body, answer.status)
+fn named(op: &str) -> Map<String, Value> {
+    Map::from_iter([("op".to_owned(), json!(op))])
+}
+
+async fn machine(State(http): Shared, headers: HeaderMap) -> Response {
+    read(&http, &headers, named("machine")).await
+}
+
+async fn state(State(http): Shared, headers: HeaderMap) -> Response {
+    read(&http, &headers, named("state")).await
 }
 
 #[derive(Debug, Deserialize)]
@@ -295,15 +297,9 @@ async fn events(
     headers: HeaderMap,
     Query(After { after }): Query<After>,
 ) -> Response {
-    let request = json!({"op": "events", "after": after});
-    let Value::Object(map) = request else {
-        return refusal(&OpError::new(ErrorCode::BadRequest, "no object"));
-    };
-    let answer = http
-        .client(&headers)
-        .answer(Request::from_object(map))
-        .await;
-    respond(answer.body, answer.status)
+    let mut op = named("events");
+    op.insert("after".to_owned(), json!(after));
+    read(&http, &headers, op).await
 }
 
 /// Signals and a range of samples, as in the query of a URL.
@@ -445,7 +441,10 @@ async fn export(
         .file_stem()
         .map(|name| name.to_string_lossy().into_owned());
     let work = move || {
-        let rows = export::Rows::read(&hub.samples, &words, times);
+        let rows = match export::Rows::read(&hub.samples, &words, times) {
+            Ok(rows) => rows,
+            Err(error) => return refusal(&error),
+        };
         let name: String = name.unwrap_or_default();
         let plain = |c: &char| c.is_ascii_alphanumeric() || *c == '-' || *c == '_';
         make(&rows, &name.chars().filter(plain).collect::<String>())
@@ -493,18 +492,34 @@ async fn recording(State(http): Shared, headers: HeaderMap, Path(name): Path<Str
         return refusal(&unknown());
     };
     let path = folder.join(&name);
-    let read = tokio::task::spawn_blocking(move || {
+    let open = move || {
         let about = std::fs::symlink_metadata(&path).ok()?;
-        about.is_file().then(|| std::fs::read(&path).ok())?
-    });
-    match read.await.ok().flatten() {
-        Some(bytes) => download(
+        about.is_file().then(|| std::fs::File::open(&path).ok())?
+    };
+    let opened = tokio::task::spawn_blocking(open).await;
+    match opened.ok().flatten() {
+        Some(file) => download(
             &name.replace('"', ""),
             "application/octet-stream",
-            bytes.into(),
+            Body::from_stream(pieces(file)),
         ),
         None => refusal(&unknown()),
     }
+}
+
+/// Returns the content of a file in pieces: a recording may be larger than the memory.
+fn pieces(file: std::fs::File) -> impl futures_util::Stream<Item = std::io::Result<Vec<u8>>> {
+    futures_util::stream::try_unfold(file, |mut file| async move {
+        let read = move || {
+            let mut piece = vec![0; PIECE];
+            let count = file.read(&mut piece)?;
+            piece.truncate(count);
+            Ok((count > 0).then_some((piece, file)))
+        };
+        tokio::task::spawn_blocking(read)
+            .await
+            .map_err(std::io::Error::other)?
+    })
 }
 
 async fn websocket(State(http): Shared, headers: HeaderMap, upgrade: WebSocketUpgrade) -> Response {

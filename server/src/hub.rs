@@ -56,6 +56,20 @@ pub enum BusState {
     Failed,
 }
 
+impl BusState {
+    /// Returns the name in the protocol.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Down => "down",
+            Self::Starting => "starting",
+            Self::Op => "op",
+            Self::Stopping => "stopping",
+            Self::Failed => "failed",
+        }
+    }
+}
+
 /// The bus, and why it is not in Op.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct BusStatus {
@@ -343,7 +357,7 @@ impl Hub {
         }
         if self.bus_state() != BusState::Op {
             let bus = self.bus.borrow();
-            let state = format!("{:?}", bus.state).to_lowercase();
+            let state = bus.state.name();
             let error = bus
                 .error
                 .as_ref()

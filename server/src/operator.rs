@@ -17,8 +17,9 @@ use crate::error::{ErrorCode, OpError};
 use crate::external::{AreaStop, ExternalClient, MESSAGES_PER_CYCLE, Message, Report, StreamEnd};
 use crate::hub::{Count, Hub, Latest, QueuedWork, RunningStep, Transfer, Work};
 
-/// The pieces of work that one call takes; the machine accepts 64 requests.
-const WORK_PER_CALL: usize = 60;
+/// The pieces of work that one call takes; the machine accepts 64 requests, and each piece is at
+/// most two.
+const WORK_PER_CALL: usize = 30;
 /// The period at which the state is published without a reason.
 const PUBLISH: Duration = Duration::from_millis(10);
 
@@ -252,14 +253,17 @@ impl ServerOperator {
         }
     }
 
-    fn take_work(&mut self) -> Vec<Request> {
+    fn take_work(&mut self, view: &View<'_>) -> Vec<Request> {
         let mut requests = Vec::new();
         // The rest of the queue is for stops.
         let room = MESSAGES_PER_CYCLE.saturating_sub(self.cycle.waiting());
         for QueuedWork { ticket, work } in self.hub.take_work(WORK_PER_CALL, room) {
             match work {
                 Work::Request(request) => {
-                    self.release(&request);
+                    if let Some(stop) = self.release(&request, view) {
+                        self.take_request(0, stop);
+                        requests.push(stop);
+                    }
                     self.take_request(ticket, request);
                     requests.push(request);
                 }
@@ -291,14 +295,34 @@ impl ServerOperator {
         requests
     }
 
-    /// From the cycle on that takes the request, the axis follows no set-points of a client.
-    fn release(&mut self, request: &Request) {
-        let message = match request {
-            Request::SetOutput { .. } | Request::Override { .. } => return,
-            Request::Program(ProgramRequest::Pause | ProgramRequest::Resume) => return,
-            request => Message::Release(request.axis().map(|axis| axis.0)),
+    /// Ends the set-points of a client at the axis of a motion or a stop. Returns the stop that
+    /// precedes a motion: if the motion is refused, the axis must not keep the client's velocity.
+    fn release(&mut self, request: &Request, view: &View<'_>) -> Option<Request> {
+        let attached = self.hub.area.attached.load(Ordering::Relaxed) != 0;
+        let (axis, stop) = match *request {
+            // Set-points go on: the cycle ends them at an axis that is not ready.
+            Request::Enable { .. }
+            | Request::Reset { .. }
+            | Request::SetMode { .. }
+            | Request::SetOutput { .. }
+            | Request::Override { .. }
+            | Request::Program(ProgramRequest::Pause | ProgramRequest::Resume) => return None,
+            Request::Program(ProgramRequest::Start | ProgramRequest::Step) => {
+                (None, Some(Request::StopAll))
+            }
+            Request::Jog { axis, .. } => {
+                let hand = view.hands.get(axis);
+                let jogs = hand.is_some_and(|h| matches!(h.doing, Activity::Jogging { .. }));
+                (Some(axis), (!jogs).then_some(Request::Stop { axis }))
+            }
+            request if request.stops() => (request.axis(), None),
+            request => (
+                request.axis(),
+                request.axis().map(|axis| Request::Stop { axis }),
+            ),
         };
-        self.send(0, message);
+        self.send(0, Message::Release(axis.map(|axis| axis.0)));
+        stop.filter(|_| attached)
     }
 
     fn send(&mut self, ticket: u64, message: Message) {
@@ -377,7 +401,7 @@ impl Operator for ServerOperator {
         self.poll_transfers();
         self.report_troubles(view);
         self.hub.expire_lease();
-        let requests = self.take_work();
+        let requests = self.take_work(view);
         OperatorInput {
             presence: match self.hub.is_wanted() {
                 true => Presence::Here,

@@ -23,7 +23,7 @@ use crate::socket::Socket;
 const PERIOD: Duration = Duration::from_millis(5);
 /// The threads that serve clients.
 const WORKERS: usize = 2;
-/// The size in bits of a new token.
+/// The size in bytes of a new token.
 const TOKEN_BYTES: usize = 16;
 
 /// Settings of the server.

@@ -5,10 +5,12 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::pin::{Pin, pin};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::channel;
 use std::task::{Context, Poll, Waker};
 
 use ecaxis_axis::Command;
+use ecaxis_axis::setpoint::{Interpolation, Knot, MotionLimits, StreamConfig};
 use ecaxis_ecat::index::AxisIndex;
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{self, Clock, Nanos};
@@ -21,6 +23,11 @@ use ecaxis_master::rt::controller::{Controller, CycleContext};
 use ecaxis_master::rt::cycle::{Engine, EngineReport};
 use ecaxis_master::samples::{SampleLayout, Samples};
 use ecaxis_master::session::{Attachments, Cause, Error, Options, Prepared, Progress, RunBuilder};
+use ecaxis_master::sys::shared_memory::SharedMemory;
+use ecaxis_server::external::{
+    AreaCounters, External, ExternalClient, Message, Report, StreamPoint, command_area, external,
+    words,
+};
 use ecaxis_test_support::{axes, faults, load, machine, virtual_time};
 
 /// The machine time whose samples are kept.
@@ -369,4 +376,132 @@ fn stopping_allocates_nothing() {
         assert!(remains.axes.iter().all(|slot| slot.last_enabled.is_some()));
         assert_eq!(counted, 0, "{result:?}");
     }
+}
+
+/// Set-points of clients: shared memory that is attached, late, refused, stale and replaced, and a
+/// stream of points.
+struct Clients {
+    external: External,
+    client: ExternalClient,
+    counters: Arc<AreaCounters>,
+    memory: Arc<SharedMemory>,
+    y: AxisRef,
+    cycle: u64,
+    ended: Arc<AtomicU64>,
+}
+
+impl Clients {
+    fn write(&self, kind: u64, position: f64) {
+        let words = self.memory.words();
+        let values = [
+            (words::COUNTER, self.cycle),
+            (words::HEADER, kind),
+            (words::HEADER + 1, position.to_bits()),
+        ];
+        words[words::SEQUENCE].fetch_add(1, Ordering::Relaxed);
+        for (at, value) in values {
+            words[at].store(value, Ordering::Relaxed);
+        }
+        words[words::SEQUENCE].fetch_add(1, Ordering::Release);
+    }
+
+    /// Does what clients and the operator do outside the cycle.
+    fn act(&mut self, ready: bool) {
+        while let Ok(report) = self.client.reports.pop() {
+            if matches!(
+                report,
+                Report::StreamEnded { .. } | Report::AreaStopped { .. }
+            ) {
+                self.ended.fetch_add(1, Ordering::Relaxed);
+            }
+        }
+        if !ready {
+            return;
+        }
+        self.cycle += 1;
+        let mut send = |message| self.client.messages.push(message).expect("room");
+        match self.cycle % 2_000 {
+            1 => {
+                self.memory = Arc::new(command_area(2).expect("memory"));
+                send(Message::Attach(Arc::clone(&self.memory)));
+                let config = StreamConfig {
+                    interpolation: Interpolation::Linear,
+                    interval_s: 0.01,
+                    prefill: 1,
+                    limits: MotionLimits {
+                        velocity: 0.0,
+                        acceleration: 0.0,
+                        jerk: 0.0,
+                    },
+                    range: None,
+                    dt_s: 0.001,
+                };
+                let (ticket, axis) = (self.cycle, 1);
+                send(Message::Open {
+                    ticket,
+                    axis,
+                    config,
+                });
+                let knot = Knot {
+                    position: 0.0,
+                    velocity: 0.0,
+                };
+                let points = vec![StreamPoint { knot, torque: 1.0 }; 20].into();
+                send(Message::Push {
+                    ticket,
+                    axis,
+                    points,
+                });
+                send(Message::Close { ticket, axis });
+            }
+            // A sine with late sets, then one that stays away, then a jump.
+            phase @ 2..1_000 if phase % 50 > 3 => {
+                let t = phase as f64 * 1e-3 * std::f64::consts::TAU;
+                self.write(1, 0.1 * (1.0 - t.cos()));
+            }
+            1_100 => self.write(0, 0.0),
+            1_200 => self.write(1, 1e9),
+            1_300 => self.write(9, f64::NAN),
+            1_900 => send(Message::Release(None)),
+            1_901 => {
+                self.counters.leases_ended.fetch_add(1, Ordering::Release);
+                send(Message::Detach);
+            }
+            _ => {}
+        }
+    }
+}
+
+impl Controller for Clients {
+    fn cycle(&mut self, machine: &mut CycleContext<'_>) {
+        let ready = machine.axis(self.y).ready;
+        unmetered(|| self.act(ready));
+        self.external.cycle(machine);
+    }
+}
+
+#[test]
+fn set_points_of_clients_allocate_nothing_in_the_cycle() {
+    let machine = load("controller.toml");
+    let y = machine.axis("y").expect("an axis");
+    let counters = Arc::<AreaCounters>::default();
+    let (external, client) = external(&machine, &counters, None);
+    let ended = Arc::<AtomicU64>::default();
+    let clients = Clients {
+        external,
+        client,
+        counters: Arc::clone(&counters),
+        memory: Arc::new(command_area(2).expect("memory")),
+        y,
+        cycle: 0,
+        ended: Arc::clone(&ended),
+    };
+    let (counted, remains, _) = metered(machine, &virtual_time(), Some(Box::new(clients)), 10_000);
+    assert!(remains.axes[AxisIndex(0)].axis.status().enabled);
+    let load = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+    assert!(load(&counters.used) > 3_000, "{counters:?}");
+    assert!(load(&counters.late) > 100, "{counters:?}");
+    assert!(load(&counters.refused) > 2, "{counters:?}");
+    assert!(load(&ended) > 6, "streams and areas ended: {ended:?}");
+    assert_eq!(counted, 0);
 }

@@ -292,3 +292,111 @@ fn a_real_time_client_misses_few_cycles() {
 fn client_sine(cycle: u64) -> f64 {
     0.5 * (1.0 - (std::f64::consts::TAU * cycle as f64 * 1e-3).cos())
 }
+
+/// A motion that is refused must not leave the axis at the velocity of the area.
+#[test]
+fn a_refused_motion_ends_the_velocity_of_the_area() {
+    let server = Server::in_virtual_time(demo());
+    for (op, keys) in [
+        ("move", json!({"axis": "x", "to": 1, "speed": 2})),
+        ("move", json!({"axis": "x", "to": 1000})),
+        ("home", json!({"axis": "x"})),
+        ("velocity", json!({"axis": "x", "velocity": 1e9})),
+        ("jog", json!({"axis": "x", "velocity": 1e9})),
+        ("program", json!({"action": "pause"})),
+    ] {
+        let mut client = server.owner("test");
+        client.done("enable", json!({"axis": "*"}));
+        client.done("move", json!({"axis": "x", "to": -50.0}));
+        let area = attach(&mut client);
+        let mut counter = 0;
+        let mut write = |client: &mut Client| {
+            for _ in 0..100 {
+                counter += 1;
+                area.write(counter, &[(2, 5.0), (0, 0.0)]);
+                client.ok("advance", json!({"cycles": 5}));
+            }
+        };
+        write(&mut client);
+        assert_eq!(client.axis("x")["target_velocity"], json!(5.0));
+        client.ask(op, keys.clone());
+        // The client goes on as if nothing had happened.
+        write(&mut client);
+        let velocity = client.axis("x")["target_velocity"].as_f64().unwrap();
+        let expected = if op == "program" { 5.0 } else { 0.0 };
+        assert_eq!(velocity, expected, "{op} {keys}");
+        client.ok("release", json!({}));
+        client.advance(0.5);
+        assert_eq!(client.axis("x")["at_rest"], json!(true), "{op} {keys}");
+    }
+}
+
+/// An axis that is enabled again follows from kind 0 on only, also if the client has written
+/// set-points all the time.
+#[test]
+fn an_axis_that_is_enabled_again_does_not_follow_at_once() {
+    for (kind, speed) in [(1, 0.002), (2, 0.001)] {
+        let server = Server::in_virtual_time(demo());
+        let mut client = server.owner("test");
+        client.done("enable", json!({"axis": "x"}));
+        let area = attach(&mut client);
+        let (mut counter, mut step) = (0, 0);
+        let mut write = |client: &mut Client, cycles: u64, more: u64| {
+            for _ in 0..cycles {
+                (counter, step) = (counter + 1, step + more);
+                area.write(counter, &[(kind, speed * step as f64), (0, 0.0)]);
+                client.ok("advance", json!({"cycles": 1}));
+            }
+        };
+        write(&mut client, 100, 1);
+        assert_ne!(client.axis("x")["target_velocity"], json!(0.0));
+        client.ok("disable", json!({"axis": "*"}));
+        write(&mut client, 500, 0);
+        assert_eq!(client.axis("x")["enabled"], json!(false));
+        client.ok("enable", json!({"axis": "x"}));
+        write(&mut client, 500, 0);
+        let axis = client.axis("x");
+        assert_eq!(axis["ready"], json!(true), "{axis}");
+        let at = client.position("x");
+        write(&mut client, 100, 1);
+        assert_eq!(client.position("x"), at);
+        area.write(counter + 1, &[(0, 0.0), (0, 0.0)]);
+        client.ok("advance", json!({"cycles": 2}));
+        area.write(counter + 2, &[(2, 1.0), (0, 0.0)]);
+        client.advance(0.008);
+        assert_eq!(client.axis("x")["target_velocity"], json!(1.0));
+    }
+}
+
+/// The same after a fault of the drive, which no command of a client precedes.
+#[test]
+fn an_axis_that_is_reset_does_not_follow_at_once() {
+    let script = "[[fault]]\nkind = 'drive-fault'\nat = '2s'\ndevice = 0\ncode = 0x3210\n";
+    let server = Server::with_faults(demo(), script);
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "x"}));
+    let area = attach(&mut client);
+    let mut counter = 0;
+    let mut write = |client: &mut Client, cycles: u64, velocity: f64| {
+        for _ in 0..cycles {
+            counter += 1;
+            area.write(counter, &[(2, velocity), (0, 0.0)]);
+            client.ok("advance", json!({"cycles": 1}));
+        }
+    };
+    write(&mut client, 2_000, 1.0);
+    assert_ne!(client.axis("x")["fault"], json!(null));
+    client.ok("reset", json!({"axis": "x"}));
+    write(&mut client, 500, 1.0);
+    client.ok("enable", json!({"axis": "x"}));
+    write(&mut client, 500, 1.0);
+    let axis = client.axis("x");
+    assert_eq!(
+        (&axis["ready"], &axis["fault"]),
+        (&json!(true), &json!(null))
+    );
+    let at = client.position("x");
+    write(&mut client, 100, 2.0);
+    assert_eq!(client.position("x"), at);
+    assert!(client.kept_events("area").len() == 1);
+}
