@@ -4,10 +4,10 @@ import { count, h, mark, message, save, set } from "./dom.js";
 
 const KINDS = {
   client: "Clients",
-  fault: "Faults and trips", emergency: "Emergency messages", bus: "Bus", lease: "Control", request: "Commands", program: "Program", group: "Groups", stream: "Streams and cyclic area", captured: "Captured positions", warning: "Warnings",
+  fault: "Faults and trips", emergency: "Emergency messages", fault_report: "Fault reports", bus: "Bus", lease: "Control", request: "Commands", program: "Program", group: "Groups", stream: "Streams and cyclic area", captured: "Captured positions", warning: "Warnings",
 };
 const kindOf = (event) => ({ done: "request", failed: "request", refused: "request", replaced: "request", let_go: "request", group_stopped: "group", group_released: "group", area: "stream" })[event] ?? event;
-const BAD = new Set(["fault", "failed", "refused", "group_stopped", "emergency"]);
+const BAD = new Set(["fault", "fault_report", "failed", "refused", "group_stopped", "emergency"]);
 const MAX_ROWS = 500;
 
 /** Returns the text of an event. */
@@ -23,6 +23,7 @@ function textOf(event) {
     case "group_stopped": return `group ${event.group} stops${why}`;
     case "group_released": return `group ${event.group} is released${why}`;
     case "fault": return event.why ?? "fault";
+    case "fault_report": return event.headline ?? "";
     case "emergency": return `${typeof event.code === "number" ? `0x${event.code.toString(16).padStart(4, "0")} ` : ""}${event.text ?? ""}`;
     case "captured": return `${event.input} captured ${event.position}`;
     case "stream": return `stream: ${event.state}${why}`;
@@ -95,6 +96,9 @@ export class Events {
     const { connection } = this.#page;
     const when = connection.machine.virtual ? `${(event.time_ns / 1e9).toFixed(3)} s` : clock(connection.wallTime(event.time_ns));
     const row = h("tr", {}, h("td", { class: "number", text: when }), h("td", { text: event.event.replace("_", " ") }), h("td", { text: place }), h("td", { class: "wide", text }));
+    if (event.event === "fault_report") {
+      row.lastChild.append(" ", h("button", { type: "button", text: "Save report", "aria-label": `Save the fault report of ${when}`, onclick: () => this.#saveReport(event.number) }));
+    }
     mark(row, "data-state", BAD.has(event.event) || (event.event === "bus" && event.state === "failed") || event.ok === false ? "bad" : null);
     return row;
   }
@@ -112,6 +116,17 @@ export class Events {
           h("td", {}, h("button", { type: "button", text: "Download", "aria-label": `Download ${file.name}`, onclick: () => this.#download(file.name) }))))))));
     } catch (error) {
       show(h("p", { class: "empty", text: error.code === "lost" ? "No connection." : `No recordings: ${error.message}` }));
+    }
+  }
+
+  async #saveReport(number) {
+    try {
+      const { reports } = await this.#page.connection.request("fault_reports");
+      const found = reports.find((report) => report.event === number);
+      if (!found) return message("The server no longer has this report.", "It keeps the last 20.");
+      save(new Blob([JSON.stringify(found.report, null, 2)], { type: "application/json" }), `fault-report-${number}.json`);
+    } catch (error) {
+      message(`Fault report: ${error.message}`, error.help);
     }
   }
 

@@ -4,6 +4,7 @@
 
 mod area;
 mod commands;
+mod documented;
 mod faults;
 mod fuzz;
 mod harness;
