@@ -193,7 +193,11 @@ impl Trace {
 
     fn stop(&self, device: usize, began: u64) -> DriveStop {
         let samples: Vec<&Sample> = self.since(device, began).collect();
-        let first = samples.first().map_or(0.0, |sample| sample.velocity.abs());
+        // One sample is not the speed: it may follow a late frame.
+        let settled = self.since(device, began.saturating_sub(SETTLED_NS));
+        let settled = settled.take_while(|sample| sample.at <= began);
+        let speeds: Vec<f64> = settled.map(|sample| sample.velocity.abs()).collect();
+        let first = speeds.iter().sum::<f64>() / speeds.len().max(1) as f64;
         let mut taken: Vec<(&'static str, f64)> = Vec::new();
         let mut stands_since = began;
         for pair in samples.windows(2) {
