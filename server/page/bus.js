@@ -3,8 +3,6 @@
 import { count, duration, figure, h, mark, NONE, set, svg } from "./dom.js";
 
 const BOX = { width: 172, height: 86, gapX: 30, gapY: 34, margin: 30 };
-/** The order in which a frame leaves a device's ports. */
-const PORT_ORDER = [3, 1, 2];
 
 export class Bus {
   visible = false;
@@ -15,6 +13,7 @@ export class Bus {
   #io = [];
   #shape = "";
   #boxes = [];
+  #wires = [];
 
   constructor(root, page) {
     this.#root = root;
@@ -82,21 +81,29 @@ export class Bus {
 
   #draw(devices, states, windowNs) {
     const width = this.#part.drawing.clientWidth || 320;
-    const links = devices.map((device) => openPorts(states.get(device.name)));
-    const shape = JSON.stringify([width, links]);
+    const parents = devices.map(({ name }) => states.get(name)?.parent ?? null);
+    const positions = devices.map(({ name }, k) => states.get(name)?.position ?? k);
+    const shape = JSON.stringify([width, parents, positions]);
     if (shape !== this.#shape) {
       this.#shape = shape;
-      this.#layOut(devices, links, width);
+      this.#layOut(devices, parents, positions, width);
     }
     devices.forEach((device, k) => this.#boxes[k].update(states.get(device.name), windowNs(device)));
+    for (const { path, parent } of this.#wires) {
+      mark(path, "data-level", states.get(parent.device)?.ports?.[parent.port]?.open === false ? "bad" : null);
+    }
   }
 
   /** Places the devices: a chain runs to the right and wraps; each further branch begins a row. */
-  #layOut(devices, links, width) {
+  #layOut(devices, parents, positions, width) {
     const { height, gapX, gapY, margin } = BOX;
     const columns = Math.max(1, Math.floor((width - margin) / (BOX.width + gapX)));
     const boxWidth = Math.min(BOX.width, width - margin - 4);
-    const children = childrenOf(links);
+    const index = new Map(devices.map(({ name }, k) => [name, k]));
+    // Until the ports are known, the devices are a line.
+    const known = parents.some((parent) => parent);
+    const above = devices.map((_, k) => (known ? index.get(parents[k]?.device) : k - 1));
+    const children = devices.map((_, parent) => devices.map((_, k) => k).filter((k) => above[k] === parent).sort((a, b) => positions[a] - positions[b]));
     const place = [];
     let rows = 0;
     const chain = (device) => {
@@ -112,54 +119,25 @@ export class Bus {
       }
       branches.forEach(chain);
     };
-    if (devices.length) chain(0);
+    devices.forEach((_, k) => devices[above[k]] === undefined && chain(k));
     const x = (k) => margin + place[k].column * (BOX.width + gapX);
     const y = (k) => 10 + place[k].row * (height + gapY);
     const total = 10 + rows * (height + gapY);
-    const lines = [];
     let turn = 0;
-    if (devices.length) lines.push(`M0 ${y(0) + height / 2}H${x(0)}`);
-    children.forEach((next, k) => {
-      for (const child of next) {
-        if (place[child].row === place[k].row) {
-          lines.push(`M${x(k) + boxWidth} ${y(k) + height / 2}H${x(child)}`);
-        } else {
-          const lane = 10 + (turn++ % 3) * 5;
-          const under = y(k) + height + gapY / 2 + (turn % 3) * 3 - 3;
-          lines.push(`M${x(k) + boxWidth / 2} ${y(k) + height}V${under}H${lane}V${y(child) + height / 2}H${x(child)}`);
-        }
-      }
-    });
+    const line = (k, parent) => {
+      if (parent === undefined) return `M0 ${y(k) + height / 2}H${x(k)}`;
+      if (place[k].row === place[parent].row) return `M${x(parent) + boxWidth} ${y(parent) + height / 2}H${x(k)}`;
+      const lane = 10 + (turn++ % 3) * 5;
+      const under = y(parent) + height + gapY / 2 + (turn % 3) * 3 - 3;
+      return `M${x(parent) + boxWidth / 2} ${y(parent) + height}V${under}H${lane}V${y(k) + height / 2}H${x(k)}`;
+    };
+    const paths = devices.map((_, k) => svg("path", { class: "wire", d: line(k, devices[above[k]] && above[k]) }));
+    this.#wires = paths.map((path, k) => ({ path, parent: parents[k] })).filter(({ parent }) => parent);
     this.#boxes = devices.map((device, k) => new Box(device, x(k), y(k), boxWidth));
     const drawing = svg("svg", { width, height: total, viewBox: `0 0 ${width} ${total}`, role: "img", "aria-label": `Topology: ${devices.map(({ name }) => name).join(", ")}. The table has the values.` },
-      svg("path", { class: "wire", d: lines.join("") }), ...this.#boxes.map(({ root }) => root));
+      ...paths, ...this.#boxes.map(({ root }) => root));
     this.#part.drawing.replaceChildren(drawing);
   }
-}
-
-/** The number of ports of a device that lead on, or `null`. */
-function openPorts(state) {
-  if (!state?.ports?.length) return null;
-  return PORT_ORDER.filter((port) => state.ports[port]?.link && state.ports[port]?.open !== false).length;
-}
-
-/** Devices come in the order of the frame: each belongs to the last one with a free port. Without data, a line. */
-function childrenOf(links) {
-  const children = links.map(() => []);
-  const open = [];
-  const complete = links.every((value) => value !== null) && links.reduce((sum, value) => sum + value, 0) === links.length - 1;
-  links.forEach((ports, k) => {
-    while (complete && open.length && open.at(-1).left === 0) open.pop();
-    if (k > 0) {
-      const parent = complete ? open.at(-1) : { device: k - 1, left: 1 };
-      if (parent) {
-        children[parent.device].push(k);
-        parent.left -= 1;
-      }
-    }
-    open.push({ device: k, left: ports ?? 0 });
-  });
-  return children;
 }
 
 const alName = (state) => (state?.answers === false ? "no answer" : (state?.al_state ?? "no state"));
@@ -177,13 +155,13 @@ class Box {
       (this.#part.bar = svg("rect", { class: "status", width: 4, height: BOX.height, rx: 2 })),
       text("name", 12, 19, { class: "name" }), text("state", width - 8, 19, { class: "al", "text-anchor": "end" }),
       text("product", 12, 36), text("clock", 12, 53), text("ports", 12, 70), (this.#part.title = svg("title")));
-    set(this.#part.name, `${device.position} ${shorten(device.name, 13)}`);
     set(this.#part.product, shorten(device.product ?? "", 22));
     this.#part.device = device;
   }
 
   update(state, windowNs) {
     const part = this.#part;
+    set(part.name, `${state?.position ?? ""} ${shorten(part.device.name, 13)}`);
     set(part.state, alName(state));
     mark(this.root, "data-state", alLevel(state));
     const difference = state?.clock_difference_ns;
@@ -191,7 +169,7 @@ class Box {
     set(part.clock, state?.al_code ? shorten(alText(state), 22) : known ? `clock ${duration(difference)}${windowNs ? ` of ±${duration(windowNs)}` : ""}` : "no clock");
     const ports = state?.ports ?? [];
     const errors = ports.reduce((sum, port) => sum + portErrors(port), (state?.processing_errors ?? 0) + (state?.pdi_errors ?? 0));
-    const open = ports.map((port, k) => (port.link ? k : null)).filter((port) => port !== null);
+    const open = ports.map((port, k) => (port.open ? k : null)).filter((port) => port !== null);
     set(part.ports, [open.length && `ports ${open.join(" ")}`, errors && `${count(errors)} errors`].filter(Boolean).join(" · "));
     mark(part.ports, "data-level", errors ? "near" : null);
     set(part.title, `${part.device.name}: ${part.device.product ?? ""} ${state?.al_state ?? ""} ${alText(state)}`);
@@ -217,7 +195,7 @@ class DeviceRow {
     const rows = [];
     for (let port = 0; port < ports; port++) {
       const own = port > 0 ? [] : [
-        h("td", { class: "number", text: this.#device.position, ...span }), h("th", { scope: "row", text: this.#device.name, ...span }), h("td", { text: this.#device.product ?? "", ...span }),
+        cell("position", { class: "number", ...span }), h("th", { scope: "row", text: this.#device.name, ...span }), h("td", { text: this.#device.product ?? "", ...span }),
         (this.#cells.state = h("td", span, (this.#cells.chip = h("span", { class: "chip" })))), cell("code", { class: "wide", ...span }),
         h("td", { class: "clock", ...span }, (this.#cells.clock = h("span", { class: "number" })), (this.#cells.bar = h("div", { class: "bar", role: "meter", "aria-label": "Clock difference", hidden: true }, h("span", { class: "zero" }), (this.#cells.fill = h("span", { class: "fill" }))))),
         cell("processing", { class: "number", ...span }), cell("pdi", { class: "number", ...span }),
@@ -236,6 +214,7 @@ class DeviceRow {
     if (shape !== this.#shape) this.#build(Number(shape));
     this.#shape = shape;
     const cells = this.#cells;
+    set(cells.position, String(state?.position ?? NONE));
     set(cells.chip, alName(state));
     mark(cells.chip, "data-state", alLevel(state));
     set(cells.code, alText(state));

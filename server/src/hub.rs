@@ -10,12 +10,12 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use ecaxis_axis::setpoint::StreamConfig;
-use ecaxis_ecat::index::{AxisIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_master::clock::{self, Nanos};
 use ecaxis_master::config::{Machine, OutputRef, Signal};
 use ecaxis_master::mailbox::Mailboxes;
 use ecaxis_master::post_mortem::FaultReport;
-use ecaxis_master::report::Error;
+use ecaxis_master::report::{DevicePlace, Error};
 use ecaxis_master::rt::channel::Snapshot;
 use ecaxis_master::samples::Samples;
 use ecaxis_master::supervise::operator::{AxisActivity, ProgramRequest, ProgramStatus, Request};
@@ -128,6 +128,8 @@ struct Inner {
     retry_now: bool,
     shutdown: bool,
     latest: Option<Arc<Latest>>,
+    /// The places of the devices; empty until the bus is up.
+    places: IndexVec<DeviceIndex, DevicePlace>,
     mailboxes: Option<Mailboxes>,
     step: RunningStep,
     speed_override: f64,
@@ -205,6 +207,7 @@ impl Hub {
                 retry_now: false,
                 shutdown: false,
                 latest: None,
+                places: IndexVec::default(),
                 mailboxes: None,
                 step: RunningStep::default(),
                 speed_override: 1.0,
@@ -438,6 +441,7 @@ impl Hub {
             abandon(&mut inner, ticket, &error);
         }
         inner.latest = None;
+        inner.places = IndexVec::default();
         inner.mailboxes = None;
         inner.step = RunningStep::default();
         // The next run has a virtual time of its own.

@@ -96,6 +96,7 @@ impl Observer for Reporter<'_> {
     fn progress(&mut self, progress: &Progress) {
         let hub = self.hub;
         match progress {
+            Progress::Topology(places) => hub.set_places(places.clone()),
             Progress::Mailboxes(mailboxes) => hub.set_mailboxes(mailboxes.clone()),
             Progress::Step(ecaxis_master::bringup::Step::State(
                 ecaxis_master::acyclic::AlState::Op,

@@ -7,9 +7,10 @@ use ecaxis_ecat::al_status_code::al_status_text;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 use ecaxis_esi::address;
 use ecaxis_master::acyclic::AlState;
+use ecaxis_master::acyclic::topology::ports;
 use ecaxis_master::config::{AxisSetup, Machine, Signal};
 use ecaxis_master::report::events::describe_stop;
-use ecaxis_master::rt::exchange::SubDeviceDiagnostics;
+use ecaxis_master::rt::exchange::{DiagnosticRegister, SubDeviceDiagnostics};
 use ecaxis_master::rt::samples::CYCLE_COLUMNS;
 use ecaxis_master::supervise::operator::MAX_MANUAL_SPEED;
 use serde_json::{Map, Value, json};
@@ -31,7 +32,6 @@ pub fn machine(hub: &Hub) -> Value {
         json!({
             "name": device.name,
             "at": device.at.to_string(),
-            "position": index.0,
             "product": device.device.type_name.to_string(),
             "axes": axes.collect::<Vec<_>>(),
             "dc": device.selection.dc.is_some(),
@@ -130,12 +130,22 @@ pub fn state(hub: &Hub) -> Value {
         .enumerate()
         .map(|(index, setup)| axis_state(machine, index, setup, latest))
         .collect();
+    let places = hub.places();
     let devices: Vec<_> = machine
         .devices
         .enumerate()
         .map(|(index, device)| {
             let found = latest.and_then(|latest| latest.snapshot.diagnoses.get(index));
-            device_state(&device.name, device.selection.dc.is_some(), found)
+            let mut state = device_state(&device.name, device.selection.dc.is_some(), found);
+            let place = places.get(index);
+            let parent = place.and_then(|place| {
+                let (device, port) = place.parent?;
+                let name = &machine.devices.get(device)?.name;
+                Some(json!({"device": name, "port": port}))
+            });
+            state["position"] = json!(place.map(|place| place.position));
+            state["parent"] = json!(parent);
+            state
         })
         .collect();
     let inputs = machine.inputs.iter().enumerate().map(|(index, input)| {
@@ -298,8 +308,13 @@ fn device_state(name: &str, dc: bool, found: Option<&SubDeviceDiagnostics>) -> V
                       "answers": false, "clock_difference_ns": Value::Null, "ports": []});
     };
     let grown = found.grown();
+    let links = found
+        .has_read(DiagnosticRegister::DlStatus)
+        .then(|| ports(found.dl_status));
     let ports = (0..4_usize).map(|port| {
-        json!({"invalid_frames": grown.invalid_frames[port], "rx_errors": grown.rx_errors[port],
+        let link = links.map(|links| links[port]);
+        json!({"link": link.map(|link| link.link), "open": link.map(|link| link.open),
+               "invalid_frames": grown.invalid_frames[port], "rx_errors": grown.rx_errors[port],
                "forwarded_errors": grown.forwarded[port], "lost_links": grown.lost_links[port]})
     });
     let text = (found.al_code != 0).then(|| al_status_text(found.al_code));

@@ -101,7 +101,7 @@ impl Observer for ProgressPrinter {
             }
             Progress::Warning(text) => note(&format!("warning: {text}")),
             Progress::Emergency(report) => note(&format!("warning: {report}")),
-            Progress::Mailboxes(_) => {}
+            Progress::Topology(_) | Progress::Mailboxes(_) => {}
             Progress::GroupStopped { group, cause } => {
                 note(&format!(
                     "warning: the group `{group}` stops, the rest goes on: {cause}"

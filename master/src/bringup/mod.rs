@@ -20,7 +20,7 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
-use crate::acyclic::{AlState, DeviceRef, StateTimeouts, Transition, al, enumerate};
+use crate::acyclic::{AlState, DeviceRef, StateTimeouts, Transition, al, enumerate, topology};
 use crate::clock;
 use crate::concurrent::try_join_all;
 use crate::config::state_timeouts::mailbox_timeouts;
@@ -28,7 +28,7 @@ use crate::config::{AdoptedUnits, DeviceConfig, LimitConflict, MAX_SUBDEVICES, M
 use crate::datagram::DatagramClient;
 use crate::mailbox::CoeClient;
 use crate::mailbox::worker::EmergencySink;
-use crate::report::{Cause, Error};
+use crate::report::{Cause, DevicePlace, Error};
 use crate::rt::image::{self, DeviceRegion, ImagePlan};
 use crate::rt::phase::ClockPlan;
 use crate::text::panic_text;
@@ -95,6 +95,29 @@ pub struct Bus {
     pub clocks_settled: bool,
     /// The durations of the steps so far.
     pub times: StepTimes,
+}
+
+impl Bus {
+    /// Returns the place of each device.
+    #[must_use]
+    pub fn places(&self) -> IndexVec<DeviceIndex, DevicePlace> {
+        let mut order: Vec<_> = self.devices.enumerate().collect();
+        order.sort_by_key(|(_, device)| device.at.position);
+        let parents = topology::parents(order.iter().map(|(_, device)| device.dl_status));
+        let place = |(index, device): (DeviceIndex, &BusDevice)| {
+            let at = order.iter().position(|(other, _)| *other == index);
+            let parent = at.and_then(|at| *parents.get(at)?);
+            let parent = parent.and_then(|parent| {
+                let (device, _) = order.get(usize::from(parent.device))?;
+                Some((*device, parent.port))
+            });
+            DevicePlace {
+                position: device.at.position,
+                parent,
+            }
+        };
+        self.devices.enumerate().map(place).collect()
+    }
 }
 
 /// Brings the segment from any state to SafeOp. Passes emergencies of the devices to the listener,

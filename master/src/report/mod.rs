@@ -22,5 +22,5 @@ pub use diagnosis_message::{DiagnosisKind, DiagnosisMessage};
 pub use emergencies::{EmergencyLine, EmergencyLog, EmergencyReport};
 pub use error::{Cause, DriveReport, Error, FailedStep, Location};
 pub use events::EventLine;
-pub use progress::{AxisLine, Observer, ProbeCapture, Progress, Status, StepRef};
+pub use progress::{AxisLine, DevicePlace, Observer, ProbeCapture, Progress, Status, StepRef};
 pub use summary::{AxisSummary, DeviceErrors, GroupStop, Summary, ThreadSummary};

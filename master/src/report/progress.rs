@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{Mode, State};
+use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use serde::Serialize;
 
 use super::bring_up::{Step, StepTime};
@@ -68,6 +69,8 @@ pub enum Progress {
     },
     /// A device has sent an emergency message.
     Emergency(EmergencyReport),
+    /// The places of the devices, in the order of the machine file; when the cycle begins.
+    Topology(IndexVec<DeviceIndex, DevicePlace>),
     /// Mailbox access during operation, valid from now to the end of the run.
     Mailboxes(Mailboxes),
     /// A group of axes has begun to stop. The machine continues without it.
@@ -82,6 +85,16 @@ pub enum Progress {
     /// The status of the machine, once a second of machine time.
     Status(Status),
     Stopping,
+}
+
+/// The place of a device in the segment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct DevicePlace {
+    /// Counted from 0 in the order of the frame.
+    pub position: u16,
+    /// The device and the port that lead to it; `None` for the first device, and if the ports
+    /// contradict each other.
+    pub parent: Option<(DeviceIndex, u8)>,
 }
 
 /// The result of a probing step.

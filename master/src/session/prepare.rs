@@ -124,6 +124,7 @@ impl RunBuilder<'_> {
                 log.set_bus_status(exchange.bus_status());
                 let (mailboxes, workers) =
                     mailbox_workers(&mut bus, wire, &exchange, machine.bus.cycle_ns, &log);
+                let _ = progress.send(Progress::Topology(bus.places()));
                 let _ = progress.send(Progress::Mailboxes(mailboxes.clone()));
                 let Attachments {
                     controller,

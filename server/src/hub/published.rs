@@ -13,6 +13,15 @@ impl Hub {
         self.lock().latest.clone()
     }
 
+    pub fn set_places(&self, places: IndexVec<DeviceIndex, DevicePlace>) {
+        self.lock().places = places;
+    }
+
+    #[must_use]
+    pub fn places(&self) -> IndexVec<DeviceIndex, DevicePlace> {
+        self.lock().places.clone()
+    }
+
     pub fn set_mailboxes(&self, mailboxes: Mailboxes) {
         self.lock().mailboxes = Some(mailboxes);
     }
@@ -92,7 +101,7 @@ impl Hub {
         let event = Arc::new(Event { number, body });
         inner.events.push_back(Arc::clone(&event));
         if inner.events.len() > EVENTS {
-            inner.events.pop_front();
+            drop_one(&mut inner.events);
         }
         // Without a subscriber, the event is only kept.
         let _ = self.events.send(event);
@@ -188,5 +197,47 @@ impl Hub {
             true => self.lock().now,
             false => clock::now(),
         }
+    }
+}
+
+/// Drops the oldest event of the kind that has the most, so that frequent events do not replace the
+/// rare ones.
+fn drop_one(events: &mut VecDeque<Arc<Event>>) {
+    let mut kinds: HashMap<&str, (usize, usize)> = HashMap::new();
+    for (index, event) in events.iter().enumerate() {
+        let kind = event.body.get("event").and_then(Value::as_str);
+        let (count, _) = kinds.entry(kind.unwrap_or_default()).or_insert((0, index));
+        *count += 1;
+    }
+    let most = kinds.into_values().max_by_key(|(count, _)| *count);
+    if let Some((_, oldest)) = most {
+        events.remove(oldest);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frequent_events_do_not_replace_rare_ones() {
+        let event = |number: u64, kind: &str| {
+            let Value::Object(body) = json!({"event": kind, "number": number}) else {
+                unreachable!("an object");
+            };
+            Arc::new(Event { number, body })
+        };
+        let mut events: VecDeque<_> = [event(1, "fault"), event(2, "lease")].into();
+        for number in 3..100 {
+            events.push_back(event(
+                number,
+                if number % 2 == 0 { "area" } else { "client" },
+            ));
+            if events.len() > 10 {
+                drop_one(&mut events);
+            }
+        }
+        let kept: Vec<_> = events.iter().map(|event| event.number).collect();
+        assert_eq!(kept, [1, 2, 92, 93, 94, 95, 96, 97, 98, 99]);
     }
 }

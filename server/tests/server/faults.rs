@@ -92,3 +92,30 @@ fn a_device_that_is_missing_is_named() {
     let error = client.refused("sdo_read", json!({"device": "x", "index": 0x6061}));
     assert_eq!(error["code"], json!("not_up"));
 }
+
+#[test]
+fn each_device_names_the_port_that_leads_to_it() {
+    let server = Server::in_virtual_time(demo());
+    let mut client = Client::new(&server.socket());
+    client.ok("await", json!({"bus": "op"}));
+    client.advance(1.0);
+    let devices = client.ok("state", json!({}))["devices"].clone();
+    assert_eq!(devices[0]["parent"], json!(null));
+    assert_eq!(devices[1]["parent"], json!({"device": "x", "port": 1}));
+    assert_eq!(devices[1]["position"], json!(1));
+    let open = |device: &Value| {
+        let ports = device["ports"].as_array().unwrap().clone();
+        ports
+            .iter()
+            .map(|port| port["open"].clone())
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(
+        open(&devices[0]),
+        [true, true, false, false].map(Value::from)
+    );
+    assert_eq!(
+        open(&devices[1]),
+        [true, false, false, false].map(Value::from)
+    );
+}

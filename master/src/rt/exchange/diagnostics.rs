@@ -8,6 +8,8 @@ use serde::Serialize;
 pub enum DiagnosticRegister {
     /// AL status and AL status code, 0x0130–0x0135.
     AlStatus,
+    /// DL status, 0x0110: the links and loops of the four ports.
+    DlStatus,
     /// System time difference, 0x092C.
     ClockDifference,
     /// Invalid frames and physical errors of the four ports, 0x0300–0x0307.
@@ -20,8 +22,9 @@ pub enum DiagnosticRegister {
 }
 
 impl DiagnosticRegister {
-    pub const ALL: [Self; 5] = [
+    pub const ALL: [Self; 6] = [
         Self::AlStatus,
+        Self::DlStatus,
         Self::ClockDifference,
         Self::RxErrors,
         Self::Forwarded,
@@ -31,6 +34,7 @@ impl DiagnosticRegister {
     pub(super) const fn register_and_len(self) -> (u16, usize) {
         match self {
             Self::AlStatus => (registers::AL_STATUS, 6),
+            Self::DlStatus => (registers::DL_STATUS, 2),
             Self::ClockDifference => (registers::DC_SYSTEM_TIME_DIFFERENCE, 4),
             Self::RxErrors => (registers::RX_ERROR_COUNTERS, 8),
             Self::Forwarded => (registers::FORWARDED_ERROR_COUNTERS, 6),
@@ -69,7 +73,9 @@ impl ErrorCounters {
                 (self.processing, self.pdi) = (from.processing, from.pdi);
             }
             DiagnosticRegister::LostLinks => self.lost_links = from.lost_links,
-            DiagnosticRegister::AlStatus | DiagnosticRegister::ClockDifference => {}
+            DiagnosticRegister::AlStatus
+            | DiagnosticRegister::DlStatus
+            | DiagnosticRegister::ClockDifference => {}
         }
     }
 
@@ -110,6 +116,8 @@ pub struct SubDeviceDiagnostics {
     pub answers: bool,
     pub al_status: u8,
     pub al_code: u16,
+    /// DL status: see [`crate::acyclic::topology::ports`].
+    pub dl_status: u16,
     /// Own clock minus reference, nanoseconds.
     pub clock_difference: i32,
     pub errors: ErrorCounters,
@@ -226,6 +234,9 @@ impl SubDeviceDiagnostics {
             (DiagnosticRegister::AlStatus, &[status, _, _, _, low, high]) => {
                 self.al_status = status;
                 self.al_code = u16::from_le_bytes([low, high]);
+            }
+            (DiagnosticRegister::DlStatus, &[low, high]) => {
+                self.dl_status = u16::from_le_bytes([low, high]);
             }
             (DiagnosticRegister::ClockDifference, &[a, b, c, d]) => {
                 self.clock_difference = sign_magnitude(u32::from_le_bytes([a, b, c, d]));

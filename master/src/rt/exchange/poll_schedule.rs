@@ -171,9 +171,9 @@ mod tests {
             [0, 1, 2, 0]
         );
         // The schedule has visited all members and starts again.
-        assert_eq!(blocks[0], blocks[15]);
+        assert_eq!(blocks[0], blocks[18]);
         for block in DiagnosticRegister::ALL {
-            assert_eq!(blocks[..15].iter().filter(|p| p.0 == block).count(), 3);
+            assert_eq!(blocks[..18].iter().filter(|p| p.0 == block).count(), 3);
         }
     }
 
