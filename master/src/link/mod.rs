@@ -129,9 +129,9 @@ pub fn sniff_foreign_frames(link: &mut dyn Link, start: Instant) -> Result<u64, 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum LinkError {
     #[error("sending failed: {0}")]
-    Send(rustix::io::Errno),
+    Send(#[source] rustix::io::Errno),
     #[error("receiving failed: {0}")]
-    Receive(rustix::io::Errno),
+    Receive(#[source] rustix::io::Errno),
     #[error("a frame of {0} bytes exceeds what the link carries")]
     TooLong(usize),
 }

@@ -550,3 +550,31 @@ fn few(names: &[String]) -> String {
         more => format!("{text} and {more} more"),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mailbox::{CoeCause, Subject};
+
+    /// Returns the texts of an error's sources, outermost first.
+    fn sources(error: &dyn std::error::Error) -> Vec<String> {
+        let chain = std::iter::successors(error.source(), |error| error.source());
+        chain.map(ToString::to_string).collect()
+    }
+
+    #[test]
+    fn source_leads_to_the_error_that_began_it() {
+        let errno = rustix::io::Errno::NETDOWN;
+        let link = Error::from(Cause::Link(LinkError::Send(errno)));
+        let end = sources(&link).pop();
+        assert_eq!(end, Some(errno.to_string()));
+        let abort = CoeCause::Abort(0x0601_0002);
+        let sdo = SdoError {
+            station: 0x1001,
+            asked: Subject::Emptying,
+            cause: abort.clone(),
+        };
+        let sdo = Error::from(Cause::Sdo(sdo));
+        assert_eq!(sources(&sdo).pop(), Some(abort.to_string()));
+    }
+}
