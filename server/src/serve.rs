@@ -55,9 +55,9 @@ pub enum ServeError {
         source: io::Error,
     },
     #[error("the system gives no memory for the samples: {0}")]
-    Memory(io::Error),
+    Memory(#[source] io::Error),
     #[error("starting a thread: {0}")]
-    Thread(io::Error),
+    Thread(#[source] io::Error),
 }
 
 /// Returns a new random token.

@@ -112,7 +112,7 @@ pub enum StreamEnd {
     /// The points ran out.
     Underrun,
     /// The axis refused a set-point.
-    Refused(CommandError),
+    Refused(#[source] CommandError),
 }
 
 /// Why an axis no longer follows the cyclic area.
@@ -121,7 +121,7 @@ pub enum AreaStop {
     #[error("no new set-point came for {0} cycles")]
     Stale(u32),
     #[error("a set-point was refused: {0}")]
-    Refused(CommandError),
+    Refused(#[source] CommandError),
     #[error("a set-point is not a finite number")]
     NotFinite,
     #[error("{0} is not a kind of set-point")]

@@ -31,9 +31,9 @@ use ecaxis_master::sys::rt_thread::CpuWakeGuard;
 #[derive(Debug, thiserror::Error)]
 pub enum BenchError {
     #[error("cannot create a veth pair: {0}")]
-    Veth(io::Error),
+    Veth(#[source] io::Error),
     #[error("the bus at the far end: {0}")]
-    Bus(io::Error),
+    Bus(#[source] io::Error),
     #[error("{0}")]
     Open(#[from] OpenError),
     #[error("{0}")]
@@ -43,11 +43,11 @@ pub enum BenchError {
     #[error("the machine: {0}")]
     Run(Box<Error>),
     #[error("{0}")]
-    Cyclictest(io::Error),
+    Cyclictest(#[source] io::Error),
     #[error("{0}")]
-    Program(io::Error),
+    Program(#[source] io::Error),
     #[error("cannot start a thread: {0}")]
-    Thread(io::Error),
+    Thread(#[source] io::Error),
 }
 
 /// The kind of a variant and its parameters.
