@@ -112,7 +112,7 @@ pub enum StreamEnd {
     /// The points ran out.
     Underrun,
     /// The axis refused a set-point.
-    Refused(#[source] CommandError),
+    Refused(CommandError),
 }
 
 /// Why an axis no longer follows the cyclic area.
