@@ -31,6 +31,7 @@ Examples:
   ecaxis run machine.toml            on the file's network interface
   ecaxis analyze run.pcapng          what a recording shows
   ecaxis help run                    the options of a subcommand, with examples
+  ecaxis --version --json            version and commit, for scripts
 
 Exit code: 0 done, 1 the machine or the bus failed, 2 the file or the command
 line is wrong, 130 interrupted.
@@ -47,6 +48,14 @@ struct Cli {
 /// Runs the command line. Exit codes: 0 done, 1 the machine or the bus failed, 2 the file or the
 /// command line is wrong, 130 interrupted.
 fn main() -> ExitCode {
+    let mut arguments: Vec<_> = std::env::args_os().skip(1).collect();
+    arguments.sort();
+    if arguments == ["--json", "--version"] {
+        return match render::print_json(&version()) {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(failure) => ExitCode::from(failure.code),
+        };
+    }
     let verb = Cli::parse().verb;
     if let Some(verbosity) = verb.verbosity() {
         render::output::start_logging(verbosity.log_filter());
@@ -60,6 +69,17 @@ fn main() -> ExitCode {
     }
 }
 
+/// Returns what identifies this program.
+fn version() -> serde_json::Value {
+    serde_json::json!({
+        "name": "ecaxis",
+        "version": ecaxis_master::VERSION,
+        "commit": ecaxis_master::COMMIT,
+        "arch": std::env::consts::ARCH,
+        "debug": cfg!(debug_assertions),
+    })
+}
+
 /// Returns the definition of the command line.
 pub(crate) fn command() -> clap::Command {
     <Cli as clap::CommandFactory>::command()
@@ -67,6 +87,8 @@ pub(crate) fn command() -> clap::Command {
 
 #[cfg(test)]
 mod tests {
+    use clap::error::ErrorKind;
+
     use crate::*;
 
     #[test]
@@ -90,7 +112,11 @@ mod tests {
                 let line = std::iter::once("ecaxis").chain(words.split_whitespace());
                 match Cli::try_parse_from(line) {
                     Ok(_) => {}
-                    Err(e) if e.kind() == clap::error::ErrorKind::DisplayHelp => {}
+                    Err(e)
+                        if matches!(
+                            e.kind(),
+                            ErrorKind::DisplayHelp | ErrorKind::DisplayVersion
+                        ) => {}
                     Err(e) => panic!("{path}: `{words}`: {e}"),
                 }
             }

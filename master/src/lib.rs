@@ -20,9 +20,15 @@
 //! - [`clock`]: monotonic or virtual time;
 //! - [`text`]: formatting of counts with nouns;
 //! - [`mod@file`]: reads whole files of bounded length;
+//! - [`file_digest`]: SHA-256 of the files that a machine is made of;
 //! - [`sys`]: system calls; all unsafe code.
 
 #![deny(unsafe_code)]
+
+/// The version of the program.
+pub const VERSION: &str = env!("CARGO_PKG_VERSION");
+/// The commit of a release build from a work tree.
+pub const COMMIT: Option<&str> = option_env!("ECAXIS_COMMIT");
 
 pub mod acyclic;
 pub mod bringup;
@@ -33,6 +39,7 @@ pub mod config;
 mod datagram;
 pub mod esi_library;
 pub mod file;
+pub mod file_digest;
 pub mod link;
 pub mod mailbox;
 pub mod post_mortem;

@@ -7,6 +7,7 @@ use ecaxis_axis::State;
 use ecaxis_master::acyclic::AlState;
 use ecaxis_master::config::Machine;
 use ecaxis_master::rt::stats::LatencyHistogram;
+use ecaxis_master::{COMMIT, VERSION};
 
 use crate::hub::{BusState, Count, Counts, Hub, Latest};
 
@@ -84,11 +85,19 @@ fn server(text: &mut Text, hub: &Hub) {
         "ecaxis_build_info",
         "gauge",
         "The version of the server.",
-        |out| out.put(&[("version", env!("CARGO_PKG_VERSION"))], 1.0),
+        |out| {
+            out.put(
+                &[
+                    ("version", VERSION),
+                    ("commit", COMMIT.unwrap_or("unknown")),
+                ],
+                1.0,
+            )
+        },
     );
-    let file = machine.path.to_string_lossy();
+    let (file, sha256) = (machine.path.to_string_lossy(), machine.sha256.to_string());
     text.family("ecaxis_machine_info", "gauge", "The machine file.", |out| {
-        out.put(&[("file", &file)], 1.0);
+        out.put(&[("file", &file), ("sha256", &sha256)], 1.0);
     });
     text.gauge(
         "ecaxis_cycle_seconds",

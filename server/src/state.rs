@@ -48,6 +48,7 @@ pub fn machine(hub: &Hub) -> Value {
     });
     json!({
         "name": name,
+        "sha256": machine.sha256.to_string(),
         "cycle_ns": machine.bus.cycle_ns,
         "clock_window_ns": machine.bus.clock_window_ns,
         "virtual": hub.options.virtual_time,

@@ -115,7 +115,8 @@ fn the_counter_counts_allocations() {
 fn recording_in_the_cycle_allocates_nothing() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.pcapng");
-    let mut recorder = Recorder::create(&path, WriterMode::Background, None).expect("a recording");
+    let mut recorder =
+        Recorder::create(&path, WriterMode::Background, None, "").expect("a recording");
     let frame = [0x5a; MAX_FRAME];
     COUNT.set(0);
     METERED.set(true);

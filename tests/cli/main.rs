@@ -5,5 +5,6 @@ mod complaints;
 mod conformance;
 mod doctor;
 mod esi;
+mod identity;
 mod messages;
 mod terminal;

@@ -154,7 +154,7 @@ fn recorded_frames(axes: usize) -> Vec<Frame> {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("bench.pcapng");
     let segment = fixture::segment(axes).expect("fits");
-    let recorder = Recorder::create(&path, WriterMode::Inline, None).expect("a recording");
+    let recorder = Recorder::create(&path, WriterMode::Inline, None, "").expect("a recording");
     let link = InProcess::new(segment, ReplyDelay::Fixed(1_000));
     let link = Box::new(CapturingLink::new(Box::new(link), recorder, 0));
     let setup = setup(axes, 2_000_000);

@@ -107,6 +107,10 @@ impl Bus {
 
     fn open(self, heard: &AtomicU64) -> Result<Box<dyn Link>, Error> {
         let Self { on, options, alone } = self;
+        let comment = match &on {
+            BusKind::Sim(machine) => session::recording_comment(machine),
+            BusKind::Interface { nic, .. } => format!("interface {nic}"),
+        };
         let link: Box<dyn Link> = match on {
             BusKind::Sim(machine) => {
                 let faults = options.faults.as_ref();
@@ -129,7 +133,7 @@ impl Bus {
                 ))
             }
         };
-        session::recorded(link, &options)
+        session::recorded(link, &options, &comment)
     }
 }
 

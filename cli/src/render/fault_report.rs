@@ -68,6 +68,10 @@ pub(crate) fn page(fault_report: &FaultReport, hints: &[String]) -> Document {
             None => "in virtual time".to_owned(),
         }
     ));
+    out.line(format!(
+        "ecaxis {}, machine sha256 {}",
+        fault_report.version, fault_report.machine_sha256
+    ));
     let also: Vec<String> = fault_report.also.iter().map(ToString::to_string).collect();
     for (title, items) in [("What to do", hints), ("Also seen", &also)] {
         if !items.is_empty() {

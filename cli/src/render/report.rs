@@ -320,6 +320,8 @@ mod tests {
         };
         Summary {
             machine: "m.toml".into(),
+            machine_sha256: String::new(),
+            version: "",
             devices: 1,
             time: "virtual",
             cycle_ns: 1_000_000,

@@ -41,7 +41,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 fn as_json(path: &Path, loaded: &Result<Machine, ConfigError>) -> serde_json::Value {
     match loaded {
         Ok(machine) => json!({
-            "ok": true, "error": null, "devices": machine.devices.len(), "problems": [],
+            "ok": true, "error": null, "sha256": machine.sha256.to_string(), "devices": machine.devices.len(), "problems": [],
         }),
         Err(e) => json!({ "ok": false, "error": in_short(path, e), "problems": problems(e) }),
     }
@@ -87,6 +87,7 @@ fn summary(machine: &Machine) -> Document {
         duration::show(machine.bus.cycle_ns),
         pluralize(machine.steps.len(), "step"),
     ));
+    out.line(format!("sha256 {}", machine.sha256));
     for device in &machine.devices {
         let selection = &device.selection;
         let mode = selection.mode.map_or("I/O".to_owned(), |m| m.to_string());

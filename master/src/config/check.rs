@@ -118,6 +118,7 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
     connections.check(&devices, p);
     Some(Machine {
         path: path.to_owned(),
+        sha256: p.sha256(),
         bus: bus?,
         devices,
         axes: axes.into(),

@@ -74,6 +74,7 @@ use raw::RawMachine;
 
 use crate::esi_library::{RevisionMatch, SiiImage};
 use crate::file;
+use crate::file_digest::FileDigest;
 use crate::link::SocketKind;
 pub use crate::rt::config::{Condition, ExchangeMode, GroupStopScope};
 use crate::rt::config::{GroupConfig, RtConfig};
@@ -88,6 +89,8 @@ pub(crate) const MAX_SUBDEVICES: usize = 512;
 #[derive(Debug, Clone)]
 pub struct Machine {
     pub path: PathBuf,
+    /// SHA-256 of this file and the files that it names.
+    pub sha256: FileDigest,
     pub bus: Bus,
     /// The devices, in bus order if every device is located by position, otherwise in file order.
     pub devices: IndexVec<DeviceIndex, DeviceConfig>,

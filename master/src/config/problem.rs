@@ -8,6 +8,8 @@ use std::path::{Path, PathBuf};
 
 use strsim::osa_distance;
 
+use crate::file_digest::{FileDigest, UsedFile};
+
 /// The reason why a machine file is rejected.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
@@ -97,9 +99,17 @@ pub(crate) struct Problems<'s> {
     lines: Vec<usize>,
     /// The problems by their first byte.
     found: BTreeMap<usize, Vec<Problem>>,
+    /// The files that were read for the machine file.
+    pub files: Vec<UsedFile>,
 }
 
 impl<'s> Problems<'s> {
+    /// Returns the digest of the machine file and the files that were read for it.
+    pub fn sha256(&self) -> FileDigest {
+        let machine = UsedFile::new(self.path, self.text.as_bytes());
+        FileDigest::of_machine(&machine, &self.files)
+    }
+
     pub fn new(path: &'s Path, text: &'s str) -> Self {
         Self {
             path,
@@ -108,6 +118,7 @@ impl<'s> Problems<'s> {
                 .chain(text.match_indices('\n').map(|(at, _)| at + 1))
                 .collect(),
             found: BTreeMap::new(),
+            files: Vec::new(),
         }
     }
 

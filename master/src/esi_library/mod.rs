@@ -18,6 +18,7 @@ use ecaxis_esi as esi;
 use serde::{Deserialize, Serialize};
 
 use crate::file;
+use crate::file_digest::UsedFile;
 
 /// The maximum number of files in a library. More files indicate a wrong path.
 const MAX_FILES: usize = 10_000;
@@ -80,8 +81,11 @@ fn read(path: &Path) -> Result<Vec<u8>, LoadError> {
 fn parse(
     path: &Path,
     wanted: &dyn Fn(&esi::DeviceHeader) -> bool,
+    used: &mut Vec<UsedFile>,
 ) -> Result<esi::EsiFile, LoadError> {
-    esi::parse_where(&read(path)?, wanted).map_err(|source| LoadError::Esi {
+    let bytes = read(path)?;
+    used.push(UsedFile::new(path, &bytes));
+    esi::parse_where(&bytes, wanted).map_err(|source| LoadError::Esi {
         path: path.to_owned(),
         source: Box::new(source),
     })
@@ -94,7 +98,16 @@ pub fn load(
     path: &Path,
     wanted: &dyn Fn(&esi::DeviceHeader) -> bool,
 ) -> Result<esi::EsiFile, LoadError> {
-    let mut file = parse(path, wanted)?;
+    load_with(path, wanted, &mut Vec::new())
+}
+
+/// Like [`load`]; adds the files that it reads to `used`.
+pub(crate) fn load_with(
+    path: &Path,
+    wanted: &dyn Fn(&esi::DeviceHeader) -> bool,
+    used: &mut Vec<UsedFile>,
+) -> Result<esi::EsiFile, LoadError> {
+    let mut file = parse(path, wanted, used)?;
     let folder = path.parent().unwrap_or(Path::new(""));
     let mut waiting = std::mem::take(&mut file.references);
     let mut seen: BTreeSet<String> = path
@@ -118,7 +131,7 @@ pub fn load(
             Err("too many files are referred to".to_owned())
         } else {
             sibling(folder, &name)
-                .and_then(|path| parse(&path, &|_| false).map_err(|e| e.to_string()))
+                .and_then(|path| parse(&path, &|_| false, used).map_err(|e| e.to_string()))
         };
         match added {
             Ok(other) => {
@@ -312,7 +325,7 @@ impl Library {
     /// Returns a library with the devices of one file.
     pub fn of_file(path: &Path) -> Result<Self, LoadError> {
         let file = PathBuf::from(path.file_name().unwrap_or_default());
-        let mut entries = devices(&file, parse(path, &|_| false)?);
+        let mut entries = devices(&file, parse(path, &|_| false, &mut Vec::new())?);
         entries.sort_by_key(|e| (e.vendor, e.product, e.revision));
         Ok(Self {
             folder: path.parent().unwrap_or(Path::new("")).to_owned(),
@@ -365,11 +378,12 @@ impl Library {
 type Record = Result<Vec<Entry>, String>;
 
 fn describe(folder: &Path, file: &Path) -> Record {
-    let parsed = parse(&folder.join(file), &|_| false).map_err(|error| match error {
-        LoadError::Esi { source, .. } => source.to_string(),
-        LoadError::Read { source, .. } => source.to_string(),
-        LoadError::Sii { source, .. } => source.to_string(),
-    })?;
+    let parsed =
+        parse(&folder.join(file), &|_| false, &mut Vec::new()).map_err(|error| match error {
+            LoadError::Esi { source, .. } => source.to_string(),
+            LoadError::Read { source, .. } => source.to_string(),
+            LoadError::Sii { source, .. } => source.to_string(),
+        })?;
     Ok(devices(file, parsed))
 }
 

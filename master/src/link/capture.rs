@@ -66,13 +66,18 @@ enum Sink {
 
 impl Recorder {
     /// Creates the file, writes its header and, for [`WriterMode::Background`], starts the writer.
-    /// With a `limit` the recording uses at most that many bytes. Parts of an older recording of
+    /// The file begins with the comment. With a `limit` the recording uses at most that many bytes. Parts of an older recording of
     /// this name are removed.
     ///
     /// # Errors
     /// Fails if the file cannot be created or written, or the thread cannot be started.
-    pub fn create(path: &Path, mode: WriterMode, limit: Option<u64>) -> io::Result<Self> {
-        let file = RotatingWriter::create(path, limit)?;
+    pub fn create(
+        path: &Path,
+        mode: WriterMode,
+        limit: Option<u64>,
+        comment: &str,
+    ) -> io::Result<Self> {
+        let file = RotatingWriter::create(path, limit, comment)?;
         let sink = match mode {
             WriterMode::Inline => Sink::Inline { file, error: None },
             WriterMode::Background => {
@@ -300,7 +305,7 @@ mod tests {
     fn record(mode: WriterMode) -> (Vec<u8>, RecordStats) {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.pcapng");
-        let mut recorder = Recorder::create(&path, mode, None).unwrap();
+        let mut recorder = Recorder::create(&path, mode, None, "").unwrap();
         for (dir, at, frame) in sample() {
             recorder.frame(dir, at, &frame);
         }
@@ -358,7 +363,7 @@ mod tests {
     fn recorder_counts_dropped_frames() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.pcapng");
-        let mut recorder = Recorder::create(&path, WriterMode::Background, None).unwrap();
+        let mut recorder = Recorder::create(&path, WriterMode::Background, None, "").unwrap();
         let frame = [0x5a; MAX_FRAME];
         let sent = 20_000;
         for at in 0..sent {
@@ -373,7 +378,7 @@ mod tests {
     #[test]
     fn finish_returns_the_error_of_a_full_disk() {
         let full = Path::new("/dev/full");
-        let mut recorder = Recorder::create(full, WriterMode::Background, None).unwrap();
+        let mut recorder = Recorder::create(full, WriterMode::Background, None, "").unwrap();
         for at in 0..2000 {
             recorder.frame(Direction::In, at, &[0; 1000]);
         }

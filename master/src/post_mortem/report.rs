@@ -28,6 +28,10 @@ pub struct FaultReport {
     /// The error that ended the run.
     pub error: String,
     pub machine: String,
+    /// SHA-256 of the machine file and the files that it names.
+    pub machine_sha256: String,
+    /// The version of ecaxis.
+    pub version: &'static str,
     /// `"real"` or `"virtual"`.
     pub time: &'static str,
     /// The time in s since 1970; `None` in virtual time.

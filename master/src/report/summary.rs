@@ -22,6 +22,10 @@ use super::events::EventLine;
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Summary {
     pub machine: String,
+    /// SHA-256 of the machine file and the files that it names.
+    pub machine_sha256: String,
+    /// The version of ecaxis.
+    pub version: &'static str,
     pub devices: usize,
     /// `"real"` or `"virtual"`.
     pub time: &'static str,
@@ -238,6 +242,8 @@ impl Summary {
         let phase = stats.phase.summary();
         Self {
             machine: machine.path.display().to_string(),
+            machine_sha256: machine.sha256.to_string(),
+            version: crate::VERSION,
             devices: machine.devices.len(),
             time: match clock {
                 Clock::Real => "real",

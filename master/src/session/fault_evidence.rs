@@ -196,6 +196,8 @@ fn build_report(
         also: diagnosis.also,
         error: error.to_string(),
         machine: machine.path.display().to_string(),
+        machine_sha256: machine.sha256.to_string(),
+        version: crate::VERSION,
         time: match options.clock {
             Clock::Real => "real",
             Clock::Virtual => "virtual",

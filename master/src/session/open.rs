@@ -61,14 +61,25 @@ pub fn link(
             link
         }
     };
-    recorded(link, options)
+    recorded(link, options, &recording_comment(machine))
 }
 
-/// Adds the recording that `options` request to a link.
+/// Returns the comment at the begin of a machine's recordings.
+#[must_use]
+pub fn recording_comment(machine: &Machine) -> String {
+    let (file, sha256) = (machine.path.display(), machine.sha256);
+    format!("machine file {file}, sha256 {sha256}")
+}
+
+/// Adds the recording that `options` request to a link. The file begins with the comment.
 ///
 /// # Errors
 /// [`Cause::Record`].
-pub fn recorded(link: Box<dyn Link>, options: &Options) -> Result<Box<dyn Link>, Error> {
+pub fn recorded(
+    link: Box<dyn Link>,
+    options: &Options,
+    comment: &str,
+) -> Result<Box<dyn Link>, Error> {
     let Some(path) = &options.record else {
         return Ok(link);
     };
@@ -80,7 +91,7 @@ pub fn recorded(link: Box<dyn Link>, options: &Options) -> Result<Box<dyn Link>,
             since_1970().saturating_sub(clock::now()),
         ),
     };
-    let recorder = Recorder::create(path, mode, options.record_limit)
+    let recorder = Recorder::create(path, mode, options.record_limit, comment)
         .map_err(|error| Cause::Record(format!("{}: {error}", path.display())))?;
     Ok(Box::new(CapturingLink::new(link, recorder, epoch)))
 }

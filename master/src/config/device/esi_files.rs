@@ -11,6 +11,7 @@ use crate::config::fields::KeyExt;
 use crate::config::problem::{Problems, Span, suggestion, unreadable};
 use crate::config::raw::RawDevice;
 use crate::esi_library::{self, Library, LoadError, SiiImage};
+use crate::file_digest::UsedFile;
 
 /// Data shared by all devices: the ESI folder, the files read so far, and the cycle.
 pub(crate) struct EsiFiles<'f> {
@@ -47,6 +48,8 @@ impl<'f> EsiFiles<'f> {
                 let read = esi_library::load_sii(&path).map_err(|e| refused(e, ".sii"));
                 let read = read.map_err(|(message, hint)| p.add_hint(name.span(), message, hint));
                 let image = read.ok().map(Arc::new);
+                let used = image.as_deref().map(|i| UsedFile::new(&i.path, &i.bytes));
+                p.files.extend(used);
                 self.images.insert(path, image.clone());
                 image
             }
@@ -99,7 +102,8 @@ impl<'f> EsiFiles<'f> {
             };
             self.queries.iter().any(fits)
         };
-        let read = esi_library::load(&path, &wanted).map_err(|e| refused(e, ".xml"));
+        let read =
+            esi_library::load_with(&path, &wanted, &mut p.files).map_err(|e| refused(e, ".xml"));
         let file = match read {
             Ok(file) => Some(Arc::new(file)),
             Err((message, hint)) => {

@@ -13,6 +13,7 @@ use crate::config::problem::{Problems, unreadable};
 use crate::config::raw::{RawGear, RawWave};
 use crate::config::{Action, AxisSetup, TableFile};
 use crate::file;
+use crate::file_digest::UsedFile;
 
 /// The maximum length of a table in bytes.
 const MAX_TABLE_BYTES: u64 = 64 << 20;
@@ -125,6 +126,7 @@ impl ProgramChecker<'_> {
                 return None;
             }
         };
+        p.files.push(UsedFile::new(&path, text.as_bytes()));
         let (index, axis) = self.positioned(name, "table", p)?;
         let limits = &axis.config.limits;
         let table = Table::parse(&text, Interpolation::Cubic).and_then(|table| {

@@ -55,6 +55,8 @@ pub fn parts_of(path: &Path) -> io::Result<Vec<PathBuf>> {
 pub(super) struct RotatingWriter {
     file: Pcapng<BufWriter<File>>,
     path: PathBuf,
+    /// The begin of each part.
+    header: Vec<u8>,
     /// Maximum bytes per part.
     each: Option<u64>,
     /// The number of the current part; 0 is the first.
@@ -63,13 +65,17 @@ pub(super) struct RotatingWriter {
     before: u64,
 }
 
-fn open_part(path: &Path) -> io::Result<Pcapng<BufWriter<File>>> {
-    Pcapng::new(BufWriter::with_capacity(1 << 20, File::create(path)?))
+fn open_part(path: &Path, header: &[u8]) -> io::Result<Pcapng<BufWriter<File>>> {
+    Pcapng::new(
+        BufWriter::with_capacity(1 << 20, File::create(path)?),
+        header,
+    )
 }
 
 impl RotatingWriter {
-    pub fn create(path: &Path, limit: Option<u64>) -> io::Result<Self> {
-        let file = open_part(path)?;
+    pub fn create(path: &Path, limit: Option<u64>, comment: &str) -> io::Result<Self> {
+        let header = header(comment);
+        let file = open_part(path, &header)?;
         if limit.is_some() {
             for old in parts_of(path)? {
                 let mut magic = Vec::new();
@@ -82,6 +88,7 @@ impl RotatingWriter {
         Ok(Self {
             file,
             path: path.to_owned(),
+            header,
             each: limit.map(|limit| limit / PARTS),
             number: 0,
             before: 0,
@@ -98,7 +105,7 @@ impl RotatingWriter {
 
     /// Continues in a new part and removes the oldest one.
     fn turn(&mut self) -> io::Result<()> {
-        let next = open_part(&part_name(&self.path, self.number + 1))?;
+        let next = open_part(&part_name(&self.path, self.number + 1), &self.header)?;
         self.before += std::mem::replace(&mut self.file, next).finish()?;
         self.number += 1;
         if let Some(old) = self
@@ -131,25 +138,32 @@ const SECTION: u32 = 0x0a0d_0d0a;
 /// Bytes of the longest block.
 const BLOCK_MOST: u64 = 48 + MAX_FRAME as u64;
 
-/// The section header of unknown length, then the description of an Ethernet interface with
-/// if_tsresol (9) = 10^-9 and the end of its options.
-const HEAD: [u32; 15] = [
-    SECTION,
-    28,
-    0x1a2b_3c4d,
-    1,
-    u32::MAX,
-    u32::MAX,
-    28, // one block
-    1,
-    32,
-    1,
-    0,
-    0x0001_0009,
-    9,
-    0,
-    32,
-];
+/// Returns the section header of unknown length with opt_comment (1) and shb_userappl (4), then the
+/// description of an Ethernet interface with if_tsresol (9) = 10^-9.
+fn header(comment: &str) -> Vec<u8> {
+    let program = concat!("ecaxis ", env!("CARGO_PKG_VERSION"));
+    let mut section = Vec::new();
+    for word in [0x1a2b_3c4d, 1, u32::MAX, u32::MAX] {
+        section.extend(u32::to_le_bytes(word));
+    }
+    for (code, text) in [(1_u16, comment), (4, program)] {
+        let text = text.get(..usize::from(u16::MAX)).unwrap_or(text).as_bytes();
+        let Ok(len) = u16::try_from(text.len()) else {
+            continue;
+        };
+        section.extend(code.to_le_bytes());
+        section.extend(len.to_le_bytes());
+        section.extend(text);
+        section.resize(section.len().next_multiple_of(4), 0);
+    }
+    section.extend([0; 4]);
+    let total = u32::try_from(section.len() + 12).unwrap_or(u32::MAX);
+    let mut bytes: Vec<u8> = [SECTION, total].map(u32::to_le_bytes).concat();
+    bytes.extend(section);
+    let interface = [total, 1, 32, 1, 0, 0x0001_0009, 9, 0, 32];
+    bytes.extend(interface.map(u32::to_le_bytes).concat());
+    bytes
+}
 
 /// Returns bits 0 and 1 of `epb_flags`.
 pub(super) fn flag(direction: Direction) -> u32 {
@@ -160,13 +174,13 @@ pub(super) fn flag(direction: Direction) -> u32 {
 }
 
 impl<W: Write> Pcapng<W> {
-    fn new(mut out: W) -> io::Result<Self> {
-        out.write_all(&HEAD.map(u32::to_le_bytes).concat())?;
+    fn new(mut out: W, header: &[u8]) -> io::Result<Self> {
+        out.write_all(header)?;
         Ok(Self {
             out,
             block: Vec::with_capacity(48 + MAX_FRAME),
             written: 0,
-            bytes: size_of_val(&HEAD) as u64,
+            bytes: header.len() as u64,
         })
     }
 
@@ -213,7 +227,7 @@ mod tests {
             let other = dir.path().join("a night.0043.pcapng");
             fs::write(&old, SECTION.to_le_bytes()).unwrap();
             fs::write(&other, "notes").unwrap();
-            let mut recorder = Recorder::create(&path, mode, Some(LIMIT)).unwrap();
+            let mut recorder = Recorder::create(&path, mode, Some(LIMIT), "").unwrap();
             let frames = 3_000;
             for at in 0..frames {
                 recorder.frame(Direction::Out, at, &[0x5a; 200]);

@@ -116,7 +116,7 @@ pub struct SubDeviceDiagnostics {
     pub answers: bool,
     pub al_status: u8,
     pub al_code: u16,
-    /// DL status: see [`crate::acyclic::topology::ports`].
+    /// DL status: the links and loops of the ports.
     pub dl_status: u16,
     /// Own clock minus reference, nanoseconds.
     pub clock_difference: i32,
