@@ -1,4 +1,4 @@
-//! Tells a release build its commit.
+//! Sets the commit of a release build.
 
 use std::process::Command;
 

@@ -15,6 +15,7 @@
 //! - [`acyclic`]: access to a bus without a cycle, in the state in which it is;
 //! - [`link`]: transports for Ethernet frames;
 //! - [`recording`]: recording files, in this project's format and others;
+//! - [`change_log`]: who changed what on the machine, and when;
 //! - [`cancel`]: cooperative cancellation;
 //! - `concurrent`: the same work on many devices at the same time;
 //! - [`clock`]: monotonic or virtual time;
@@ -33,6 +34,7 @@ pub const COMMIT: Option<&str> = option_env!("ECAXIS_COMMIT");
 pub mod acyclic;
 pub mod bringup;
 pub mod cancel;
+pub mod change_log;
 pub mod clock;
 mod concurrent;
 pub mod config;

@@ -1,6 +1,6 @@
 //! One client: carries out its requests.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -9,6 +9,7 @@ use ecaxis_axis::setpoint::{Interpolation, Knot, MotionLimits, StreamConfig};
 use ecaxis_ecat::data_type::{DataType, Kind};
 use ecaxis_ecat::index::AxisIndex;
 use ecaxis_esi::address;
+use ecaxis_master::clock;
 use ecaxis_master::mailbox::worker::MailboxError;
 use ecaxis_master::supervise::operator::{ProgramRequest, Request as MachineRequest};
 use ecaxis_master::sys::shared_memory::SharedMemory;
@@ -31,6 +32,8 @@ mod parts;
 const WAITING: usize = 256;
 /// The age in ns of a state from which no client may jog.
 const OLD_NS: u64 = 500_000_000;
+/// The messages of one jog follow each other within this time.
+const JOG_PAUSE_NS: u64 = 1_000_000_000;
 /// The torque offset (CiA 402).
 const TORQUE_OFFSET: u16 = 0x60b2;
 /// The longest name of a client.
@@ -61,6 +64,10 @@ pub struct Client {
     waits: bool,
     /// The client can receive file descriptors.
     takes_memory: bool,
+    /// Process and user at the other end.
+    peer: Value,
+    /// The time of the last jog.
+    jogged: AtomicU64,
     gone: AtomicBool,
 }
 
@@ -78,6 +85,8 @@ impl Client {
             waiting: Semaphore::new(WAITING),
             waits,
             takes_memory: false,
+            peer: Value::Null,
+            jogged: AtomicU64::new(0),
             gone: AtomicBool::new(false),
             hub,
         }
@@ -87,6 +96,13 @@ impl Client {
     #[must_use]
     pub fn with_memory(mut self) -> Self {
         self.takes_memory = true;
+        self
+    }
+
+    /// Names process and user at the other end.
+    #[must_use]
+    pub fn with_peer(mut self, peer: Value) -> Self {
+        self.peer = peer;
         self
     }
 
@@ -142,7 +158,12 @@ impl Client {
         let mut area = None;
         let result = match request.op {
             Err(error) => Err(error),
-            Ok(op) => self.carry_out(op, request.wait, &mut area).await,
+            Ok(op) => {
+                let change = self.change(&op);
+                let result = self.carry_out(op, request.wait, &mut area).await;
+                self.log_change(change, &result);
+                result
+            }
         };
         let (mut body, status) = match result {
             Ok(mut body) => {
@@ -155,6 +176,47 @@ impl Client {
             body.insert("id".to_owned(), id);
         }
         Answer { body, status, area }
+    }
+
+    /// Returns the entry of the change log for an operation that belongs there.
+    fn change(&self, op: &Op) -> Option<Map<String, Value>> {
+        self.hub.options.changes.as_ref()?;
+        if !op.is_change() || matches!(op, Op::Jog { .. }) && !self.begins_jog() {
+            return None;
+        }
+        let mut entry = Map::new();
+        entry.insert("machine".to_owned(), json!(self.hub.machine.path));
+        let sha256 = self.hub.machine.sha256.to_string();
+        entry.insert("sha256".to_owned(), json!(sha256));
+        let client = json!({"id": self.id, "name": self.name(), "peer": self.peer});
+        entry.insert("client".to_owned(), client);
+        entry.insert("command".to_owned(), json!(op));
+        Some(entry)
+    }
+
+    /// True if a jog begins: the messages of one follow each other within [`JOG_PAUSE_NS`].
+    fn begins_jog(&self) -> bool {
+        let now = clock::now();
+        let before = self.jogged.swap(now, Ordering::Relaxed);
+        before == 0 || now.saturating_sub(before) > JOG_PAUSE_NS
+    }
+
+    fn log_change(
+        &self,
+        entry: Option<Map<String, Value>>,
+        result: &Result<Map<String, Value>, OpError>,
+    ) {
+        let (Some(mut entry), Some(changes)) = (entry, &self.hub.options.changes) else {
+            return;
+        };
+        let outcome = match result {
+            Ok(_) => "ok",
+            Err(error) => &error.message,
+        };
+        entry.insert("outcome".to_owned(), json!(outcome));
+        if changes.try_send(entry).is_err() {
+            tracing::warn!("the change log is too slow: an entry is lost");
+        }
     }
 
     async fn carry_out(

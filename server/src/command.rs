@@ -1,7 +1,7 @@
 //! The operations of the protocol, as clients write them.
 
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
 use crate::error::{ErrorCode, OpError};
@@ -18,7 +18,7 @@ pub struct Request {
 }
 
 /// One operation with its keys.
-#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(tag = "op", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Op {
     /// Names the client and returns the version of server and protocol.
@@ -187,7 +187,7 @@ fn prefill() -> usize {
     8
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Topic {
     Events,
@@ -195,7 +195,7 @@ pub enum Topic {
     Samples,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ProgramAction {
     Start,
@@ -205,14 +205,14 @@ pub enum ProgramAction {
     Stop,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum BusAction {
     Up,
     Down,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum InterpolationName {
     #[default]
@@ -221,7 +221,7 @@ pub enum InterpolationName {
 }
 
 /// A point of a stream: a position, the velocity there, and the torque feed-forward in percent.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(untagged)]
 pub enum Point {
     Position([f64; 1]),
@@ -230,7 +230,7 @@ pub enum Point {
 }
 
 /// The index of an object: a number, or a text such as `"0x6061"`.
-#[derive(Debug, Clone, PartialEq, Eq, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize, JsonSchema, Serialize)]
 #[serde(untagged)]
 pub enum Index {
     Number(u16),
@@ -291,6 +291,21 @@ impl Op {
             Self::Disable { axis } if axis == ALL => Access::Command,
             _ => Access::Lease,
         }
+    }
+}
+
+impl Op {
+    /// True if the change log contains the operation: not those that repeat many times a second.
+    #[must_use]
+    pub fn is_change(&self) -> bool {
+        self.access() != Access::Read
+            && !matches!(
+                self,
+                Self::Renew {}
+                    | Self::SdoRead { .. }
+                    | Self::Advance { .. }
+                    | Self::StreamPush { .. }
+            )
     }
 }
 

@@ -6,6 +6,7 @@
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::pin::Pin;
 use std::sync::atomic::Ordering;
+use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -108,12 +109,14 @@ pub struct RunningStep {
 pub type Describe = dyn Fn(&Error) -> (String, Option<String>) + Send + Sync;
 
 /// Settings of the server.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct HubOptions {
     /// HTTP clients may command.
     pub control: bool,
     /// The bus runs in virtual time, which clients advance.
     pub virtual_time: bool,
+    /// Receives the entries of the change log.
+    pub changes: Option<SyncSender<Map<String, Value>>>,
 }
 
 #[derive(Debug)]

@@ -4,15 +4,18 @@ use std::io;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread;
 use std::time::Duration;
 
 use ecaxis_master::cancel::CancelToken;
+use ecaxis_master::change_log::ChangeLog;
 use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config::Machine;
 use ecaxis_master::samples::{SampleLayout, Samples};
 use ecaxis_master::session::Options;
 use ecaxis_master::supervise::operator::for_manual_mode;
+use serde_json::{Map, Value};
 
 use crate::http::{HttpOptions, HttpServer};
 use crate::hub::{Describe, Hub, HubOptions};
@@ -23,6 +26,8 @@ use crate::socket::Socket;
 const PERIOD: Duration = Duration::from_millis(5);
 /// The threads that serve clients.
 const WORKERS: usize = 2;
+/// The entries of the change log that may wait for the disk.
+const CHANGES: usize = 1024;
 /// The size in bytes of a new token.
 const TOKEN_BYTES: usize = 16;
 
@@ -34,6 +39,8 @@ pub struct ServerOptions {
     pub http: Option<HttpOptions>,
     /// The time for which every cycle's samples are kept.
     pub keep_ns: Nanos,
+    /// Receives the commands of all clients.
+    pub change_log: Option<ChangeLog>,
 }
 
 /// The addresses at which the server listens.
@@ -58,6 +65,21 @@ pub enum ServeError {
     Memory(#[source] io::Error),
     #[error("starting a thread: {0}")]
     Thread(#[source] io::Error),
+}
+
+/// Starts a thread that writes the change log: no client waits for the disk.
+fn log_changes(log: ChangeLog) -> Result<SyncSender<Map<String, Value>>, ServeError> {
+    let (sender, receiver) = sync_channel(CHANGES);
+    let work = move || {
+        for entry in receiver {
+            if let Err(error) = log.append(entry) {
+                tracing::error!(%error, path = %log.path().display(), "the change log");
+            }
+        }
+    };
+    let thread = thread::Builder::new().name("ecaxis-changes".to_owned());
+    thread.spawn(work).map_err(ServeError::Thread)?;
+    Ok(sender)
 }
 
 /// Returns a new random token.
@@ -89,6 +111,7 @@ pub fn serve(
     let hub_options = HubOptions {
         control: options.http.as_ref().is_some_and(|http| http.control),
         virtual_time: run.clock == Clock::Virtual,
+        changes: options.change_log.clone().map(log_changes).transpose()?,
     };
     let hub = Arc::new(Hub::new(machine, outputs, samples, hub_options));
     let runtime = tokio::runtime::Builder::new_multi_thread()

@@ -88,7 +88,10 @@ async fn serve_client(stream: UnixStream, hub: Arc<Hub>) {
     let peer = stream.peer_cred().ok();
     let pid = peer.and_then(|peer| peer.pid());
     let uid = peer.map(|peer| peer.uid());
-    let client = Arc::new(Client::new(Arc::clone(&hub), "socket", None, false).with_memory());
+    let client = Client::new(Arc::clone(&hub), "socket", None, false)
+        .with_peer(json!({"pid": pid, "uid": uid}))
+        .with_memory();
+    let client = Arc::new(client);
     let id = client.id;
     tracing::info!(client = id, ?pid, ?uid, "client connected");
     hub.event(json!({"event": "client", "client": id, "connected": true, "pid": pid, "uid": uid}));

@@ -1,5 +1,6 @@
 //! The bus and the device that a subcommand works on, and the signals that end the work.
 
 pub(crate) mod bus;
+pub(crate) mod change_log;
 pub(crate) mod device;
 pub(crate) mod signals;

@@ -151,6 +151,13 @@ struct VerifyArgs {
     place: DeviceArgs,
 }
 
+impl Args {
+    /// True if the subcommand may change a device.
+    pub fn changes(&self) -> bool {
+        matches!(self.command, Command::Write(_) | Command::Alias(_))
+    }
+}
+
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.command {
         Command::Read(args) => read(args),

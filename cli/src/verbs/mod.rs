@@ -1,7 +1,9 @@
 //! The subcommands.
 
 use clap::Subcommand;
+use ecaxis_master::change_log::ChangeLog;
 
+use crate::access::change_log;
 use crate::args::Verbosity;
 use crate::hints::Failure;
 
@@ -61,7 +63,37 @@ impl Verb {
         }
     }
 
+    /// True if the subcommand may change a machine.
+    fn changes(&self) -> bool {
+        match self {
+            Self::Run(_) | Self::Serve(_) | Self::Jog(_) => true,
+            Self::Sdo(args) => args.changes(),
+            Self::Eeprom(args) => args.changes(),
+            Self::Firmware(args) => args.changes(),
+            _ => false,
+        }
+    }
+
+    /// Runs the subcommand. One that may change a machine enters the change log.
     pub fn run(self) -> Result<(), Failure> {
+        let log = ChangeLog::of_environment().filter(|_| self.changes());
+        let Some(log) = log else {
+            return self.run_unlogged();
+        };
+        let long = matches!(self, Self::Run(_) | Self::Serve(_) | Self::Jog(_));
+        if long {
+            change_log::append(&log, "begins");
+        }
+        let done = self.run_unlogged();
+        let outcome = match &done {
+            Ok(()) => "done",
+            Err(failure) => failure.message.as_str(),
+        };
+        change_log::append(&log, outcome);
+        done
+    }
+
+    fn run_unlogged(self) -> Result<(), Failure> {
         match self {
             Self::Run(args) => run::run(&args),
             Self::Serve(args) => serve::run(&args),

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use ecaxis_master::cancel::CancelToken;
+use ecaxis_master::change_log::ChangeLog;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{Nic, duration};
 use ecaxis_master::session::Options;
@@ -113,6 +114,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         socket: Some((socket(args)?, args.socket_mode)),
         http,
         keep_ns: args.keep,
+        change_log: ChangeLog::of_environment(),
     };
     let defaults = Options::default();
     let run_options = Options {

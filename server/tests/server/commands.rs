@@ -1,5 +1,7 @@
 //! Commands and their outcomes.
 
+use std::time::{Duration, Instant};
+
 use serde_json::json;
 
 use crate::harness::{Server, demo};
@@ -28,7 +30,7 @@ fn time_stands_still_between_requests() {
     let start = client.ok("advance", json!({"cycles": 1}))["time_ns"]
         .as_u64()
         .unwrap();
-    std::thread::sleep(std::time::Duration::from_millis(50));
+    std::thread::sleep(Duration::from_millis(50));
     let end = client.ok("advance", json!({"cycles": 500}))["time_ns"]
         .as_u64()
         .unwrap();
@@ -234,4 +236,42 @@ fn the_bus_goes_down_and_comes_up() {
     client.ok("await", json!({"bus": "op"}));
     client.done("enable", json!({"axis": "x"}));
     client.done("move", json!({"axis": "x", "to": 3.0}));
+}
+
+#[test]
+fn commands_are_in_the_change_log_with_their_client() {
+    let server = Server::in_virtual_time(demo());
+    let mut client = server.owner("cell");
+    client.done("enable", json!({"axis": "*"}));
+    client.ok("override", json!({"factor": 0.5}));
+    let write = json!({"device": "x", "index": 0x6065, "value": 1500});
+    client.ok("sdo_write", write);
+    for _ in 0..5 {
+        client.ok("state", json!({}));
+        client.ok("renew", json!({}));
+        client.ok("jog", json!({"axis": "x", "velocity": 1.0}));
+    }
+    let mut other = server.client();
+    other.refused("move", json!({"axis": "x", "to": 1.0}));
+    let expected = ["take", "enable", "override", "sdo_write", "jog", "move"];
+    // The thread that writes is not waited for.
+    let end = Instant::now() + Duration::from_secs(10);
+    while server.changes().len() < expected.len() && Instant::now() < end {
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let changes = server.changes();
+    let commands: Vec<_> = changes
+        .iter()
+        .map(|entry| &entry["command"]["op"])
+        .collect();
+    assert_eq!(commands, expected);
+    for entry in &changes[1..5] {
+        assert_eq!(entry["client"]["name"], json!("cell"));
+        assert_eq!(entry["client"]["peer"]["pid"], json!(std::process::id()));
+        assert_eq!(entry["outcome"], json!("ok"));
+    }
+    assert_eq!(changes[3]["command"]["value"], json!(1500));
+    assert_eq!(changes[3]["sha256"].as_str().map(str::len), Some(64));
+    let refused = changes[5]["outcome"].as_str().unwrap();
+    assert!(refused.contains("cell"), "{refused}");
 }

@@ -8,6 +8,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use ecaxis_master::cancel::CancelToken;
+use ecaxis_master::change_log::ChangeLog;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{self, Machine};
 use ecaxis_master::session::Options;
@@ -75,6 +76,7 @@ impl Server {
             socket: Some((folder.path().join("s.sock"), 0o600)),
             http,
             keep_ns: 10_000_000_000,
+            change_log: Some(ChangeLog::new(folder.path().join("changes.jsonl"))),
         };
         let (ready, listening) = std::sync::mpsc::channel::<Listening>();
         let cancel = Arc::clone(&stop);
@@ -96,6 +98,16 @@ impl Server {
 
     pub fn socket(&self) -> PathBuf {
         self.folder.path().join("s.sock")
+    }
+
+    /// Returns the entries of the change log. A thread writes them soon after the answers.
+    pub fn changes(&self) -> Vec<Value> {
+        let log = self.folder.path().join("changes.jsonl");
+        let text = std::fs::read_to_string(log).unwrap_or_default();
+        let lines = text.lines();
+        lines
+            .map(|line| serde_json::from_str(line).expect("JSON"))
+            .collect()
     }
 
     /// Connects a client, and waits until the bus is in Op.

@@ -111,6 +111,13 @@ fn wrong(message: &str) -> Failure {
     Failure::new(WRONG, message)
 }
 
+impl Args {
+    /// True if the subcommand may change a device.
+    pub fn changes(&self) -> bool {
+        matches!(self.what, FirmwareCommand::Update(_))
+    }
+}
+
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.what {
         FirmwareCommand::Info(info) => info::run(info),

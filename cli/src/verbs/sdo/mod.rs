@@ -65,6 +65,14 @@ enum Command {
     Defaults(command::DefaultsArgs),
 }
 
+impl Args {
+    /// True if the subcommand may change a device.
+    pub fn changes(&self) -> bool {
+        use Command::{Defaults, Restore, Store, Write};
+        matches!(self.command, Write(_) | Restore(_) | Store(_) | Defaults(_))
+    }
+}
+
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.command {
         Command::Read(args) => read::run(args),
