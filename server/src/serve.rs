@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::change_log::ChangeLog;
@@ -15,10 +15,11 @@ use ecaxis_master::config::Machine;
 use ecaxis_master::samples::{SampleLayout, Samples};
 use ecaxis_master::session::Options;
 use ecaxis_master::supervise::operator::for_manual_mode;
+use sd_notify::NotifyState;
 use serde_json::{Map, Value};
 
 use crate::http::{HttpOptions, HttpServer};
-use crate::hub::{Describe, Hub, HubOptions};
+use crate::hub::{BusState, Describe, Hub, HubOptions};
 use crate::machine::keep_up;
 use crate::socket::Socket;
 
@@ -65,6 +66,51 @@ pub enum ServeError {
     Memory(#[source] io::Error),
     #[error("starting a thread: {0}")]
     Thread(#[source] io::Error),
+}
+
+/// The service manager that has started the server, if one has: sd_notify(3).
+struct Service {
+    /// The interval at which it wants to hear of the server.
+    watchdog: Option<Duration>,
+    heard: Instant,
+    state: Option<BusState>,
+}
+
+impl Service {
+    fn start() -> Self {
+        notify(NotifyState::Ready);
+        Self {
+            // Half of the time after which the service manager ends the process.
+            watchdog: sd_notify::watchdog_enabled().map(|time| time / 2),
+            heard: Instant::now(),
+            state: None,
+        }
+    }
+
+    /// Reports the bus when its state changes, and resets the watchdog in time.
+    fn alive(&mut self, state: BusState) {
+        if self.state.replace(state) != Some(state) {
+            notify(NotifyState::Status(&format!("bus: {}", state.name())));
+        }
+        if self
+            .watchdog
+            .is_some_and(|every| self.heard.elapsed() >= every)
+        {
+            self.heard = Instant::now();
+            notify(NotifyState::Watchdog);
+        }
+    }
+
+    fn stops(self) {
+        notify(NotifyState::Stopping);
+    }
+}
+
+/// Does nothing without a service manager.
+fn notify(state: NotifyState<'_>) {
+    if let Err(error) = sd_notify::notify(&[state]) {
+        tracing::warn!(%error, "the service manager cannot be reached");
+    }
 }
 
 /// Starts a thread that writes the change log: no client waits for the disk.
@@ -156,11 +202,14 @@ pub fn serve(
             None => std::future::pending().await,
         }
     });
+    let mut service = Service::start();
     while !stop.is_cancelled() && !keeper.is_finished() {
         thread::sleep(PERIOD);
         // Also while no run calls the operator.
         hub.expire_lease();
+        service.alive(hub.bus_state());
     }
+    service.stops();
     hub.shut_down();
     let kept = keeper.join();
     let _ = sampler.join();

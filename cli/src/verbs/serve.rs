@@ -55,7 +55,8 @@ pub(crate) struct Args {
     /// Fault script for the simulated bus
     #[arg(long, value_name = "FILE")]
     faults: Option<PathBuf>,
-    /// Control socket [default: NAME.sock in /run/ecaxis or $XDG_RUNTIME_DIR/ecaxis]
+    /// Control socket [default: NAME.sock in $RUNTIME_DIRECTORY, /run/ecaxis or
+    /// $XDG_RUNTIME_DIR/ecaxis]
     #[arg(long, value_name = "PATH")]
     socket: Option<PathBuf>,
     /// File mode of the socket, octal: who may write to it may command the machine
@@ -209,6 +210,11 @@ fn socket(args: &Args) -> Result<PathBuf, Failure> {
     if let Some(path) = &args.socket {
         return Ok(path.clone());
     }
+    let name = Path::new(args.file.file_stem().unwrap_or_default()).with_extension("sock");
+    // Of a systemd unit with RuntimeDirectory=.
+    if let Some(folder) = std::env::var_os("RUNTIME_DIRECTORY") {
+        return Ok(Path::new(&folder).join(name));
+    }
     let folder = match rustix::process::geteuid().is_root() {
         true => PathBuf::from("/run"),
         false => std::env::var_os("XDG_RUNTIME_DIR")
@@ -226,6 +232,5 @@ fn socket(args: &Args) -> Result<PathBuf, Failure> {
         )
         .hint("name the socket with --socket")
     })?;
-    let name = args.file.file_stem().unwrap_or_default();
-    Ok(folder.join(name).with_extension("sock"))
+    Ok(folder.join(name))
 }
