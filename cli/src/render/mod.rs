@@ -8,6 +8,7 @@ use serde::Serialize;
 use crate::failure::{FAILED, Failure, INTERRUPTED};
 
 pub(crate) mod fault_report;
+pub(crate) mod live;
 pub(crate) mod output;
 pub(crate) mod pdo_table;
 pub(crate) mod progress;

@@ -108,6 +108,13 @@ pub(crate) fn stderr_width() -> Option<usize> {
     err.is_terminal().then(|| columns(&err)).flatten()
 }
 
+/// Columns and rows of stderr, or `None` if it is not a terminal.
+pub(crate) fn stderr_size() -> Option<[usize; 2]> {
+    let size = rustix::termios::tcgetwinsize(io::stderr()).ok()?;
+    let size = [size.ws_col, size.ws_row].map(usize::from);
+    (!size.contains(&0)).then_some(size)
+}
+
 /// The width of stdout, or `None` if it is not a terminal.
 pub(crate) fn stdout_width() -> Option<usize> {
     columns(io::stdout())

@@ -10,6 +10,7 @@ use ecaxis_master::session::{AxisLine, Observer, Progress, Status};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::hints;
+use crate::render::live::{Live, clipped};
 use crate::render::{note, output, style};
 
 /// The minimum interval between status lines. In virtual time, an hour of status passes in seconds.
@@ -25,6 +26,11 @@ pub(crate) struct ProgressPrinter {
     /// The interface; hints depend on it.
     nic: Nic,
     last_passing: Option<Instant>,
+    /// The second of machine time of the last line.
+    last_second: Option<u64>,
+    live: Live,
+    /// The present step of the program.
+    step: Option<String>,
     advised: Vec<String>,
 }
 
@@ -33,7 +39,7 @@ impl ProgressPrinter {
     pub fn new(clock: Clock, bus: &Bus, plain: bool) -> Self {
         let bar = (style::rewrites() && !plain).then(|| {
             let bar = ProgressBar::new_spinner();
-            let style = ProgressStyle::with_template("{spinner} {wide_msg}");
+            let style = ProgressStyle::with_template("{spinner} {msg}");
             let bar = bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_spinner()));
             output::attach_bar(&bar);
             bar
@@ -45,6 +51,9 @@ impl ProgressPrinter {
             cycle_ns: bus.cycle_ns,
             nic: bus.nic.clone(),
             last_passing: None,
+            last_second: None,
+            live: Live::default(),
+            step: None,
             advised: Vec::new(),
         }
     }
@@ -53,7 +62,7 @@ impl ProgressPrinter {
     fn passing(&self, text: &str) {
         match &self.bar {
             Some(bar) => {
-                bar.set_message(text.to_owned());
+                bar.set_message(fitted(text));
                 bar.tick();
             }
             None => note(text),
@@ -70,6 +79,41 @@ impl ProgressPrinter {
             self.passing(&text());
         }
     }
+}
+
+impl ProgressPrinter {
+    /// Shows the axes as a table on a terminal; otherwise a line for each second.
+    fn status(&mut self, status: &Status) {
+        let cycle_ns = self.cycle_ns;
+        if let Some(bar) = &self.bar {
+            let [columns, rows] = output::stderr_size().unwrap_or([80, 24]);
+            let mut text = fitted(&bus_text(status, cycle_ns));
+            if let Some(step) = &self.step {
+                text += "\n";
+                text += &clipped(step, columns.saturating_sub(1));
+            }
+            let room = [columns.saturating_sub(1), rows.saturating_sub(4)];
+            for line in self.live.lines(status, room) {
+                text += "\n";
+                text += &line;
+            }
+            bar.set_message(text);
+            bar.tick();
+        } else if self.clock == Clock::Virtual {
+            self.rate_limited(|| status_line(status, cycle_ns));
+        } else {
+            let second = status.time / 1_000_000_000;
+            if self.last_second.replace(second) != Some(second) {
+                self.passing(&status_line(status, cycle_ns));
+            }
+        }
+    }
+}
+
+/// Cuts a line to the width of the terminal behind the spinner.
+fn fitted(text: &str) -> String {
+    let columns = output::stderr_width().unwrap_or(80);
+    clipped(text, columns.saturating_sub(3))
 }
 
 impl Observer for ProgressPrinter {
@@ -124,20 +168,17 @@ impl Observer for ProgressPrinter {
             Progress::Enabled { axes } => note(&format!("{axes} axes in Operation enabled")),
             Progress::Program { run, step, what } => {
                 let text = format!("run {run}, step {}: {what}", step.number);
-                if *run == 1 && self.bar.is_none() {
+                self.step = Some(text.clone());
+                if *run == 1 {
                     note(&text);
-                } else {
+                } else if self.bar.is_none() {
                     self.rate_limited(|| text);
                 }
             }
             Progress::Captured { run, capture } => {
                 note(&format!("run {run}, step {}: {capture}", capture.step));
             }
-            Progress::Status(status) if self.clock == Clock::Virtual => {
-                let cycle_ns = self.cycle_ns;
-                self.rate_limited(|| status_line(status, cycle_ns));
-            }
-            Progress::Status(status) => self.passing(&status_line(status, self.cycle_ns)),
+            Progress::Status(status) => self.status(status),
             Progress::Stopping => note("stopping: axes to rest, power off, bus to Init"),
         }
     }
@@ -168,6 +209,15 @@ fn bring_up_times(steps: &[StepTime]) -> String {
 }
 
 fn status_line(status: &Status, cycle_ns: u64) -> String {
+    let mut text = bus_text(status, cycle_ns);
+    for axis in &status.axes {
+        text += "  ";
+        text += &axis_text(axis);
+    }
+    text
+}
+
+fn bus_text(status: &Status, cycle_ns: u64) -> String {
     let counters = &status.counters;
     let turns = counters.cycles.saturating_add(counters.overruns);
     let mut text = format!(
@@ -183,10 +233,6 @@ fn status_line(status: &Status, cycle_ns: u64) -> String {
             phase.error_ns,
             if phase.locked { "" } else { " (not locked)" }
         );
-    }
-    for axis in &status.axes {
-        text += "  ";
-        text += &axis_text(axis);
     }
     text
 }

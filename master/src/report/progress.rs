@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use ecaxis_axis::units::UserUnits;
-use ecaxis_axis::{Mode, State};
+use ecaxis_axis::{AxisStatus, Mode, State};
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use serde::Serialize;
 
@@ -82,7 +82,7 @@ pub enum Progress {
     GroupReleased {
         group: String,
     },
-    /// The status of the machine, once a second of machine time.
+    /// The status of the machine, five times a second of machine time.
     Status(Status),
     Stopping,
 }
@@ -154,6 +154,20 @@ pub struct AxisLine {
     /// The torque in `torque_unit`.
     pub torque: f64,
     pub torque_unit: TorqueUnit,
+    /// The set-points, in the units of the actual values.
+    pub target_position: f64,
+    pub target_velocity: f64,
+    pub target_torque: f64,
+    pub following_error: f64,
+    /// The fault, the trip, or what enabling waits for.
+    pub trouble: Option<String>,
+}
+
+fn trouble(status: &AxisStatus) -> Option<String> {
+    let trip = status.trip.map(|trip| trip.to_string());
+    let fault = || status.fault.map(|fault| fault.to_string());
+    let waiting = || status.waiting.map(|waiting| waiting.to_string());
+    trip.or_else(fault).or_else(waiting)
 }
 
 impl Status {
@@ -174,6 +188,15 @@ impl Status {
                     velocity: status.velocity,
                     torque: setup.torque.shown(status.torque),
                     torque_unit: setup.torque.unit,
+                    target_position: setup
+                        .config
+                        .scale
+                        .place(UserUnits(status.target_position))
+                        .0,
+                    target_velocity: status.target_velocity,
+                    target_torque: setup.torque.shown(status.target_torque),
+                    following_error: status.following_error,
+                    trouble: trouble(status),
                 }
             })
             .collect();

@@ -45,7 +45,7 @@ const FIRST_CYCLES: u64 = 20;
 const REFUSALS: usize = 256;
 /// The time in ns after which devices on their way to Op are read one by one.
 const BROADCAST_WAIT: Nanos = 100_000_000;
-const STATUS_PERIOD: Nanos = 1_000_000_000;
+const STATUS_PERIOD: Nanos = 200_000_000;
 
 /// Drives a machine from SafeOp through its program and back to Init.
 #[derive(Debug)]
