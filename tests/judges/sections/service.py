@@ -17,7 +17,8 @@ UNIT = rig.ROOT / "packaging/ecaxis@.service"
 # The exposure by `systemd-analyze security`, of 10; lower is better.
 EXPOSURE = 2.5
 CAPABILITIES = "+net_raw,+sys_nice,+ipc_lock"
-NOBODY = "65534"
+# A user without any files.
+UNPRIVILEGED = "65534"
 
 
 def service(bench):
@@ -51,7 +52,7 @@ def unprivileged(bench, folder):
     state, run = folder / "state", folder / "run"
     for made in (state, run):
         made.mkdir()
-        os.chown(made, int(NOBODY), int(NOBODY))
+        os.chown(made, int(UNPRIVILEGED), int(UNPRIVILEGED))
     machine = rig.Machine()
     rig.drive(machine, "x", rig.ROOT / "configs/esi/EPOS4.xml", "EPOS4")
     file = machine.write(folder)
@@ -66,7 +67,7 @@ def unprivileged(bench, folder):
         "ECAXIS_CHANGE_LOG": str(log),
         "PATH": "/usr/bin:/bin",
     }
-    limited = ["setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups", "--no-new-privs"]
+    limited = ["setpriv", f"--reuid={UNPRIVILEGED}", f"--regid={UNPRIVILEGED}", "--clear-groups", "--no-new-privs"]
     limited += [f"--{kind}={CAPABILITIES}" for kind in ("inh-caps", "ambient-caps")]
     limited += [f"--bounding-set=-all,{CAPABILITIES}"]
     serve = [*limited, str(program), "serve", str(file), "--nic", bench.nic]
@@ -90,7 +91,7 @@ def unprivileged(bench, folder):
 
 
 def messages(manager, child, until=None, seconds=1.0):
-    """Returns what a service has told its manager within a time, or until a message comes."""
+    """Returns the messages of a service to its manager within a time, or until one of them comes."""
     heard, end = [], time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0 and (child.poll() is None or until is None):
         if not select.select([manager], [], [], left)[0]:
