@@ -3,6 +3,7 @@
 //!
 //! `ECAXIS_UPDATE_SNAPSHOTS=1` writes `tests/snapshots/analyze` again; review the difference.
 
+mod absences;
 mod al_status;
 mod hostile;
 mod replay;

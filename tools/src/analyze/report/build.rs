@@ -3,7 +3,10 @@
 use std::collections::BTreeMap;
 
 use super::process_data::{axes, clocks, cycle};
-use super::{DeviceReport, FileReport, Line, Report, SyncManagerReport, TransferReport, problems};
+use super::{
+    Absence, DeviceReport, FileReport, LINKS_LOST, Line, Report, SyncManagerReport, TransferReport,
+    problems,
+};
 use crate::analyze::events::{Event, EventKind, EventScope};
 use crate::analyze::mailbox::{TransferDirection, TransferOutcome};
 use crate::analyze::segment::{Device, RecordedSegment};
@@ -62,6 +65,7 @@ pub(in crate::analyze) fn report(
         file: file(remarks, counted, &segment),
         trouble: Vec::new(),
         answering: segment.answering,
+        absences: absences(&segment.events, &since),
         story: together(story),
         events: lines(segment.events.iter(), &since, place),
         more_events: segment.more_events,
@@ -74,6 +78,31 @@ pub(in crate::analyze) fn report(
     };
     report.trouble = problems::of(&report);
     report
+}
+
+fn absences(events: &[Event], since: &Since) -> Vec<Absence> {
+    let mut found: Vec<Absence> = Vec::new();
+    let mut all = 0;
+    for event in events {
+        let EventKind::Answering(count) = event.what else {
+            continue;
+        };
+        let at = since.seconds(event.at);
+        let open = found.last_mut().filter(|absence| absence.until.is_none());
+        match open {
+            Some(absence) if count >= all => absence.until = Some(at),
+            Some(absence) => absence.absent = absence.absent.max(all - count),
+            None if count < all => found.push(Absence {
+                at,
+                absent: all - count,
+                of: all,
+                until: None,
+            }),
+            None => {}
+        }
+        all = all.max(count);
+    }
+    found
 }
 
 fn file(mut remarks: Vec<String>, counted: &PacketCounts, segment: &RecordedSegment) -> FileReport {
@@ -284,7 +313,7 @@ fn errors(device: &Device) -> Vec<(String, u8)> {
             ),
             (
                 registers::LOST_LINK_COUNTERS + port,
-                format!("links lost at port {port}"),
+                format!("{LINKS_LOST}{port}"),
             ),
         ]
     };

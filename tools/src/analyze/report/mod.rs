@@ -24,6 +24,8 @@ pub struct Report {
     pub trouble: Vec<String>,
     /// The maximum number of devices that answered a broadcast read.
     pub answering: Option<u16>,
+    /// When fewer devices answered than before.
+    pub absences: Vec<Absence>,
     pub devices: Vec<DeviceReport>,
     /// The main events in order: state changes, refusals, emergencies.
     pub story: Vec<Line>,
@@ -35,6 +37,22 @@ pub struct Report {
     pub cycle: Vec<CycleReport>,
     pub clocks: ClocksReport,
     pub axes: Vec<AxisReport>,
+}
+
+/// The begin of the name of a port's counter.
+const LINKS_LOST: &str = "links lost at port ";
+
+/// A time in which devices did not answer.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Absence {
+    /// The time in s since the first frame.
+    pub at: f64,
+    /// The most devices that were absent at once.
+    pub absent: u16,
+    /// The devices before.
+    pub of: u16,
+    /// The time at which all answered again.
+    pub until: Option<f64>,
 }
 
 #[derive(Debug, Serialize)]

@@ -1,6 +1,6 @@
 //! The problems of a report, worst first.
 
-use super::{CycleReport, Report, WkcRun, called};
+use super::{Absence, CycleReport, LINKS_LOST, Report, WkcRun, called};
 use crate::document::format::time;
 use ecaxis_master::text::pluralize;
 
@@ -20,6 +20,7 @@ pub(super) fn of(report: &Report) -> Vec<String> {
                 .to_owned(),
         );
     }
+    absences(report, &mut found);
     story(report, &mut found);
     if file.lost > 0 && file.answered > 0 {
         found.push(format!(
@@ -89,6 +90,37 @@ fn odd(cycle: &CycleReport) -> (u64, f64) {
         .collect();
     let count = odd.iter().map(|run| run.cycles).sum();
     (count, odd.first().map_or(0.0, |run| run.at))
+}
+
+/// Adds devices that no longer answered: the likely cause of what follows.
+fn absences(report: &Report, found: &mut Vec<String>) {
+    let lost = report
+        .devices
+        .iter()
+        .enumerate()
+        .flat_map(|(place, device)| {
+            let ports = device.errors.iter();
+            let port = |(what, _): &(String, u8)| Some(what.strip_prefix(LINKS_LOST)?.to_owned());
+            let ports = ports.filter_map(port);
+            ports.map(move |port| format!(" behind port {port} of #{place} {}", called(place, device)))
+        });
+    let lost: Vec<String> = lost.collect();
+    // Links lost at several places do not say which of them it was.
+    let behind = match lost.as_slice() {
+        [one] => one.as_str(),
+        _ => "",
+    };
+    for absence in report.absences.iter().take(LINES) {
+        let Absence { at, absent, of, .. } = *absence;
+        let devices = pluralize(usize::from(absent), "SubDevice");
+        let back = match absence.until {
+            Some(until) => format!(", back at {until:.3} s"),
+            None => String::new(),
+        };
+        found.push(format!(
+            "{at:.3} s: {devices} of {of} vanished{behind}{back}"
+        ));
+    }
 }
 
 /// Adds AL errors, refused transfers, emergencies and faults in order of occurrence.
