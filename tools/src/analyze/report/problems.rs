@@ -102,7 +102,9 @@ fn absences(report: &Report, found: &mut Vec<String>) {
             let ports = device.errors.iter();
             let port = |(what, _): &(String, u8)| Some(what.strip_prefix(LINKS_LOST)?.to_owned());
             let ports = ports.filter_map(port);
-            ports.map(move |port| format!(" behind port {port} of #{place} {}", called(place, device)))
+            ports.map(move |port| {
+                format!(" behind port {port} of #{place} {}", called(place, device))
+            })
         });
     let lost: Vec<String> = lost.collect();
     // Links lost at several places do not say which of them it was.
