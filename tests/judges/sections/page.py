@@ -235,6 +235,7 @@ def page(bench):
             tab = Tab(browser, server)
         restarts(bench, folder, token, tab, port)
         reads_only(bench, browser, folder)
+        hour(bench, browser, folder)
 
 
 def shows(bench, browser, server):
@@ -483,6 +484,40 @@ def samples(report, browser, server):
     observer.do("release")
     report.equal("no console message in the scope", tab.complaints, [])
     tab.close()
+
+
+def hour(bench, browser, folder):
+    """A set-point that lasts one cycle of an hour is in the widest picture."""
+    report = bench.report
+    with Server(bench.program, folder, "--virtual") as server:
+        observer = server.observer
+        observer.do("unsubscribe", topics=["samples"])
+        observer.do("take", name="observer", ttl_ms=60000)
+        observer.do("enable", axis="*", wait=True)
+        half = lambda: [observer.do("advance", seconds=225) for _ in range(8)]  # noqa: E731
+        half()
+        spike = COUNT / 2
+        observer.do("stream_open", axis="x", interval_ms=1, interpolation="linear", prefill=3)
+        answer = observer.do("stream_push", axis="x", points=[[0.0], [spike], [0.0], [0.0]])
+        report.check("the set-points are accepted", answer.get("accepted") == 4, answer)
+        half()
+        tab = Tab(browser, server, viewport={"width": 1280, "height": 800})
+        tab.page.click("#tab-scope")
+        tab.page.select_option('[aria-label="Length of the window"]', "3600000000000")
+        found = "window.__samples?.signals.find(s => s.name === 'x.target_position')"
+
+        def is_shown():
+            # The live view follows new samples.
+            observer.do("advance", seconds=0.1)
+            return tab.page.evaluate(f"{found} !== undefined && !window.__samples.oneCycle")
+
+        wait_for("the view of an hour", is_shown)
+        greatest = tab.page.evaluate(f"Array.from({found}.greatest).filter(v => !Number.isNaN(v))")
+        shown = [value for value in greatest if value > 0]
+        report.equal("one column of an hour has the spike", shown, [spike])
+        report.check("the picture is of the whole hour", len(greatest) > 500, f"{len(greatest)} columns")
+        tab.page.screenshot(path=rig.target() / "page" / "scope-hour.png")
+        tab.close()
 
 
 def foreign_origin(report, browser, server):
