@@ -11,6 +11,7 @@
 //! - [`bringup`]: the way from power-up to SafeOp; may block and allocate;
 //! - [`rt`]: the cycle; must not block or allocate;
 //! - [`samples`]: the values of every cycle, for other threads and processes;
+//! - [`ros2`]: these values as ROS 2 messages and as MCAP files;
 //! - [`mailbox`]: CoE and FoE over raw datagrams, also during operation;
 //! - [`acyclic`]: access to a bus without a cycle, in the state in which it is;
 //! - [`link`]: transports for Ethernet frames;
@@ -47,6 +48,7 @@ pub mod mailbox;
 pub mod post_mortem;
 pub mod recording;
 pub mod report;
+pub mod ros2;
 pub mod rt;
 pub mod samples;
 pub mod session;

@@ -1,12 +1,13 @@
 //! Samples as files: CSV and MCAP.
 
-use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::Cursor;
+use std::sync::Arc;
 
 use ecaxis_master::clock::Nanos;
+use ecaxis_master::ros2::mcap::{McapError, McapFile};
+use ecaxis_master::ros2::topics::Topics;
 use ecaxis_master::samples::Samples;
-use serde_json::json;
 
 use crate::connection::Batch;
 use crate::error::{ErrorCode, OpError};
@@ -58,12 +59,16 @@ impl Rows {
                 }
             }
             if batch.rows.len().saturating_mul(words.len().max(1)) > VALUES {
-                let error = OpError::new(ErrorCode::TooLarge, "more than 8 million values");
-                return Err(error.help("choose fewer signals or a shorter time"));
+                return Err(too_large());
             }
         }
         Ok(Self { names, batch })
     }
+}
+
+fn too_large() -> OpError {
+    OpError::new(ErrorCode::TooLarge, "more than 8 million values")
+        .help("choose fewer signals or a shorter time")
 }
 
 /// Returns the rows as CSV (RFC 4180). Values are exact; a value that does not exist is empty.
@@ -91,41 +96,39 @@ pub fn csv(rows: &Rows) -> String {
     text
 }
 
-/// Returns the rows as MCAP: one channel with JSON messages, one for each cycle.
+/// Returns all kept rows between both times as MCAP, with the topics of the signals.
 ///
 /// # Errors
-/// Fails if the writer fails.
-pub fn mcap(rows: &Rows) -> Result<Vec<u8>, mcap::McapError> {
-    let mut bytes = Cursor::new(Vec::new());
-    let options = mcap::WriteOptions::new().profile("").compression(None);
-    let mut writer = options.create(&mut bytes)?;
-    let mut properties = serde_json::Map::new();
-    properties.insert("row".to_owned(), json!({"type": "integer"}));
-    for (name, unit) in &rows.names {
-        let about = json!({"type": ["number", "null"], "description": unit});
-        properties.insert(name.clone(), about);
-    }
-    let schema = json!({"type": "object", "properties": properties});
-    let schema = serde_json::to_vec(&schema).unwrap_or_default();
-    let schema = writer.add_schema("ecaxis.Samples", "jsonschema", &schema)?;
-    let channel = writer.add_channel(schema, "/samples", "json", &BTreeMap::new())?;
-    for (index, (row, time)) in rows.batch.rows.iter().zip(&rows.batch.times_ns).enumerate() {
-        let mut message = serde_json::Map::new();
-        message.insert("row".to_owned(), json!(row));
-        for ((name, _), values) in rows.names.iter().zip(&rows.batch.signals) {
-            message.insert(name.clone(), json!(values.get(index)));
+/// Fails if the rows have more than 8 million values.
+pub fn mcap(
+    samples: &Samples,
+    topics: &Arc<Topics>,
+    words: &[usize],
+    [from_ns, to_ns]: [Nanos; 2],
+) -> Result<Vec<u8>, OpError> {
+    let failed = |error: McapError| OpError::new(ErrorCode::Failed, error.to_string());
+    let wanted = |source| words.iter().any(|word| topics.words(source).contains(word));
+    let bytes = Cursor::new(Vec::new());
+    let mut file = McapFile::new(bytes, Arc::clone(topics), wanted).map_err(failed)?;
+    let (mut row, mut values, mut expected) = (Vec::new(), 0, None);
+    let end = samples.written();
+    for number in end.saturating_sub(samples.capacity())..end {
+        if !samples.read(number, &mut row) {
+            continue;
         }
-        let data = serde_json::to_vec(&message).unwrap_or_default();
-        let header = mcap::records::MessageHeader {
-            channel_id: channel,
-            // At most 2^32 rows are kept.
-            sequence: u32::try_from(*row & u64::from(u32::MAX)).unwrap_or(0),
-            log_time: *time,
-            publish_time: *time,
-        };
-        writer.write_to_known_channel(&header, &data)?;
+        if !row
+            .get(1)
+            .is_some_and(|time| (from_ns..=to_ns).contains(time))
+        {
+            continue;
+        }
+        file.miss(number - expected.unwrap_or(number));
+        expected = Some(number + 1);
+        values += row.len();
+        if values > VALUES {
+            return Err(too_large());
+        }
+        file.write_row(&row).map_err(failed)?;
     }
-    writer.finish()?;
-    drop(writer);
-    Ok(bytes.into_inner())
+    Ok(file.finish().map_err(failed)?.into_inner())
 }

@@ -4,30 +4,29 @@ use std::io::Read as _;
 use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::Duration;
 
 use axum::Router;
 use axum::body::{Body, Bytes};
-use axum::extract::ws::{Message, WebSocket, WebSocketUpgrade};
 use axum::extract::{DefaultBodyLimit, Path, Query, Request as HttpRequest, State};
-use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::http::{HeaderMap, HeaderValue, StatusCode, Uri, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
-use futures_util::{SinkExt, StreamExt};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 use tokio::net::TcpListener;
 
 use crate::client::{Answer, Client};
 use crate::command::Request;
-use crate::connection::{Batch, Connection, Outgoing, same, signal_words};
+use crate::connection::{Batch, same, signal_words};
 use crate::error::{ErrorCode, OpError};
 use crate::export;
+use crate::foxglove::{self, Viewers};
 use crate::hub::Hub;
 use crate::openapi;
 use crate::page;
 use crate::socket::LINE;
+use crate::websocket;
 
 /// The most buckets of one history.
 const BUCKETS: usize = 20_000;
@@ -35,8 +34,6 @@ const BUCKETS: usize = 20_000;
 const VALUES: u64 = 1 << 22;
 /// The bytes of a recording that are read at once.
 const PIECE: usize = 256 * 1024;
-/// The silence after which a WebSocket client is asked for a sign of life.
-const PING: Duration = Duration::from_secs(10);
 
 /// Settings of the HTTP server.
 #[derive(Debug, Clone)]
@@ -54,14 +51,15 @@ pub struct HttpOptions {
 #[derive(Debug)]
 pub struct Http {
     pub hub: Arc<Hub>,
-    options: HttpOptions,
-    token: Arc<str>,
+    pub(crate) viewers: Viewers,
+    pub(crate) options: HttpOptions,
+    pub(crate) token: Arc<str>,
     /// The client of all requests with the token, and of those without.
     with_token: Client,
-    without_token: Client,
+    pub(crate) without_token: Client,
 }
 
-type Shared = State<Arc<Http>>;
+pub(crate) type Shared = State<Arc<Http>>;
 
 /// A server that listens.
 #[derive(Debug)]
@@ -87,6 +85,7 @@ impl HttpServer {
             without_token: Client::new(Arc::clone(hub), "http", Some(no_token), true),
             token: options.token.clone().into(),
             hub: Arc::clone(hub),
+            viewers: Viewers::new(),
             options,
         };
         http.without_token.set_blind(!http.is_loopback());
@@ -112,7 +111,7 @@ impl HttpServer {
     }
 }
 
-fn read_only() -> OpError {
+pub(crate) fn read_only() -> OpError {
     OpError::new(
         ErrorCode::ReadOnly,
         "the server takes no commands over HTTP",
@@ -125,13 +124,13 @@ fn router(http: Arc<Http>) -> Router {
         router.route(file.path, get(move || async move { file.response() }))
     });
     Router::new()
-        .route("/", get(|| async { page::index() }))
+        .route("/", get(foxglove::index))
         .route("/metrics", get(metrics))
         .route(
             "/openapi.json",
             get(|| async { axum::Json(openapi::document()) }),
         )
-        .route("/api/ws", get(websocket))
+        .route("/api/ws", get(websocket::upgrade))
         .route("/api/machine", get(machine))
         .route("/api/state", get(state))
         .route("/api/events", get(events))
@@ -150,15 +149,25 @@ fn router(http: Arc<Http>) -> Router {
 }
 
 impl Http {
-    fn is_loopback(&self) -> bool {
+    pub(crate) fn is_loopback(&self) -> bool {
         self.options.address.ip().is_loopback()
     }
 
-    fn has_token(&self, headers: &HeaderMap) -> bool {
+    pub(crate) fn has_token(&self, headers: &HeaderMap) -> bool {
         let given = headers.get(header::AUTHORIZATION);
         let given = given.and_then(|value| value.to_str().ok());
         let given = given.and_then(|value| value.strip_prefix("Bearer "));
         given.is_some_and(|given| same(&self.token, given.trim()))
+    }
+
+    /// Returns whether the address contains the token, as `?token=TOKEN`: viewers in a browser
+    /// cannot set headers.
+    pub(crate) fn has_token_in(&self, address: &Uri) -> bool {
+        let mut keys = address.query().unwrap_or_default().split('&');
+        keys.any(|key| {
+            key.strip_prefix("token=")
+                .is_some_and(|given| same(&self.token, given))
+        })
     }
 
     fn client(&self, headers: &HeaderMap) -> &Client {
@@ -188,8 +197,9 @@ impl Http {
             .any(|host| host.eq_ignore_ascii_case(name))
     }
 
-    /// Fails if a page of another server asks, or under a foreign name.
-    fn check_origin(&self, headers: &HeaderMap) -> Result<(), OpError> {
+    /// Fails if a page of another server asks, or under a foreign name. A viewer of another server
+    /// with the token may connect, because it only reads.
+    fn check_origin(&self, headers: &HeaderMap, address: &Uri) -> Result<(), OpError> {
         let text = |name| headers.get(name).map(|value: &HeaderValue| value.to_str());
         let host = match text(header::HOST) {
             Some(Ok(host)) if self.is_own_host(host) => host,
@@ -203,14 +213,16 @@ impl Http {
             Some(Ok(origin)) => origin.strip_prefix("http://") == Some(host),
             Some(Err(_)) => false,
         };
-        own.then_some(())
+        let viewer = foxglove::is_asked_for(headers, address) && self.has_token_in(address);
+        (own || viewer)
+            .then_some(())
             .ok_or_else(|| OpError::new(ErrorCode::WrongOrigin, "the page is of another server"))
     }
 }
 
 /// Refuses foreign pages, and adds the headers that every answer has.
 async fn guard(State(http): Shared, request: HttpRequest, next: Next) -> Response {
-    let mut response = match http.check_origin(request.headers()) {
+    let mut response = match http.check_origin(request.headers(), request.uri()) {
         Ok(()) => next.run(request).await,
         Err(error) => refusal(&error),
     };
@@ -229,7 +241,7 @@ async fn guard(State(http): Shared, request: HttpRequest, next: Next) -> Respons
     response
 }
 
-fn refusal(error: &OpError) -> Response {
+pub(crate) fn refusal(error: &OpError) -> Response {
     respond(error.answer(), error.code.status())
 }
 
@@ -390,14 +402,18 @@ fn download(name: &str, kind: &'static str, body: Body) -> Response {
     (headers, body).into_response()
 }
 
+/// Makes a file of the words of rows between two times.
+type Export = fn(&Hub, &[usize], [u64; 2]) -> Result<Vec<u8>, OpError>;
+
 async fn export_csv(
     State(http): Shared,
     headers: HeaderMap,
     Query(range): Query<Range>,
 ) -> Response {
-    export(&http, &headers, &range, |rows, machine| {
-        let body = Body::from(export::csv(rows));
-        download(&format!("{machine}.csv"), "text/csv; charset=utf-8", body)
+    let kind = "text/csv; charset=utf-8";
+    export(&http, &headers, &range, "csv", kind, |hub, words, times| {
+        let rows = export::Rows::read(&hub.samples, words, times)?;
+        Ok(export::csv(&rows).into_bytes())
     })
     .await
 }
@@ -407,18 +423,14 @@ async fn export_mcap(
     headers: HeaderMap,
     Query(range): Query<Range>,
 ) -> Response {
+    let kind = "application/octet-stream";
     export(
         &http,
         &headers,
         &range,
-        |rows, machine| match export::mcap(rows) {
-            Ok(bytes) => download(
-                &format!("{machine}.mcap"),
-                "application/octet-stream",
-                Body::from(bytes),
-            ),
-            Err(error) => refusal(&OpError::new(ErrorCode::Failed, error.to_string())),
-        },
+        "mcap",
+        kind,
+        |hub, words, times| export::mcap(&hub.samples, &hub.topics, words, times),
     )
     .await
 }
@@ -427,7 +439,9 @@ async fn export(
     http: &Arc<Http>,
     headers: &HeaderMap,
     range: &Range,
-    make: fn(&export::Rows, &str) -> Response,
+    extension: &str,
+    kind: &'static str,
+    make: Export,
 ) -> Response {
     let words = match range.words(http, headers) {
         Ok(words) => words,
@@ -435,22 +449,12 @@ async fn export(
     };
     let times = [range.from_ns.unwrap_or(0), range.to_ns.unwrap_or(u64::MAX)];
     let hub = Arc::clone(&http.hub);
-    let name = hub
-        .machine
-        .path
-        .file_stem()
-        .map(|name| name.to_string_lossy().into_owned());
-    let work = move || {
-        let rows = match export::Rows::read(&hub.samples, &words, times) {
-            Ok(rows) => rows,
-            Err(error) => return refusal(&error),
-        };
-        let name: String = name.unwrap_or_default();
-        let plain = |c: &char| c.is_ascii_alphanumeric() || *c == '-' || *c == '_';
-        make(&rows, &name.chars().filter(plain).collect::<String>())
-    };
-    match tokio::task::spawn_blocking(work).await {
-        Ok(response) => response,
+    let name = hub.machine.path.file_stem().unwrap_or_default();
+    let plain = |c: &char| c.is_ascii_alphanumeric() || *c == '-' || *c == '_';
+    let name: String = name.to_string_lossy().chars().filter(plain).collect();
+    match tokio::task::spawn_blocking(move || make(&hub, &words, times)).await {
+        Ok(Ok(bytes)) => download(&format!("{name}.{extension}"), kind, Body::from(bytes)),
+        Ok(Err(error)) => refusal(&error),
         Err(error) => refusal(&OpError::new(ErrorCode::Failed, error.to_string())),
     }
 }
@@ -520,70 +524,4 @@ fn pieces(file: std::fs::File) -> impl futures_util::Stream<Item = std::io::Resu
             .await
             .map_err(std::io::Error::other)?
     })
-}
-
-async fn websocket(State(http): Shared, headers: HeaderMap, upgrade: WebSocketUpgrade) -> Response {
-    let read_only = (!http.options.control).then(read_only);
-    let refusal = match http.has_token(&headers) {
-        true => read_only.clone(),
-        false => http.without_token.refusal(),
-    };
-    let blind = !http.is_loopback() && !http.has_token(&headers);
-    let client = Client::new(Arc::clone(&http.hub), "websocket", refusal, false);
-    client.set_blind(blind);
-    let token = Some((Arc::clone(&http.token), read_only));
-    upgrade
-        .max_message_size(LINE)
-        .max_frame_size(LINE)
-        .on_upgrade(move |socket| serve_websocket(socket, Arc::new(client), token))
-}
-
-async fn serve_websocket(
-    socket: WebSocket,
-    client: Arc<Client>,
-    token: Option<(Arc<str>, Option<OpError>)>,
-) {
-    let (id, hub) = (client.id, Arc::clone(&client.hub));
-    hub.event(json!({"event": "client", "client": id, "connected": true}));
-    let (connection, mut outgoing) = Connection::start(Arc::clone(&client), token);
-    let (mut sink, mut stream) = socket.split();
-    let read = async {
-        loop {
-            match stream.next().await {
-                Some(Ok(Message::Text(text))) => connection.take(text.as_bytes()).await,
-                Some(Ok(Message::Binary(_))) => {
-                    let error = OpError::new(ErrorCode::BadRequest, "requests are text frames");
-                    connection.refuse(error).await;
-                }
-                Some(Ok(Message::Ping(_) | Message::Pong(_))) => {}
-                Some(Ok(Message::Close(_)) | Err(_)) | None => return,
-            }
-        }
-    };
-    let write = async {
-        let mut ping = tokio::time::interval(PING);
-        loop {
-            let frame = tokio::select! {
-                message = outgoing.recv() => match message {
-                    Some(Outgoing::Answer(Answer { body, .. }) | Outgoing::Object(body)) => {
-                        Message::Text(serde_json::to_string(&body).unwrap_or_default().into())
-                    }
-                    Some(Outgoing::Samples(batch)) => Message::Binary(batch.frame().into()),
-                    None => return,
-                },
-                _ = ping.tick() => Message::Ping(Bytes::new()),
-            };
-            if sink.send(frame).await.is_err() {
-                return;
-            }
-        }
-    };
-    // Apart, so that a reader whose answers wait does not wait for itself.
-    tokio::select! {
-        () = read => {}
-        () = write => {}
-    }
-    drop(connection);
-    client.leave();
-    hub.event(json!({"event": "client", "client": id, "connected": false}));
 }

@@ -8,7 +8,7 @@ use std::pin::Pin;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use ecaxis_axis::setpoint::StreamConfig;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
@@ -17,6 +17,7 @@ use ecaxis_master::config::{Machine, OutputRef, Signal};
 use ecaxis_master::mailbox::Mailboxes;
 use ecaxis_master::post_mortem::FaultReport;
 use ecaxis_master::report::{DevicePlace, Error};
+use ecaxis_master::ros2::topics::Topics;
 use ecaxis_master::rt::channel::Snapshot;
 use ecaxis_master::samples::Samples;
 use ecaxis_master::supervise::operator::{AxisActivity, ProgramRequest, ProgramStatus, Request};
@@ -172,6 +173,8 @@ pub struct Hub {
     pub outputs: Vec<(OutputRef, Signal)>,
     pub samples: Samples,
     pub sampler: Sampler,
+    /// The topics for viewers.
+    pub topics: Arc<Topics>,
     pub options: HubOptions,
     pub area: Arc<AreaCounters>,
     inner: Mutex<Inner>,
@@ -180,6 +183,17 @@ pub struct Hub {
     events: broadcast::Sender<Arc<Event>>,
     bus: watch::Sender<BusStatus>,
     time: watch::Sender<Nanos>,
+}
+
+/// Returns the time in ns since 1970 at which the clock of the samples was 0. Virtual time begins
+/// in 1970.
+fn epoch(virtual_time: bool) -> Nanos {
+    if virtual_time {
+        return 0;
+    }
+    let unix = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    let unix = unix.map_or(0, |unix| u64::try_from(unix.as_nanos()).unwrap_or(u64::MAX));
+    unix.saturating_sub(clock::now())
 }
 
 impl Hub {
@@ -199,6 +213,7 @@ impl Hub {
         };
         Self {
             sampler: Sampler::new(samples.layout().signals.len(), machine.bus.cycle_ns),
+            topics: Arc::new(Topics::new(&machine, epoch(options.virtual_time))),
             machine: Arc::new(machine),
             inner: Mutex::new(Inner {
                 lease: Lease::default(),

@@ -6,16 +6,21 @@
 //! - [`external`]: set-points of clients in the cycle;
 //! - [`lease`]: who owns the motion;
 //! - [`command`], [`error`]: the protocol;
-//! - [`sampler`]: history and distribution of times.
+//! - [`sampler`]: history and distribution of times;
+//! - [`recorder`]: every cycle to an MCAP file;
+//! - [`foxglove`]: the Foxglove WebSocket protocol, for viewers;
+//! - [`diagnostics`]: the state as ROS diagnostics.
 
 #![deny(unsafe_code)]
 
 pub mod client;
 pub mod command;
 pub mod connection;
+pub mod diagnostics;
 pub mod error;
 pub mod export;
 pub mod external;
+pub mod foxglove;
 pub mod http;
 pub mod hub;
 pub mod lease;
@@ -24,7 +29,9 @@ pub mod metrics;
 pub mod openapi;
 pub mod operator;
 pub mod page;
+pub mod recorder;
 pub mod sampler;
 pub mod serve;
 pub mod socket;
 pub mod state;
+pub mod websocket;

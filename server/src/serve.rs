@@ -21,6 +21,7 @@ use serde_json::{Map, Value};
 use crate::http::{HttpOptions, HttpServer};
 use crate::hub::{BusState, Describe, Hub, HubOptions};
 use crate::machine::keep_up;
+use crate::recorder::{RecordError, Recorder};
 use crate::socket::Socket;
 
 /// The period at which samples are taken over, and at which the end is noticed.
@@ -42,6 +43,8 @@ pub struct ServerOptions {
     pub keep_ns: Nanos,
     /// Receives the commands of all clients.
     pub change_log: Option<ChangeLog>,
+    /// The MCAP file to which every cycle is recorded.
+    pub record: Option<PathBuf>,
 }
 
 /// The addresses at which the server listens.
@@ -66,6 +69,8 @@ pub enum ServeError {
     Memory(#[source] io::Error),
     #[error("starting a thread: {0}")]
     Thread(#[source] io::Error),
+    #[error(transparent)]
+    Record(#[from] RecordError),
 }
 
 /// The service manager that has started the server, if one has: sd_notify(3).
@@ -141,7 +146,7 @@ pub fn new_token() -> io::Result<String> {
 /// Serves the machine until `stop` is cancelled. Blocks.
 ///
 /// # Errors
-/// Fails if the server cannot listen. A failure of the machine is reported to the clients instead.
+/// Fails if the server cannot listen, or the recording failed. A failure of the machine is reported to the clients instead.
 pub fn serve(
     mut machine: Machine,
     run: Options,
@@ -171,6 +176,8 @@ pub fn serve(
         socket: options.socket.map(|(path, _)| path),
         url: http.as_ref().map(HttpServer::url),
     });
+    let record = options.record;
+    let recorder = record.map(|path| Recorder::start(path, &hub)).transpose()?;
     let keeper = {
         let (hub, stop) = (Arc::clone(&hub), Arc::clone(stop));
         let work = move || keep_up(&hub, &run, &stop, &describe);
@@ -213,9 +220,11 @@ pub fn serve(
     hub.shut_down();
     let kept = keeper.join();
     let _ = sampler.join();
+    // After the last cycle.
+    let recorded = recorder.map_or(Ok(()), Recorder::finish);
     runtime.shutdown_timeout(Duration::from_secs(1));
     match kept {
-        Ok(()) => Ok(()),
+        Ok(()) => Ok(recorded?),
         Err(panic) => std::panic::resume_unwind(panic),
     }
 }

@@ -15,6 +15,7 @@ use ecaxis_server::serve::{ServeError, ServerOptions, new_token, serve};
 
 use crate::access::signals;
 use crate::args::Verbosity;
+use crate::args::files::{Inputs, check_output};
 use crate::hints::{self, Failure};
 use crate::render::note;
 use crate::verbs::run;
@@ -25,6 +26,7 @@ Examples:
   ecaxis serve m.toml --http 127.0.0.1:8080      the page, read only
   ecaxis serve m.toml --sim --http 127.0.0.1:0 --control
                                                  the page, with commands
+  ecaxis serve m.toml --record run.mcap          every cycle for other viewers
   ecaxis serve m.toml --sim --virtual --socket t.sock
                                                  for tests: time advances on
                                                  request
@@ -77,6 +79,12 @@ pub(crate) struct Args {
     /// Folder with the recordings that the page lists
     #[arg(long, value_name = "FOLDER", requires = "http")]
     recordings: Option<PathBuf>,
+    /// Record every cycle to this MCAP file
+    #[arg(long, value_name = "FILE.mcap")]
+    record: Option<PathBuf>,
+    /// Overwrite an existing recording
+    #[arg(long, requires = "record")]
+    force: bool,
     /// Keep the samples of every cycle for this time
     #[arg(long, value_name = "DURATION", default_value = "60s", value_parser = duration::parse)]
     keep: u64,
@@ -110,12 +118,19 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let faults = script
         .map(|path| run::faults(path, &machine, None))
         .transpose()?;
+    if let Some(path) = &args.record {
+        let inputs = Inputs::from_machine(&machine)
+            .with("the fault script", script)
+            .with("the file with the token", &args.token_file);
+        check_output("--record", path, args.force, &inputs)?;
+    }
     let http = args.http.map(|address| http(args, address)).transpose()?;
     let options = ServerOptions {
         socket: Some((socket(args)?, args.socket_mode)),
         http,
         keep_ns: args.keep,
         change_log: ChangeLog::of_environment(),
+        record: args.record.clone(),
     };
     let defaults = Options::default();
     let run_options = Options {
@@ -159,8 +174,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             ServeError::Http { .. } => "name another address with --http, or port 0",
             ServeError::Memory(_) => "keep fewer samples with --keep",
             ServeError::Thread(_) => "end other programs",
+            ServeError::Record(_) => "name a file with --record on a disk with enough space",
         };
-        Failure::new(hints::WRONG, error.to_string()).hint(hint)
+        let code = match &error {
+            ServeError::Record(_) => hints::FAILED,
+            _ => hints::WRONG,
+        };
+        Failure::new(code, error.to_string()).hint(hint)
     })
 }
 

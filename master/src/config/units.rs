@@ -52,3 +52,24 @@ pub(crate) fn unit(given: Option<&Spanned<String>>, p: &mut Problems<'_>) -> Opt
 pub(crate) fn is_turn(unit: &str) -> bool {
     TURNS.contains(&unit)
 }
+
+/// Returns the metres or radians in one unit; `None` for units of neither.
+pub(crate) fn si_factor(unit: &str) -> Option<f64> {
+    use std::f64::consts::{PI, TAU};
+    Some(match unit {
+        "m" => 1.0,
+        "cm" => 1e-2,
+        "mm" => 1e-3,
+        "um" | "µm" => 1e-6,
+        "nm" => 1e-9,
+        "in" | "inch" => 0.0254,
+        "ft" => 0.3048,
+        "rad" => 1.0,
+        "mrad" => 1e-3,
+        "deg" | "°" => PI / 180.0,
+        "arcmin" => PI / (180.0 * 60.0),
+        "arcsec" => PI / (180.0 * 3600.0),
+        unit if is_turn(unit) => TAU,
+        _ => return None,
+    })
+}

@@ -53,6 +53,15 @@ impl Server {
         Self::start(machine, options, None)
     }
 
+    /// Like [`Server::in_virtual_time`], with a recording.
+    pub fn with_recording(machine: Machine) -> Self {
+        let options = Options {
+            clock: Clock::Virtual,
+            ..Options::default()
+        };
+        Self::start_recording(machine, options, None, true)
+    }
+
     pub fn in_real_time(machine: Machine) -> Self {
         Self::start(machine, Options::default(), None)
     }
@@ -70,6 +79,15 @@ impl Server {
     }
 
     pub fn start(machine: Machine, run: Options, http: Option<HttpOptions>) -> Self {
+        Self::start_recording(machine, run, http, false)
+    }
+
+    fn start_recording(
+        machine: Machine,
+        run: Options,
+        http: Option<HttpOptions>,
+        record: bool,
+    ) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let stop = Arc::<CancelToken>::default();
         let options = ServerOptions {
@@ -77,6 +95,7 @@ impl Server {
             http,
             keep_ns: 10_000_000_000,
             change_log: Some(ChangeLog::new(folder.path().join("changes.jsonl"))),
+            record: record.then(|| folder.path().join("run.mcap")),
         };
         let (ready, listening) = std::sync::mpsc::channel::<Listening>();
         let cancel = Arc::clone(&stop);
@@ -93,6 +112,22 @@ impl Server {
             stop,
             thread: Some(thread),
             url: listening.url,
+        }
+    }
+
+    /// Ends the server. Returns its recording.
+    pub fn recorded(mut self) -> Vec<u8> {
+        self.end();
+        std::fs::read(self.folder.path().join("run.mcap")).unwrap()
+    }
+
+    fn end(&mut self) {
+        self.stop.cancel();
+        let ended = self.thread.take().map(JoinHandle::join);
+        if !std::thread::panicking()
+            && let Some(ended) = ended
+        {
+            ended.expect("no panic").expect("the server ends");
         }
     }
 
@@ -127,11 +162,7 @@ impl Server {
 
 impl Drop for Server {
     fn drop(&mut self) {
-        self.stop.cancel();
-        let ended = self.thread.take().map(JoinHandle::join);
-        if !std::thread::panicking() {
-            ended.unwrap().expect("no panic").expect("the server ends");
-        }
+        self.end();
     }
 }
 

@@ -9,97 +9,24 @@ use serde_json::{Value, json};
 use crate::area::{Area, attach};
 use crate::fuzz::{Random, mutated};
 use crate::harness::{Client, Server, TOKEN, demo};
+use crate::websocket::{address, frame, read_frame, tcp, websocket};
 
 /// Returns the number in an environment variable.
-fn count(name: &str, default: u64) -> u64 {
+pub fn count(name: &str, default: u64) -> u64 {
     let value = std::env::var(name).ok();
     value.and_then(|n| n.parse().ok()).unwrap_or(default)
 }
 
 /// The resident memory of this process in bytes (proc(5)).
-fn resident() -> u64 {
+pub fn resident() -> u64 {
     let statm = std::fs::read_to_string("/proc/self/statm").unwrap();
     let pages: u64 = statm.split(' ').nth(1).unwrap().parse().unwrap();
     pages * 4096
 }
 
-fn address(server: &Server) -> String {
-    let url = server.url.as_ref().unwrap();
-    let rest = url.strip_prefix("http://").unwrap();
-    rest.split('/').next().unwrap().to_owned()
-}
-
-fn tcp(server: &Server) -> TcpStream {
-    let stream = TcpStream::connect(address(server)).unwrap();
-    let timeout = Some(Duration::from_secs(20));
-    stream.set_read_timeout(timeout).unwrap();
-    stream.set_write_timeout(timeout).unwrap();
-    stream
-}
-
-/// Opens a WebSocket that may command (RFC 6455).
-fn websocket(server: &Server) -> TcpStream {
-    let mut stream = tcp(server);
-    let host = address(server);
-    let request = format!(
-        "GET /api/ws HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
-         Authorization: Bearer {TOKEN}\r\n\
-         Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
-    );
-    stream.write_all(request.as_bytes()).unwrap();
-    let mut head = Vec::new();
-    while !head.ends_with(b"\r\n\r\n") {
-        let mut byte = [0];
-        stream.read_exact(&mut byte).unwrap();
-        head.push(byte[0]);
-    }
-    assert!(head.starts_with(b"HTTP/1.1 101"), "{head:?}");
-    stream
-}
-
-/// A frame of a client with the mask 0 (RFC 6455, 5.2).
-fn frame(opcode: u8, payload: &[u8]) -> Vec<u8> {
-    let mut frame = vec![0x80 | opcode];
-    match u16::try_from(payload.len()) {
-        Ok(short @ 0..126) => frame.push(0x80 | u8::try_from(short).unwrap()),
-        Ok(length) => {
-            frame.push(0x80 | 126);
-            frame.extend(length.to_be_bytes());
-        }
-        Err(_) => {
-            frame.push(0x80 | 127);
-            frame.extend((payload.len() as u64).to_be_bytes());
-        }
-    }
-    frame.extend([0; 4]);
-    frame.extend(payload);
-    frame
-}
-
 /// Reads frames until one has this text.
 fn read_until(stream: &mut TcpStream, text: &str) {
-    loop {
-        let mut head = [0; 2];
-        stream.read_exact(&mut head).unwrap();
-        let length = match head[1] & 0x7f {
-            126 => {
-                let mut long = [0; 2];
-                stream.read_exact(&mut long).unwrap();
-                u64::from(u16::from_be_bytes(long))
-            }
-            127 => {
-                let mut long = [0; 8];
-                stream.read_exact(&mut long).unwrap();
-                u64::from_be_bytes(long)
-            }
-            short => u64::from(short),
-        };
-        let mut payload = vec![0; usize::try_from(length).unwrap()];
-        stream.read_exact(&mut payload).unwrap();
-        if String::from_utf8_lossy(&payload).contains(text) {
-            return;
-        }
-    }
+    while !String::from_utf8_lossy(&read_frame(stream).1).contains(text) {}
 }
 
 /// More requests than messages wait, before the first answer is read: the server must not wait for
@@ -137,7 +64,7 @@ const REQUESTS: &[&str] = &[
 ];
 
 /// Changes some bytes, or cuts the end.
-fn damage(random: &mut Random, bytes: &mut Vec<u8>) {
+pub fn damage(random: &mut Random, bytes: &mut Vec<u8>) {
     for _ in 0..random.below(4) {
         let at = random.below(bytes.len());
         match random.below(4) {

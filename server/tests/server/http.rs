@@ -7,10 +7,10 @@ use serde_json::{Value, json};
 
 use crate::harness::{Server, TOKEN, demo};
 
-struct Reply {
-    status: u16,
+pub struct Reply {
+    pub status: u16,
     head: String,
-    body: Vec<u8>,
+    pub body: Vec<u8>,
 }
 
 impl Reply {
@@ -19,7 +19,7 @@ impl Reply {
     }
 }
 
-fn request(
+pub fn request(
     server: &Server,
     method: &str,
     path: &str,

@@ -19,6 +19,7 @@ pub mod machines;
 pub mod mailbox;
 pub mod program;
 pub mod recordings;
+pub mod ros2;
 pub mod script;
 pub mod wire;
 

@@ -1,0 +1,88 @@
+//! The WebSocket of the page: requests, answers, events, states and samples.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::body::Bytes;
+use axum::extract::State;
+use axum::extract::ws::{Message, WebSocket, WebSocketUpgrade};
+use axum::http::HeaderMap;
+use axum::response::Response;
+use futures_util::{SinkExt, StreamExt};
+use serde_json::json;
+
+use crate::client::{Answer, Client};
+use crate::connection::{Connection, Outgoing};
+use crate::error::{ErrorCode, OpError};
+use crate::http::{Shared, read_only};
+use crate::socket::LINE;
+
+/// The silence after which a WebSocket client is asked for a sign of life.
+pub const PING: Duration = Duration::from_secs(10);
+
+/// Connects a client.
+pub async fn upgrade(
+    State(http): Shared,
+    headers: HeaderMap,
+    upgrade: WebSocketUpgrade,
+) -> Response {
+    let read_only = (!http.options.control).then(read_only);
+    let refusal = match http.has_token(&headers) {
+        true => read_only.clone(),
+        false => http.without_token.refusal(),
+    };
+    let blind = !http.is_loopback() && !http.has_token(&headers);
+    let client = Client::new(Arc::clone(&http.hub), "websocket", refusal, false);
+    client.set_blind(blind);
+    let token = Some((Arc::clone(&http.token), read_only));
+    upgrade
+        .max_message_size(LINE)
+        .max_frame_size(LINE)
+        .on_upgrade(move |socket| serve(socket, Arc::new(client), token))
+}
+
+async fn serve(socket: WebSocket, client: Arc<Client>, token: Option<(Arc<str>, Option<OpError>)>) {
+    let (id, hub) = (client.id, Arc::clone(&client.hub));
+    hub.event(json!({"event": "client", "client": id, "connected": true}));
+    let (connection, mut outgoing) = Connection::start(Arc::clone(&client), token);
+    let (mut sink, mut stream) = socket.split();
+    let read = async {
+        loop {
+            match stream.next().await {
+                Some(Ok(Message::Text(text))) => connection.take(text.as_bytes()).await,
+                Some(Ok(Message::Binary(_))) => {
+                    let error = OpError::new(ErrorCode::BadRequest, "requests are text frames");
+                    connection.refuse(error).await;
+                }
+                Some(Ok(Message::Ping(_) | Message::Pong(_))) => {}
+                Some(Ok(Message::Close(_)) | Err(_)) | None => return,
+            }
+        }
+    };
+    let write = async {
+        let mut ping = tokio::time::interval(PING);
+        loop {
+            let frame = tokio::select! {
+                message = outgoing.recv() => match message {
+                    Some(Outgoing::Answer(Answer { body, .. }) | Outgoing::Object(body)) => {
+                        Message::Text(serde_json::to_string(&body).unwrap_or_default().into())
+                    }
+                    Some(Outgoing::Samples(batch)) => Message::Binary(batch.frame().into()),
+                    None => return,
+                },
+                _ = ping.tick() => Message::Ping(Bytes::new()),
+            };
+            if sink.send(frame).await.is_err() {
+                return;
+            }
+        }
+    };
+    // Apart, so that a reader whose answers wait does not wait for itself.
+    tokio::select! {
+        () = read => {}
+        () = write => {}
+    }
+    drop(connection);
+    client.leave();
+    hub.event(json!({"event": "client", "client": id, "connected": false}));
+}
