@@ -6,6 +6,7 @@
 mod absences;
 mod al_status;
 mod hostile;
+mod mcap;
 mod replay;
 mod tshark;
 

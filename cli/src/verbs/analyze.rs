@@ -1,10 +1,16 @@
 //! `ecaxis analyze`: reports on a recording as text, JSON, or HTML with plots of the axes.
 
+use std::fs::File;
+use std::io::BufWriter;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
+use ecaxis_master::config::Machine;
+use ecaxis_master::ros2::mcap::{McapError, McapFile};
+use ecaxis_master::ros2::topics::{Source, Topics};
 use ecaxis_master::text::pluralize;
 use ecaxis_master::{config, recording};
-use ecaxis_tools::analyze::{self as analysis, Context, DeviceReport, Report, called};
+use ecaxis_tools::analyze::{self as analysis, Context, DeviceReport, Report, RowSink, called};
 
 use crate::args::files::{Inputs, check_output, unwritable};
 use crate::hints::{self, Failure};
@@ -16,6 +22,8 @@ Examples:
   ecaxis analyze run.pcapng --all                  every event and transfer
   ecaxis analyze run.pcapng --machine m.toml       with its names and units
   ecaxis analyze run.pcapng --html report.html     with pictures of each axis
+  ecaxis analyze run.pcapng --machine m.toml --mcap run.mcap
+                                                   every cycle for viewers
   ecaxis analyze other.pcap --esi esi/ --json      from any MainDevice, as JSON
   ecaxis analyze night.pcapng night.0*.pcapng      parts of one recording
 
@@ -48,20 +56,30 @@ pub(crate) struct Args {
     /// Write an HTML report with plots of the axes to this file
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
-    /// Overwrite an existing report
+    /// Write the values of every cycle to this MCAP file, for Foxglove or PlotJuggler
+    #[arg(long, value_name = "FILE.mcap", requires = "machine")]
+    mcap: Option<PathBuf>,
+    /// Overwrite existing output files
     #[arg(long)]
     force: bool,
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    if let Some(path) = &args.html {
-        let inputs = Inputs::default()
+    let inputs = || {
+        Inputs::default()
             .with("a recording to read", &args.files)
             .with("the machine file", &args.machine)
-            .with("the ESI file", &args.esi);
-        check_output("--html", path, args.force, &inputs)?;
+            .with("the ESI file", &args.esi)
+    };
+    if let Some(path) = &args.html {
+        check_output("--html", path, args.force, &inputs())?;
     }
-    let (known, expected) = known(args)?;
+    if let Some(path) = &args.mcap {
+        let inputs = inputs().with("the file of --html", &args.html);
+        check_output("--mcap", path, args.force, &inputs)?;
+    }
+    let machine = machine(args)?;
+    let known = known(args, machine.as_ref())?;
     let mut parts = Vec::new();
     for path in &args.files {
         let mut reader = recording::open(path).map_err(|e| {
@@ -80,11 +98,25 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         .to_string_lossy()
         .into_owned();
     let readers = parts.into_iter().map(|(_, reader, _)| reader).collect();
-    let report = analysis::analyze(readers, args.interface, known);
-    if let Some((file, names)) = &expected
-        && let Some(odd) = other_machine(names, &report.devices)
+    let mut output = mcap_output(args, machine.as_ref())?;
+    let mut take = |row: &[u64], missed| {
+        if let Some(output) = &mut output {
+            output.take(row, missed);
+        }
+    };
+    let sink = machine.as_ref().filter(|_| args.mcap.is_some());
+    let sink = sink.map(|machine| RowSink {
+        machine,
+        take: &mut take,
+    });
+    let report = analysis::analyze_rows(readers, args.interface, known, sink);
+    if let Some(machine) = &machine
+        && let Some(odd) = other_machine(machine, &report.devices)
     {
-        note(&format!("note: {}: {odd}", file.display()));
+        note(&format!("note: {}: {odd}", machine.path.display()));
+    }
+    if let Some(output) = output {
+        output.finish()?;
     }
     let advice = advice(&report);
     if let Some(path) = &args.html {
@@ -122,15 +154,66 @@ fn advice(report: &Report) -> Vec<String> {
     devices.flat_map(of_device).collect()
 }
 
-/// A machine file and the names of its devices.
-type Expected<'a> = (&'a Path, Vec<String>);
+/// The MCAP file with the values of every cycle.
+struct McapOutput<'a> {
+    path: &'a Path,
+    rows: u64,
+    /// The first error ends the file.
+    file: Result<McapFile<BufWriter<File>>, McapError>,
+}
+
+impl McapOutput<'_> {
+    fn take(&mut self, row: &[u64], missed: u64) {
+        if let Ok(file) = &mut self.file {
+            file.miss(missed);
+            self.rows += 1;
+            if let Err(error) = file.write_row(row) {
+                self.file = Err(error);
+            }
+        }
+    }
+
+    fn finish(self) -> Result<(), Failure> {
+        let finish = || -> Result<(), McapError> {
+            let file = self.file?.finish()?.into_inner();
+            file.map_err(std::io::IntoInnerError::into_error)?;
+            Ok(())
+        };
+        finish().map_err(|error| unwritable(self.path, &std::io::Error::other(error)))?;
+        let cycles = pluralize(usize::try_from(self.rows).unwrap_or(usize::MAX), "cycle");
+        note(&format!("written: {}, {cycles}", self.path.display()));
+        Ok(())
+    }
+}
+
+/// Begins the MCAP file, if one is wanted. A recording has no diagnostics, and inputs are not
+/// decoded.
+fn mcap_output<'a>(
+    args: &'a Args,
+    machine: Option<&Machine>,
+) -> Result<Option<McapOutput<'a>>, Failure> {
+    let (Some(path), Some(machine)) = (&args.mcap, machine) else {
+        return Ok(None);
+    };
+    let file = File::create(path).map_err(|error| unwritable(path, &error))?;
+    let topics = Arc::new(Topics::new(machine, 0));
+    let wanted = |source| !matches!(source, Source::Diagnostics | Source::Inputs);
+    let file = McapFile::new(BufWriter::new(file), topics, wanted);
+    Ok(Some(McapOutput {
+        path,
+        rows: 0,
+        file,
+    }))
+}
 
 /// Returns a warning if the machine file does not match the recorded machine. Devices get names
 /// only if position and product match.
-fn other_machine(names: &[String], devices: &[DeviceReport]) -> Option<String> {
+fn other_machine(machine: &Machine, devices: &[DeviceReport]) -> Option<String> {
+    let names = machine.devices.iter().map(|device| &device.name);
+    let names: Vec<_> = names.collect();
     let known = |device: &&DeviceReport| {
         let name = device.name.as_ref();
-        name.is_some_and(|name| names.contains(name))
+        name.is_some_and(|name| names.contains(&name))
     };
     let fitting = devices.iter().filter(known).count();
     if fitting == devices.len() && fitting == names.len() {
@@ -143,19 +226,21 @@ fn other_machine(names: &[String], devices: &[DeviceReport]) -> Option<String> {
     ))
 }
 
-fn known(args: &Args) -> Result<(Context, Option<Expected<'_>>), Failure> {
+/// Returns the machine of `--machine`.
+fn machine(args: &Args) -> Result<Option<Machine>, Failure> {
+    let load = |file: &PathBuf| config::load(file).map_err(|e| hints::config(file, &e));
+    args.machine.as_ref().map(load).transpose()
+}
+
+fn known(args: &Args, machine: Option<&Machine>) -> Result<Context, Failure> {
     let mut known = Context::default();
-    let mut expected = None;
-    if let Some(file) = &args.machine {
-        let machine = config::load(file).map_err(|e| hints::config(file, &e))?;
-        known = known.with_machine(&machine);
-        let names = machine.devices.iter().map(|device| device.name.clone());
-        expected = Some((file.as_path(), names.collect()));
+    if let Some(machine) = machine {
+        known = known.with_machine(machine);
     }
     if let Some(path) = &args.esi {
         let library = analysis::library(path)
             .map_err(|e| Failure::new(hints::WRONG, format!("--esi: {e}")))?;
         known = known.with_library(library);
     }
-    Ok((known, expected))
+    Ok(known)
 }

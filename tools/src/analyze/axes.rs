@@ -7,6 +7,7 @@ use super::events::EventKind;
 use super::match_frames::DatagramExchange;
 use super::objects::{Mapped, Objects};
 use super::registers::Registers;
+use super::rows::Rows;
 
 /// The maximum number of points per curve; twice as many are merged in pairs.
 const POINTS: usize = 1500;
@@ -102,6 +103,8 @@ impl Curve {
 pub struct Axis {
     /// 0 is the axis at 0x6000.
     pub number: u8,
+    /// The axis in the machine file.
+    pub index: Option<usize>,
     pub cycles: u64,
     pub state: Option<State>,
     /// The states and their start times.
@@ -221,6 +224,7 @@ impl Axes {
     pub fn process_data(
         &mut self,
         passed: &DatagramExchange<'_>,
+        rows: &mut Option<Rows>,
         mut report: impl FnMut(EventKind),
     ) {
         let start = u64::from(passed.address) * 8;
@@ -241,6 +245,10 @@ impl Axes {
                 *target = Some(value.1);
             }
             axis.takes(place.signal, passed.at, value, &mut report);
+            let hidden = place.signal == Signal::Mode && axis.shows_mode;
+            if let (Some(rows), Some(index), false) = (rows.as_mut(), axis.index, hidden) {
+                rows.take(index, place.signal, value);
+            }
             if place.signal == Signal::ActualPosition
                 && let Some(Some(target)) = targets.get(place.axis)
             {

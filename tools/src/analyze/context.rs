@@ -16,8 +16,8 @@ struct Expected {
     name: String,
     product: u32,
     layout: Arc<Layout>,
-    /// The axes: number in the drive, scale, unit.
-    axes: Vec<(u16, (Scale, String))>,
+    /// The axes: number in the drive, index in the machine, scale, unit.
+    axes: Vec<(u16, usize, (Scale, String))>,
 }
 
 /// Names, layouts and units that a recording does not contain.
@@ -46,8 +46,9 @@ impl Context {
             axes: machine
                 .axes
                 .iter()
-                .filter(|axis| machine.devices[axis.device].name == device.name)
-                .map(|axis| (axis.number, (axis.config.scale, axis.unit.clone())))
+                .enumerate()
+                .filter(|(_, axis)| machine.devices[axis.device].name == device.name)
+                .map(|(n, axis)| (axis.number, n, (axis.config.scale, axis.unit.clone())))
                 .collect(),
         };
         self.expected = bus_order(&machine.devices).iter().map(of).collect();
@@ -85,8 +86,21 @@ impl Context {
         number: usize,
     ) -> Option<&(Scale, String)> {
         let axes = &self.expected(position, product)?.axes;
-        let own = axes.iter().find(|(own, _)| usize::from(*own) == number);
-        own.map(|(_, units)| units)
+        let own = axes.iter().find(|(own, ..)| usize::from(*own) == number);
+        own.map(|(.., units)| units)
+    }
+
+    /// Returns the index of an axis of a drive in the machine file.
+    #[must_use]
+    pub fn axis_index(
+        &self,
+        position: Option<u16>,
+        product: Option<u32>,
+        number: usize,
+    ) -> Option<usize> {
+        let axes = &self.expected(position, product)?.axes;
+        let own = axes.iter().find(|(own, ..)| usize::from(*own) == number);
+        own.map(|(_, index, _)| *index)
     }
 
     fn described(&mut self, vendor: u32, product: u32, revision: u32) -> Option<&Described> {

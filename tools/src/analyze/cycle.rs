@@ -19,6 +19,12 @@ const PAUSE_NS: u64 = 10_000_000_000;
 /// The identity of process data: command, logical address, length in bytes.
 pub type Key = (Command, u32, usize);
 
+/// Returns the identity of a datagram with process data.
+pub fn key(passed: &DatagramExchange<'_>) -> Key {
+    let len = passed.sent.or(passed.back).map_or(0, <[u8]>::len);
+    (passed.command, passed.address, len)
+}
+
 /// Consecutive cycles with the same working counter; `None`: no answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Run {
@@ -102,9 +108,7 @@ impl Cycle {
     /// Processes a logical datagram. `open`: its answer may have arrived after the end of the
     /// recording. Returns true if the working counter is the highest so far. Otherwise some inputs
     /// still have their transmitted values.
-    pub fn passed(&mut self, passed: &DatagramExchange<'_>, open: bool) -> bool {
-        let len = passed.sent.or(passed.back).map_or(0, <[u8]>::len);
-        let key = (passed.command, passed.address, len);
+    pub fn passed(&mut self, key: Key, passed: &DatagramExchange<'_>, open: bool) -> bool {
         if !self.groups.contains_key(&key) {
             let group = (self.groups.len() < GROUPS).then(|| Group::new(passed.at));
             let Some(group) = group.flatten() else {

@@ -6,12 +6,14 @@
 //! - `segment`: the devices and the evaluation of each datagram; `registers`, `eeprom`, `mailbox`,
 //!   `objects`: parts of a device;
 //! - `cycle`, `clocks`, `axes`: process data, distributed clocks, CiA 402;
+//! - `rows`: process data as the samples of a machine;
 //! - `context`: machine file and ESI files;
 //! - `events`, `values`: events as text;
 //! - `report`: the [`Report`]; [`document`](fn@document): the report for readers.
 
 use std::io::Read;
 
+use ecaxis_master::config::Machine;
 use ecaxis_master::recording::frame::{Content, Encapsulation, content};
 use ecaxis_master::recording::{Packet, Reader};
 
@@ -27,6 +29,7 @@ mod match_frames;
 mod objects;
 mod registers;
 mod report;
+mod rows;
 mod segment;
 mod values;
 
@@ -38,6 +41,7 @@ pub use report::{
 };
 
 use match_frames::Pairing;
+use rows::Rows;
 use segment::RecordedSegment;
 
 /// The maximum number of distinguished VLANs.
@@ -66,9 +70,34 @@ struct PacketCounts {
 /// Analyzes one file, or its parts in order. Never fails: problems of the files are part of the
 /// report. With `interface`, only its packets are used.
 pub fn analyze<R: Read>(parts: Vec<Reader<R>>, interface: Option<u32>, known: Context) -> Report {
+    analyze_rows(parts, interface, known, None)
+}
+
+/// Takes each cycle of a recording of a machine.
+pub struct RowSink<'s> {
+    pub machine: &'s Machine,
+    /// Takes a row of samples with time in ns since 1970, and the number of cycles without an
+    /// answer before it.
+    pub take: &'s mut dyn FnMut(&[u64], u64),
+}
+
+impl std::fmt::Debug for RowSink<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("RowSink").finish_non_exhaustive()
+    }
+}
+
+/// Like [`analyze`]; the values of each cycle go to `sink`, which needs a context with its machine.
+pub fn analyze_rows<R: Read>(
+    parts: Vec<Reader<R>>,
+    interface: Option<u32>,
+    known: Context,
+    mut sink: Option<RowSink<'_>>,
+) -> Report {
     let mut counted = PacketCounts::default();
     let mut pairing = Pairing::default();
     let mut segment = RecordedSegment::new(known);
+    segment.rows = sink.as_ref().map(|sink| Rows::new(sink.machine));
     let mut remarks = Vec::new();
     let several = parts.len() > 1;
     for (number, mut reader) in (1..).zip(parts) {
@@ -76,7 +105,7 @@ pub fn analyze<R: Read>(parts: Vec<Reader<R>>, interface: Option<u32>, known: Co
         let next = reader.peek().and_then(|packet| packet.at);
         if next.is_some_and(|at| at > counted.last.saturating_add(match_frames::TIMEOUT_NS)) {
             pairing.end();
-            drain(&mut pairing, &mut segment);
+            drain(&mut pairing, &mut segment, &mut sink);
             segment.cycle.pause();
         }
         while let Some(packet) = reader.next() {
@@ -87,7 +116,7 @@ pub fn analyze<R: Read>(parts: Vec<Reader<R>>, interface: Option<u32>, known: Co
             if let Some(frame) = counted.frame(packet) {
                 pairing.push(frame);
             }
-            drain(&mut pairing, &mut segment);
+            drain(&mut pairing, &mut segment, &mut sink);
         }
         let which = if several {
             format!("file {number}: ")
@@ -108,14 +137,24 @@ pub fn analyze<R: Read>(parts: Vec<Reader<R>>, interface: Option<u32>, known: Co
         }
     }
     pairing.end();
-    drain(&mut pairing, &mut segment);
+    drain(&mut pairing, &mut segment, &mut sink);
     segment.end();
+    take_rows(&mut segment, &mut sink);
     report::report(remarks, &counted, segment)
 }
 
-fn drain(pairing: &mut Pairing, segment: &mut RecordedSegment) {
+fn drain(pairing: &mut Pairing, segment: &mut RecordedSegment, sink: &mut Option<RowSink<'_>>) {
     while let Some(exchange) = pairing.next() {
         segment.exchange(&exchange);
+        take_rows(segment, sink);
+    }
+}
+
+fn take_rows(segment: &mut RecordedSegment, sink: &mut Option<RowSink<'_>>) {
+    if let (Some(rows), Some(sink)) = (&mut segment.rows, sink) {
+        for (row, missed) in rows.drain() {
+            (sink.take)(&row, missed);
+        }
     }
 }
 

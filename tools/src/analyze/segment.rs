@@ -7,13 +7,14 @@ use ecaxis_master::acyclic::AlState;
 use super::axes::Axes;
 use super::clocks::Clocks;
 use super::context::Context;
-use super::cycle::Cycle;
+use super::cycle::{Cycle, Key, key};
 use super::eeprom::Eeprom;
 use super::events::{EVENTS, Event, EventKind, EventScope};
 use super::mailbox::{self, Mailbox, MailboxEvent};
 use super::match_frames::{DatagramExchange, FrameExchange};
 use super::objects::Objects;
 use super::registers::{Registers, part, part_u16};
+use super::rows::Rows;
 
 /// The maximum number of devices.
 const DEVICES: usize = 1024;
@@ -83,6 +84,8 @@ pub struct RecordedSegment {
     version: u64,
     located: Option<u64>,
     pub known: Context,
+    /// The values of each cycle, if they are wanted.
+    pub rows: Option<Rows>,
     last: u64,
 }
 
@@ -114,8 +117,13 @@ impl RecordedSegment {
         self.last = self.last.max(exchange.at());
         for passed in exchange.datagrams() {
             if passed.command.is_logical() {
-                if self.cycle.passed(&passed, exchange.open) {
-                    self.process_data(&passed);
+                let key = key(&passed);
+                let valid = self.cycle.passed(key, &passed, exchange.open);
+                if let Some(rows) = &mut self.rows {
+                    rows.begin(&key, &passed, valid);
+                }
+                if valid {
+                    self.process_data(key, &passed);
                 }
             } else {
                 self.datagram(&passed);
@@ -125,6 +133,9 @@ impl RecordedSegment {
 
     /// Ends the recording.
     pub fn end(&mut self) {
+        if let Some(rows) = &mut self.rows {
+            rows.end();
+        }
         for device in 0..self.devices.len() {
             let at = self.last;
             let reported = self.devices.get_mut(device).map(|d| d.mailbox.end(at));
@@ -479,7 +490,7 @@ impl RecordedSegment {
     }
 
     /// Evaluates the axes in process data.
-    fn process_data(&mut self, passed: &DatagramExchange<'_>) {
+    fn process_data(&mut self, key: Key, passed: &DatagramExchange<'_>) {
         if self.located != Some(self.version) {
             self.located = Some(self.version);
             for device in &mut self.devices {
@@ -490,7 +501,11 @@ impl RecordedSegment {
         for (index, device) in self.devices.iter_mut().enumerate() {
             device
                 .axes
-                .process_data(passed, |what| happened.push((index, what)));
+                .process_data(passed, &mut self.rows, |what| happened.push((index, what)));
+        }
+        if let Some(rows) = &mut self.rows {
+            let in_op = |device: &Device| device.state.is_none_or(|state| state == AlState::Op);
+            rows.end_datagram(key, self.devices.iter().all(in_op));
         }
         for (index, what) in happened {
             self.event(passed.at, EventScope::Device(index), what);
@@ -537,6 +552,10 @@ impl Device {
         let layout = known.layout(self.position, vendor, product, revision);
         self.axes
             .locate(&self.registers, &self.objects, layout.as_deref());
+        for axis in &mut self.axes.axes {
+            let number = usize::from(axis.number);
+            axis.index = known.axis_index(self.position, product, number);
+        }
     }
 }
 
