@@ -24,8 +24,9 @@ from .parameters import parameters
 from .recordings import judge, recordings
 from .ring import ring
 from .service import service
+from .viewers import viewers
 
-__all__ = ["Bench", "bringup", "eeproms", "ethercrab", "faults", "gateway", "mailbox", "monitoring", "operation", "overlap", "page", "parameters", "recordings", "ring", "service"]
+__all__ = ["Bench", "bringup", "eeproms", "ethercrab", "faults", "gateway", "mailbox", "monitoring", "operation", "overlap", "page", "parameters", "recordings", "ring", "service", "viewers"]
 
 MAXON = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml"
 OWN = rig.ROOT / "configs/esi"
