@@ -1,14 +1,15 @@
 #!/usr/bin/env python3
 """Real-time clients of `ecaxis serve`, written from docs/server.md alone, and what their death does.
 
-    python tests/judges/realtime_clients.py [--seconds 60] [--trials 200]
+    python tests/judges/realtime_clients.py [--seconds 60] [--trials 200] [--veth]
 
-Runs examples/clients/realtime.c and realtime.py on the simulated bus, then ends them with SIGKILL
+Runs examples/clients/realtime.c and realtime.py on the simulated bus, in the same program or over interfaces, then ends them with SIGKILL
 or SIGSTOP at random moments. The samples show whether the axis stayed within its limits and rests.
 """
 
 import argparse
 import array
+import contextlib
 import json
 import mmap
 import pathlib
@@ -25,6 +26,7 @@ import rig
 from report import Report
 
 CLIENTS = rig.ROOT / "examples/clients"
+MACHINE = rig.ROOT / "configs/demo.toml"
 VELOCITY, ACCELERATION, RANGE = 250.0, 2500.0, 60.0  # configs/demo.toml
 TTL_S = 0.5
 
@@ -60,20 +62,21 @@ class Watcher:
         self.ask("release")
 
     def targets(self, first):
-        """Yields the time in ns and the target of each cycle."""
+        """Yields the time in ns, whether the inputs are of this cycle, and the target of each cycle."""
         words = self.words
         for row in range(first, words[6]):
             at = words[2] + row % words[4] * words[3]
-            yield words[at + 1], self.numbers[at + self.target]
+            yield words[at + 1], words[at + 3] & 1, self.numbers[at + self.target]
 
 
 def within_limits(rows, dt=1e-3):
     """Returns what exceeds the limits of the machine file, or None.
 
-    A computer that skipped cycles has not sent the target before them: the drive stands at an earlier one.
+    A computer that skipped cycles has not sent the target before them: the drive stands at an earlier one. While no answer
+    comes, the set-point waits, as the drive does.
     """
-    for (begin, a), (_, b), (end, c) in zip(rows, rows[1:], rows[2:]):
-        if end - begin > 2.5e9 * dt:
+    for (begin, *_, a), (_, _, b), (end, fresh, c) in zip(rows, rows[1:], rows[2:]):
+        if end - begin > 2.5e9 * dt or not fresh:
             continue
         velocity, change = (c - b) / dt, abs(c - 2 * b + a) / dt**2
         if abs(velocity) > VELOCITY * 1.000001 or change > ACCELERATION * 1.0001 or abs(c) > RANGE:
@@ -91,7 +94,7 @@ def trial(report, watcher, name, command, kill):
         axis = watcher.ask("state")["axes"][0]
         rows = list(watcher.targets(first))
         ended = [e for e in watcher.ask("events", after=events)["events"] if e["event"] in ("lease", "area")]
-    wrong, targets = within_limits(rows), [target for _, target in rows]
+    wrong, targets = within_limits(rows), [target for *_, target in rows]
     moved = max(targets) - min(targets)
     names = any(name in json.dumps(event) and event.get("why") in ("expired", "disconnected") for event in ended)
     ok = axis["at_rest"] and axis["enabled"] and targets[-1] == targets[-50] and names and not wrong
@@ -104,6 +107,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=5)
     parser.add_argument("--trials", type=int, default=10)
+    parser.add_argument("--veth", action="store_true", help="with the bus at the other end of a pair of interfaces")
     arguments = parser.parse_args()
     report, program = Report(), rig.binary()
     with tempfile.TemporaryDirectory(prefix="ecaxis-judge-") as temporary:
@@ -111,8 +115,15 @@ def main():
         native, path = folder / "realtime", folder / "s.sock"
         subprocess.run(["gcc", "-O2", "-Wall", "-o", native, CLIENTS / "realtime.c", "-lm"], check=True)
         clients = {"realtime.c": [str(native), str(path)], "realtime.py": [sys.executable, str(CLIENTS / "realtime.py"), str(path)]}
-        serve = [str(program), "serve", str(rig.ROOT / "configs/demo.toml"), "--sim", "--socket", str(path)]
-        with rig.process(serve, stderr=subprocess.DEVNULL):
+        with contextlib.ExitStack() as stack:
+            bus = ["--sim"]
+            if arguments.veth:
+                nic, other = stack.enter_context(rig.veth_pair())
+                bus = ["--nic", nic]
+                sim = [str(program), "sim", str(MACHINE), "--nic", other]
+                stack.enter_context(rig.process(sim, stderr=subprocess.DEVNULL))
+            serve = [str(program), "serve", str(MACHINE), *bus, "--socket", str(path)]
+            stack.enter_context(rig.process(serve, stderr=subprocess.DEVNULL))
             while not path.exists():
                 time.sleep(0.05)
             watcher = Watcher(path)
