@@ -1,55 +1,38 @@
-//! Checks that docs/machine-file.md and the parser have the same keys.
+//! Checks that docs/machine-file.md and the parser have the same keys, with the same descriptions.
 
 use std::collections::BTreeSet;
 use std::path::Path;
+
+use serde_json::Value as Json;
+
+use super::schema;
 
 fn is_key(word: &str) -> bool {
     let letter = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
     !word.is_empty() && word.chars().all(letter)
 }
 
-fn quoted(text: &str) -> Option<&str> {
-    let (word, _) = text.trim_start().strip_prefix('"')?.split_once('"')?;
-    is_key(word).then_some(word)
-}
-
-/// Returns the keys of the tables and the list of verbs in a source file.
-fn keys(source: &str) -> BTreeSet<String> {
-    let code = source.split("#[cfg(test)]").next().unwrap_or_default();
-    let mut keys = BTreeSet::new();
-    for table in code.split("table! {").skip(1) {
-        let (table, _) = table.split_once("\n}\n").unwrap_or_default();
-        for line in table.lines().map(str::trim) {
-            let field = line.split_once(": ").filter(|(name, _)| is_key(name));
-            let renamed = line.split_once(" as ").and_then(|(_, rest)| quoted(rest));
-            let key = renamed.or(field.map(|(name, _)| name));
-            keys.extend(key.map(str::to_owned));
+/// Adds the keys of all tables in a schema.
+fn add_keys(schema: &Json, keys: &mut BTreeSet<String>) {
+    match schema {
+        Json::Object(fields) => {
+            for (field, value) in fields {
+                if field == "properties" {
+                    let properties = value.as_object().into_iter().flatten();
+                    keys.extend(properties.map(|(key, _)| key.clone()));
+                }
+                add_keys(value, keys);
+            }
         }
+        Json::Array(values) => values.iter().for_each(|value| add_keys(value, keys)),
+        _ => {}
     }
-    for list in ["const VERBS", "const COMPANIONS"] {
-        let Some((_, after)) = code.split_once(list) else {
-            continue;
-        };
-        let (list, _) = after.split_once("];").unwrap_or_default();
-        let (_, list) = list.split_once('=').unwrap_or_default();
-        for word in list.split(['(', '[', ',']) {
-            keys.extend(quoted(word).map(str::to_owned));
-        }
-    }
-    keys
 }
 
 fn known() -> BTreeSet<String> {
-    let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/config");
-    let files = [
-        "raw/mod.rs",
-        "raw/axis.rs",
-        "raw/step.rs",
-        "gateway.rs",
-        "travel.rs",
-    ];
-    let sources = files.map(|file| std::fs::read_to_string(config.join(file)).unwrap());
-    sources.iter().flat_map(|source| keys(source)).collect()
+    let mut keys = BTreeSet::new();
+    add_keys(&schema::machine_file(), &mut keys);
+    keys
 }
 
 fn document() -> String {
@@ -60,23 +43,7 @@ fn document() -> String {
 #[test]
 fn document_lists_every_key() {
     let (known, document) = (known(), document());
-    // The search itself must find keys of every file.
-    for key in [
-        "cycle",
-        "encoder",
-        "gear",
-        "velocity",
-        "move_by",
-        "timeout",
-        "cable",
-        "heartbeat",
-        "rx",
-    ] {
-        assert!(
-            known.contains(key),
-            "{key} is not found in the sources: {known:?}"
-        );
-    }
+    assert!(known.len() > 130, "{known:?}");
     let there = |key: &str| {
         let shapes = [
             format!("`{key}`"),
@@ -95,21 +62,104 @@ fn document_lists_every_key() {
     );
 }
 
+/// The tables of the schema that a section of the document describes.
+#[rustfmt::skip] // one row per section
+const SECTIONS: [(&str, &str); 12] = [
+    ("[bus]", "/properties/bus"),
+    ("[[device]]", "/properties/device/items"),
+    ("[device.axis]", "/definitions/axis"),
+    ("Units", "/definitions/axis"),
+    ("Limits", "/definitions/axis/properties/limits"),
+    ("Loops", "/definitions/axis"),
+    ("Supervision and stopping", "/definitions/axis"),
+    ("Homing", "/definitions/axis/properties/homing"),
+    ("[device.sim]", "/properties/device/items/properties/sim"),
+    ("[[copy]]", "/properties/copy/items"),
+    ("[stop]", "/properties/stop"),
+    ("[server]", "/properties/server"),
+];
+
+/// Formats a row as the doc comment of the key.
+fn description(kind: &str, default: &str, meaning: &str) -> String {
+    let mut text = String::new();
+    let mut letters = meaning.chars();
+    if let Some(first) = letters.next() {
+        text.extend(first.to_uppercase());
+        text += letters.as_str();
+        text.push(' ');
+    }
+    let default = match default {
+        "" | "needed" => String::new(),
+        default => format!("; default {default}"),
+    };
+    format!("{text}({kind}{default})")
+}
+
 #[test]
-fn parser_reads_every_documented_key() {
-    let (known, document) = (known(), document());
-    let mut rows = 0;
+fn descriptions_of_the_schema_are_those_of_the_document() {
+    let (schema, document) = (schema::machine_file(), document());
+    let (mut section, mut rows) = (None, 0);
+    let mut of_group = false;
     for line in document.lines() {
-        let cell = line
+        if line.starts_with('#') {
+            let heading = line.trim_start_matches('#').trim();
+            section = SECTIONS.iter().find(|(known, _)| *known == heading);
+            of_group = false;
+        }
+        of_group |= line.starts_with("| key of a group |");
+        let cells: Vec<&str> = line.split(" | ").collect();
+        let (Some((_, place)), [key, kind, default, meaning]) = (section, cells.as_slice()) else {
+            continue;
+        };
+        let key = key
             .strip_prefix("| `")
-            .and_then(|rest| rest.split_once("` |"));
-        let Some((path, _)) = cell else { continue };
-        if path.split('.').all(is_key) {
-            rows += 1;
-            for key in path.split('.') {
-                assert!(known.contains(key), "`{key}` is read nowhere: {line}");
+            .and_then(|key| key.strip_suffix('`'));
+        let Some(key) = key.filter(|key| key.split('.').all(is_key)) else {
+            continue;
+        };
+        rows += 1;
+        let group = if of_group {
+            "/properties/group/items"
+        } else {
+            ""
+        };
+        let path = key.replace('.', "/properties/");
+        let place = format!("{place}{group}/properties/{path}");
+        let known = schema.pointer(&place);
+        let known = known.unwrap_or_else(|| panic!("`{key}` is read nowhere: {line}"));
+        let meaning = meaning.trim_end_matches('|').trim();
+        assert_eq!(
+            known["description"],
+            description(kind.trim(), default.trim(), meaning)
+        );
+    }
+    assert!(rows > 90, "{rows} keys in the document's tables");
+}
+
+#[test]
+fn every_property_has_a_description() {
+    fn look(schema: &Json, path: &str, bare: &mut Vec<String>) {
+        if let Some(properties) = schema["properties"].as_object() {
+            for (key, value) in properties {
+                let path = format!("{path}.{key}");
+                if value["description"].as_str().is_none_or(str::is_empty) {
+                    bare.push(path.clone());
+                }
+                look(value, &path, bare);
             }
         }
+        let parts = ["items", "additionalProperties"].map(|part| &schema[part]);
+        let choices = schema["anyOf"].as_array().into_iter().flatten();
+        let all = parts.into_iter().chain(choices);
+        for part in all.filter(|part| part.is_object()) {
+            look(part, path, bare);
+        }
     }
-    assert!(rows > 80, "{rows} keys in the document's tables");
+    let schema = schema::machine_file();
+    let mut bare = Vec::new();
+    look(&schema, "", &mut bare);
+    for definition in ["axis", "step"] {
+        look(&schema["definitions"][definition], definition, &mut bare);
+    }
+    assert!(bare.is_empty(), "{bare:?}");
 }

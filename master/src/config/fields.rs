@@ -10,6 +10,7 @@ use toml::de::{DeTable, DeValue};
 
 use super::duration::{self, show};
 use super::problem::{Problems, Span, list, nearest, suggestion};
+use super::schema::{self, Schema};
 
 pub(crate) type Value<'d> = &'d Spanned<DeValue<'d>>;
 
@@ -50,6 +51,8 @@ pub(crate) trait Read: Sized {
 /// The permitted values of a key: a range, or words with their meanings.
 pub(crate) trait Domain<T> {
     fn read(&self, value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<T>;
+
+    fn schema(&self) -> serde_json::Value;
 }
 
 /// A type of fields in `table!`.
@@ -87,7 +90,7 @@ impl<T> Field for Vec<T> {
     }
 }
 
-pub(crate) struct Elements<T>(Vec<T>);
+pub(crate) struct Elements<T>(pub Vec<T>);
 
 impl<T: Read> Read for Elements<T> {
     fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
@@ -106,7 +109,9 @@ impl<T: Read> Read for Vec<T> {
 }
 
 /// Declares a table: `key: type [domain] as "other key" = "example" ,`. A key with an example must
-/// be there. A `table` without its key is empty; a `row` is part of a list.
+/// be there. A `table` without its key is empty; a `row` is part of a list. The doc comments are
+/// the descriptions of the JSON schema: `meaning (type; default value)`, as in
+/// docs/machine-file.md.
 macro_rules! table {
     ($name:literal, $(#[$meta:meta])* table $table:ident $fields:tt) => {
         table!($name, $(#[$meta])* #[derive(Default)] row $table $fields);
@@ -120,7 +125,7 @@ macro_rules! table {
         }
     };
     ($name:literal, $(#[$meta:meta])* row $table:ident {
-        $($(#[$doc:meta])* $field:ident: $type:ty $([$domain:expr])? $(as $key:literal)? $(= $example:literal)?,)*
+        $($(#[doc = $doc:literal])* $field:ident: $type:ty $([$domain:expr])? $(as $key:literal)? $(= $example:literal)?,)*
     }) => {
         $(#[$meta])*
         #[derive(Debug)]
@@ -128,13 +133,23 @@ macro_rules! table {
         pub(crate) struct $table {
             pub span: Span,
             pub written: Written,
-            $($(#[$doc])* pub $field: $type,)*
+            $($(#[doc = $doc])* pub $field: $type,)*
         }
 
         impl $table {
             const KEYS: &[TableKey] = &[
                 $((table!(@key $field $($key)?), table!(@example $($example)?))),*
             ];
+        }
+
+        impl Schema for $table {
+            fn schema() -> serde_json::Value {
+                schema::table([$((
+                    (table!(@key $field $($key)?), table!(@example $($example)?)),
+                    table!(@schema $type $(, $domain)?),
+                    concat!($($doc),*),
+                )),*])
+            }
         }
 
         impl Read for $table {
@@ -162,6 +177,8 @@ macro_rules! table {
     (@key $field:ident) => { stringify!($field) };
     (@example $example:literal) => { Some($example) };
     (@example) => { None };
+    (@schema $type:ty, $domain:expr) => { schema::domain::<$type, _>(&$domain) };
+    (@schema $type:ty) => { <<$type as Field>::Value as Schema>::schema() };
     (@read $type:ty, $value:ident, $key:ident, $p:ident, $domain:expr) => {
         Domain::read(&$domain, $value, $key, $p).map(|v| Spanned::new($value.span(), v))
     };
@@ -340,7 +357,7 @@ impl Read for bool {
 
 /// The maximum absolute number. Beyond it, axes and tables reject positions, and `f64` loses
 /// decimals.
-const LARGEST: f64 = 1e15;
+pub(crate) const LARGEST: f64 = 1e15;
 
 /// An integer or decimal number of at most ±[`LARGEST`].
 impl Read for f64 {
@@ -415,6 +432,16 @@ macro_rules! integers {
             fn read(&self, value: Value<'_>, _: &str, p: &mut Problems<'_>) -> Option<$type> {
                 integer(value, self, p)
             }
+
+            fn schema(&self) -> serde_json::Value {
+                schema::integer(*self.start(), *self.end())
+            }
+        }
+
+        impl Schema for $type {
+            fn schema() -> serde_json::Value {
+                schema::integer(Self::MIN, Self::MAX)
+            }
         }
     )*};
 }
@@ -472,6 +499,10 @@ impl Domain<Ns> for RangeInclusive<Ns> {
         p.add(value.span(), message);
         None
     }
+
+    fn schema(&self) -> serde_json::Value {
+        Ns::schema()
+    }
 }
 
 /// Words with their meanings.
@@ -485,5 +516,20 @@ impl<T: Copy, const N: usize> Domain<T> for [(&'static str, T); N] {
             p.add_hint(value.span(), message, suggestion(&word, names, "there are"));
         }
         known.map(|(_, meaning)| *meaning)
+    }
+
+    fn schema(&self) -> serde_json::Value {
+        schema::words(self.iter().map(|(word, _)| *word))
+    }
+}
+
+/// Texts that a later check reads, with messages of its own.
+impl<const N: usize> Domain<String> for [&'static str; N] {
+    fn read(&self, value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<String> {
+        String::read(value, key, p)
+    }
+
+    fn schema(&self) -> serde_json::Value {
+        schema::words(*self)
     }
 }

@@ -7,16 +7,23 @@ use toml::Spanned;
 use super::fields::{Domain, Field, Ns, Read, Table, TableKey, Value, Written};
 use super::problem::{Problems, Span, list, suggestion};
 use super::raw::{RawEntry, RawSim};
+use super::schema::{self, Schema};
 
 const MS: Ns = 1_000_000;
 
 table! { "[[device.sim.node]]",
     row RawNode {
+        /// CANopen node-ID (1 to 127)
         id: u8 [1..=127] = "1",
+        /// Drive, such as "EPOS 24/5"
         drive: Spanned<Epos> = "\"EPOS 24/5\"",
+        /// Period of the heartbeat (time, 10 ms to 65 s)
         heartbeat: Option<Heartbeat>,
+        /// If true, the gateway needs the node (default false)
         mandatory: Option<bool>,
+        /// PDOs from the node to the gateway
         inputs: Vec<RawLink>,
+        /// PDOs from the gateway to the node
         outputs: Vec<RawLink>,
     }
 }
@@ -31,6 +38,12 @@ impl Read for Epos {
             p.add_hint(value.span(), format!("unknown drive `{name}`"), hint);
         }
         found
+    }
+}
+
+impl Schema for Epos {
+    fn schema() -> serde_json::Value {
+        schema::words(Self::ALL.map(Self::name))
     }
 }
 
@@ -49,11 +62,21 @@ impl Read for Heartbeat {
     }
 }
 
+impl Schema for Heartbeat {
+    fn schema() -> serde_json::Value {
+        Ns::schema()
+    }
+}
+
 table! { "a PDO of a node",
     row RawLink {
+        /// Number of the PDO (1 to 3)
         pdo: u8 [1..=3] = "1",
+        /// First byte in the gateway's data (2 to 511)
         at: u16 [2..=511] = "2",
+        /// Mapped objects (default the drive's own)
         objects: Vec<MappableObject>,
+        /// If true, the SYNC triggers the PDO (default true)
         synchronous: Option<bool>,
     }
 }
@@ -73,6 +96,12 @@ impl Read for MappableObject {
             p.add(value.span(), message);
         }
         bits.map(|bits| Self(index, sub, bits))
+    }
+}
+
+impl Schema for MappableObject {
+    fn schema() -> serde_json::Value {
+        RawEntry::schema()
     }
 }
 

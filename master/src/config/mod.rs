@@ -6,6 +6,7 @@
 //! | `duration.rs` | `"250us"` |
 //! | `fields.rs` | `table!`: a table's keys, types, ranges and examples in one place |
 //! | `raw/` | the file as written: its tables |
+//! | `schema.rs` | the tables as a JSON schema, for editors |
 //! | `check.rs` | raw → [`Machine`]: bus, names, positions |
 //! | `copy.rs` | inputs that are copied to outputs |
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
@@ -43,6 +44,7 @@ mod gateway;
 mod problem;
 mod program;
 mod raw;
+pub mod schema;
 mod sdo;
 mod signal;
 pub mod sim;

@@ -9,17 +9,26 @@ use toml::de::DeValue;
 use super::AxisSetup;
 use super::fields::{Field, Key, Read, Table, TableKey, Value, Written};
 use super::problem::{Problems, Span};
+use super::schema::{self, Schema};
 
 table! { "`track`",
     /// Positions are in the axis's unit, as shown at power-on.
     table RawTrack {
+        /// Position of the axis at power-on (unit; default 0)
         start: Key<f64>,
+        /// Position of the negative limit switch (unit)
         negative_limit: Key<f64>,
+        /// Position of the positive limit switch (unit)
         positive_limit: Key<f64>,
+        /// Range of the home switch ([from, to], unit)
         home: Key<[f64; 2]>,
+        /// Range of the target of touch probe 1 ([from, to], unit)
         probe1: Key<[f64; 2]>,
+        /// Range of the target of touch probe 2 ([from, to], unit)
         probe2: Key<[f64; 2]>,
+        /// Mechanical ends ([from, to], unit)
         ends: Key<[f64; 2]>,
+        /// Position of the index pulse, or false for none (unit; default 0)
         index: Key<Index>,
     }
 }
@@ -34,6 +43,12 @@ impl Read for Index {
             DeValue::Boolean(false) => Some(Self(None)),
             _ => f64::read(value, key, p).map(|position| Self(Some(position))),
         }
+    }
+}
+
+impl Schema for Index {
+    fn schema() -> serde_json::Value {
+        schema::any_of([serde_json::json!({ "enum": [false] }), f64::schema()])
     }
 }
 

@@ -7,6 +7,7 @@ use toml::de::DeValue;
 use super::super::TorqueUnit;
 use super::super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Written, array};
 use super::super::problem::{Problems, Span};
+use super::super::schema::{self, Schema};
 use super::{STOP_METHODS, STOPS_BY_DRIVE, Spanned};
 
 const WAYS: [(&str, ModuloDirection); 3] = [
@@ -30,37 +31,70 @@ const TORQUE_UNITS: [(&str, TorqueUnit); 3] = [
 
 table! { "[device.axis]",
     table RawAxis {
+        /// Unique name; required if the drive has several axes here (text; default that of the
+        /// device)
         name: Key<String>,
-        /// The number of the axis in its drive, from 1.
+        /// Axis of the drive (1 to 8; default by order)
         number: Key<u16> [1..=ecaxis_esi::axis::MAX_AXES],
+        /// Position unit: mm, deg, turn, …; your own as `"custom:slots"` (text; default `"turn"`)
         unit: Key<String>,
+        /// Units per motor turn, gear included; or the next two (above 0; default 1.0)
         per_turn: Key<f64>,
-        /// Motor turns and the resulting turns of the output shaft.
+        /// Gear ratio, whole numbers (as 0x6091) ([motor turns, shaft turns]; default [1, 1])
         gear: Key<[u32; 2]>,
-        /// User units per turn of the output shaft.
+        /// Units per turn of the shaft behind the gear (above 0; default 1.0)
         feed: Key<f64>,
+        /// Period after which positions repeat; not with `limits.position` (above 0, unit; default
+        /// none: linear axis)
         modulo: Key<f64>,
+        /// Direction in which a modulo axis moves (`"shortest"`, `"positive"`, `"negative"`;
+        /// default `"shortest"`)
         way: Key<ModuloDirection> [WAYS],
+        /// Counts per motor turn, four per line of an incremental encoder (1 to 2^31)
         encoder: Key<f64> = "2000",
+        /// The positive direction is the drive's negative direction (true, false; default false)
         invert: Key<bool>,
+        /// Position at count 0 (number, unit; default 0)
         offset: Key<f64>,
+        /// Distance within which a move is in target (unit; default a tenth of the following error,
+        /// or ten counts)
         target_window: Key<f64>,
+        /// Unit of the drive's velocities (`"rpm"`, `"mrpm"`, `"counts/s"`, `"turns/s"`; default
+        /// what 0x60A9 says)
         velocity_unit: Key<VelocityUnit> [VELOCITY_UNITS],
+        /// Unit of torques in limits, supervision and steps (`"percent"`, `"Nm"`, `"A"`; default
+        /// `"percent"`)
         torque_unit: Key<TorqueUnit> [TORQUE_UNITS],
+        /// Other drives need it for `torque_unit = "A"` (above 0, Nm/A; default what maxon's
+        /// 0x3001:05 says)
         torque_constant: Key<f64>,
+        /// Rated torque of the motor (above 0, Nm; default what 0x6076 says)
         rated_torque: Key<f64>,
+        /// Commanded values never exceed these limits
         limits: RawLimits = "{ velocity = 200.0, acceleration = 2000.0 }",
+        /// From a set-point to the first report that can show it (time, up to 100 ms; default 0)
         dead_time: Key<Ns>,
+        /// Time after which a stop becomes harder (time above 0; default see below)
         stop_timeout: Key<Ns>,
+        /// The drive serves Statusword bit 12 in CSP, CSV and CST (`true`, `false`; default `true`)
         follows_bit: Key<bool>,
+        /// What accompanies the target in CSP
         csp: RawOffsets,
+        /// Position loop over the drive's velocity
         csv: Option<RawVelocityLoop>,
+        /// Position loop over the drive's torque
         cst: Option<RawPid>,
+        /// Times of the holding brake, and its output
         brake: RawBrake,
+        /// Automatic reset of faults
         fault_reset: RawFaultReset,
+        /// Supervision of reported torque, acceleration and standstill
         supervise: RawSupervision,
+        /// Reaction to a trip (`"quick-stop"`, `"ramp"`, `"no-power"`; default `"quick-stop"`)
         on_trip: Key<StopMethod> [STOP_METHODS],
+        /// Reaction to an emergency stop (`"quick-stop"`, `"no-power"`; default `"quick-stop"`)
         on_emergency: Key<StopMethod> [STOPS_BY_DRIVE],
+        /// Homing by the drive; 0x6060 and 0x6061 must be mapped
         homing: Option<RawHoming>,
     }
 }
@@ -88,6 +122,14 @@ impl Read for AxisTables {
     }
 }
 
+impl Schema for AxisTables {
+    fn schema() -> serde_json::Value {
+        let axis = schema::definition("axis");
+        let several = serde_json::json!({ "type": "array", "items": axis });
+        schema::any_of([axis, several])
+    }
+}
+
 impl Read for [u32; 2] {
     fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
         let turns = array(p, value, "motor turns and shaft turns, `[3, 1]`")?;
@@ -104,11 +146,18 @@ impl Read for [u32; 2] {
 
 table! { "`limits`",
     table RawLimits {
+        /// Range ([low, high], unit; default endless)
         position: Key<[f64; 2]>,
+        /// (above 0, unit/s)
         velocity: Key<f64> = "200.0",
+        /// Also applies to stops; a stop may last an hour at most (above 0, unit/s²)
         acceleration: Key<f64> = "2000.0",
+        /// Applies to jerk-limited moves (above 0, unit/s³; default full acceleration in 50 ms)
         jerk: Key<f64>,
+        /// (above 0, `torque_unit`; default rated torque)
         torque: Key<f64>,
+        /// Set-point minus reported position, after the dead time (above 0, unit; default not
+        /// supervised)
         following_error: Key<f64>,
     }
 }
@@ -116,63 +165,99 @@ table! { "`limits`",
 table! { "`csp`",
     /// Written to 0x60B1 and 0x60B2.
     table RawOffsets {
+        /// Share of the velocity that is written to 0x60B1, which must be mapped (0 to 1; default
+        /// 0)
         velocity_offset: Key<f64>,
+        /// Torque per acceleration, written to 0x60B2, which must be mapped (% per unit/s²; default
+        /// 0)
         torque_offset: Key<f64>,
     }
 }
 
 table! { "`csv`",
     table RawVelocityLoop {
+        /// Gain of the position loop over the drive's velocity (above 0, 1/s; default no position
+        /// loop)
         kv: Key<f64> = "20.0",
+        /// Share of the velocity that is fed forward (0 to 1; default 1)
         feed_forward: Key<f64>,
     }
 }
 
 table! { "`cst`",
     table RawPid {
+        /// Gain of the position loop over the drive's torque (above 0, % per unit; default no
+        /// position loop)
         kp: Key<f64> = "10.0",
+        /// Integral action time (time; default no integral part)
         tn: Key<Ns>,
+        /// Derivative action time (time; default 0)
         tv: Key<Ns>,
+        /// Torque per acceleration (% per unit/s²; default 0)
         acceleration: Key<f64>,
     }
 }
 
 table! { "`brake`",
     table RawBrake {
-        /// The output, for example `io.Output 3`.
+        /// One-bit output that opens the brake (device.output, text; default the drive switches its
+        /// brake)
         output: Key<String>,
+        /// From Operation enabled to the first motion (time; default 0)
         release: Key<Ns>,
+        /// From standstill to the loss of power (time; default 0)
         engage: Key<Ns>,
     }
 }
 
 table! { "`fault_reset`",
     table RawFaultReset {
+        /// Number of automatic fault resets (1 to 100; default no automatic reset)
         tries: Key<u8> [1..=100] = "3",
+        /// From the fault to the reset (time; default `"1s"`)
         delay: Key<Ns>,
     }
 }
 
 table! { "`supervise`",
     table RawSupervision {
+        /// Reported torque that must not last (above 0, `torque_unit`; default not supervised)
         torque: Key<f64>,
+        /// Time for which the torque may exceed it (time; default `"100ms"`)
         torque_time: Key<Ns>,
+        /// Reported acceleration, filtered (above 0, unit/s²; default not supervised)
         acceleration: Key<f64>,
+        /// The axis is at standstill below this velocity (above 0, unit/s; default 1 % of the
+        /// velocity limit)
         standstill: Key<f64>,
+        /// Time for which the velocity must be below it (time; default 0)
         standstill_time: Key<Ns>,
+        /// Time that the axis must be within `target_window` (time; default 0)
         target_time: Key<Ns>,
     }
 }
 
 table! { "`homing`",
     table RawHoming {
+        /// 0x6098: CiA 402 methods or maxon's negative ones; the error for a wrong one lists all
+        /// (number)
         method: Key<i8> = "37",
+        /// Velocity to the switch or mechanical end (0x6099:01) (above 0, unit/s; default the
+        /// drive's)
         search: Key<f64>,
+        /// Velocity off the switch and to the index (0x6099:02) (above 0, unit/s; default the
+        /// drive's)
         zero: Key<f64>,
+        /// 0x609A (above 0, unit/s²; default the drive's)
         acceleration: Key<f64>,
+        /// Further travel from the position found (maxon's 0x30B1) (unit; default the drive's)
         distance: Key<f64>,
+        /// Position value there (maxon's 0x30B0, others' 0x607C) (unit; default the drive's)
         position: Key<f64>,
+        /// Current that detects a mechanical end (maxon's 0x30B2); needed by such methods (1 to
+        /// 65535 mA)
         threshold: Key<u16> [1..=u16::MAX],
+        /// Of the whole search (time; default `"1min"`)
         timeout: Key<Ns>,
     }
 }

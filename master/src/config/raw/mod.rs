@@ -9,6 +9,7 @@ use ecaxis_esi::Address;
 use super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Written, unquoted};
 use super::gateway::RawNode;
 use super::problem::{Problems, Span};
+use super::schema::{self, Schema, any_of};
 use super::travel::RawTrack;
 use super::{ExchangeMode, GroupStopScope, MailboxSource, SocketKind, Spin};
 
@@ -23,13 +24,22 @@ pub(crate) use step::{
 
 table! { "the machine file",
     table RawMachine {
+        /// Number of runs of the program (1 to 1,000,000; default 1)
         repeat: Key<u32> [1..=1_000_000],
+        /// If false, the axes get no power, and the bus stays in Op; `ecaxis run --enable`
+        /// overrides it (true, false; default true)
         enable: Key<bool>,
+        /// Network interface and cycle
         bus: RawBus = "[bus]\ncycle = \"1ms\"",
+        /// A SubDevice: position, ESI file, mode, process data, start-up SDOs
         devices: Vec<RawDevice> as "device" = "[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"",
+        /// Inputs of one device that become outputs of another
         copies: Vec<RawCopy> as "copy",
+        /// How the machine stops
         stop: RawStop,
+        /// Clients of `ecaxis serve`
         server: RawServer,
+        /// The program: one verb for each step
         steps: Vec<RawStep> as "step",
     }
 }
@@ -64,22 +74,45 @@ const MAILBOXES: [(&str, MailboxSource); 2] = [
 
 table! { "[bus]",
     table RawBus {
+        /// Network interface, or `"sim"` for the simulated bus (text; default `"sim"`)
         nic: Key<String>,
+        /// Time from frame to frame; also 0x60C2 and SYNC0 (time, 50 µs to 100 ms)
         cycle: Key<Ns> [50_000..=100 * MS] = "\"1ms\"",
+        /// Consecutive cycles without a valid answer that stop the axes, see below (1 to 1000;
+        /// default 3)
         lost_frames: Key<u32> [1..=1000],
+        /// CPU of the real-time thread (0 to 1023; default any)
         cpu: Key<u32> [0..=1023],
+        /// SCHED_FIFO priority of the real-time thread (1 to 99; default 80)
         priority: Key<u8> [1..=99],
+        /// Time before each cycle in which the thread spins (`"auto"`, time up to a cycle, or 0;
+        /// default `"auto"`)
         spin: Key<Spin>,
-        /// `true` if `cpu` is kept awake.
+        /// `"awake"` keeps `cpu` from idling between cycles; costs power (`"sleep"`, `"awake"`;
+        /// default `"sleep"`)
         idle: Key<bool> [IDLE_MODES],
+        /// From SafeOp to Op (time, 1 ms to 10 min; default see below)
         op_timeout: Key<Ns> [MS..=600 * S],
+        /// To Operation enabled; also for steps that wait for a state (time, 1 ms to 10 min;
+        /// default `"5s"`)
         enable_timeout: Key<Ns> [MS..=600 * S],
         // The watchdog registers count 100 µs in 16 bits.
+        /// A SubDevice without outputs for this time leaves Op by itself (time, 1 ms to 6.5535 s;
+        /// default `"100ms"`)
         watchdog: Key<Ns> [MS..=6553 * S + 500 * MS],
+        /// A larger offset from the reference clock (0x092C) is a warning (time, 100 ns to 1 s;
+        /// default `"10us"`)
         clock_window: Key<Ns> [100..=S],
+        /// Before Op, every device with SYNC0 is as close to the reference clock (0x092C) (time,
+        /// 100 ns to 1 s; default `"1us"`)
         sync_window: Key<Ns> [100..=S],
+        /// Until the clocks are in `sync_window` and frames are in phase with SYNC0 (time, 1 ms to
+        /// 10 min; default `"5s"`)
         sync_timeout: Key<Ns> [MS..=600 * S],
+        /// Cycle in which answers are processed (`"same-cycle"`, `"pipelined"`; default
+        /// `"same-cycle"`)
         exchange: Key<ExchangeMode> [EXCHANGES],
+        /// How frames are read from the interface (`"ring"`, `"packet"`; default `"ring"`)
         link: Key<SocketKind> [LINKS],
     }
 }
@@ -95,38 +128,74 @@ impl Read for Spin {
     }
 }
 
+impl Schema for Spin {
+    fn schema() -> serde_json::Value {
+        any_of([serde_json::json!({ "enum": ["auto", 0] }), Ns::schema()])
+    }
+}
+
+/// The cyclic modes.
+const MODES: [&str; 3] = ["csp", "csv", "cst"];
+
+const IDENTITIES: [&str; 6] = ["equal", ">=", "newer", "high-word", "low-word", "ignore"];
+
 table! { "[[device]]",
     table RawDevice {
+        /// Unique name (text)
         name: Key<String> = "\"x\"",
+        /// ESI file, or a folder of ESI files (path; default this, `sii` or both)
         esi: Key<String>,
+        /// EEPROM image (SII); it describes a device without `esi` (path)
         sii: Key<String>,
+        /// Source of the mailboxes if both differ (`"esi"`, `"eeprom"`; default `"esi"`)
         mailbox: Key<MailboxSource> [MAILBOXES],
+        /// Position on the bus, from 0 (0 to 65535; default one of these three)
         position: Key<u16>,
+        /// Configured station alias (0x0012) (1 to 65535)
         alias: Key<u16> [1..=u16::MAX],
+        /// Explicit device identification (1 to 65535)
         id: Key<u16> [1..=u16::MAX],
+        /// Type or name, if the ESI describes several devices (text)
         type_name: Key<String> as "type",
+        /// Selects a device likewise; only with a folder (number)
         vendor: Key<u32>,
+        /// Selects a device likewise (number)
         product: Key<u32>,
+        /// Selects a device likewise (number; default the newest)
         revision: Key<u32>,
-        identity: Key<String>,
+        /// Revisions that are accepted (`"equal"`, `">="`, `"high-word"`, `"low-word"`, `"ignore"`;
+        /// default `"equal"`)
+        identity: Key<String> [IDENTITIES],
+        /// Serial number that the device must have (number; default any)
         serial: Key<u32>,
-        mode: Key<String>,
+        /// Selects module or PDO set, 0x6060 and start-up SDOs (`"csp"`, `"csv"`, `"cst"`; default
+        /// none: no axis)
+        mode: Key<String> [MODES],
+        /// OpMode by name; `"off"`: no distributed clock (text; default the ESI's first OpMode)
         dc: Key<String>,
-        /// A name for each slot, `-` for none.
+        /// Module names, slot by slot (list of text; default by `mode`)
         modules: Key<Vec<String>>,
+        /// `AlternativeSmMapping` by name (text; default the ESI's default)
         assignment: Key<String>,
+        /// Process data: `rx` are outputs, `tx` are inputs (table; default the ESI's)
         pdo: RawPdos,
+        /// Start-up SDOs, sent in order after those of the ESI (list of tables; default none)
         sdo: Vec<RawSdo>,
-        /// The defaults for all start-up SDOs.
+        /// `verify = true` and `skip_equal = true` for all start-up SDOs (table; default neither)
         startup: RawStartup,
+        /// Units, limits, loops, supervision and homing of a drive's axis; as `[[device.axis]]` for
+        /// each axis of a drive with several
         axes: AxisTables as "axis",
+        /// Settings of the simulated bus
         sim: Option<RawSim>,
     }
 }
 
 table! { "`pdo`",
     table RawPdos {
+        /// Objects of the outputs, such as "0x607A" or "0x60C1:01"
         rx: Key<Vec<RawEntry>>,
+        /// Objects of the inputs, such as "0x6041"
         tx: Key<Vec<RawEntry>>,
     }
 }
@@ -141,7 +210,9 @@ pub(crate) struct RawEntry {
 
 table! { "a PDO entry",
     row EntryTable {
+        /// Index of the object
         index: u16 [1..=u16::MAX] = "0x607A",
+        /// Subindex of the object (default 0)
         sub: Option<u8>,
     }
 }
@@ -167,13 +238,25 @@ impl Read for RawEntry {
     }
 }
 
+impl Schema for RawEntry {
+    fn schema() -> serde_json::Value {
+        any_of([String::schema(), EntryTable::schema()])
+    }
+}
+
 table! { "`sdo`",
     row RawSdo {
+        /// Index of the object
         index: u16 [1..=u16::MAX] = "0x6065",
+        /// Subindex of the object (default 0)
         sub: Option<u8>,
+        /// Value: a number, a text, true or false, or a list of bytes
         value: Spanned<SdoValue> = "2000",
+        /// Data type, such as "u16", "i32", "f32", "text" or "UINT" (default what the ESI says)
         type_name: Key<String> as "type",
+        /// If true, the object is read back and compared (default that of `startup`)
         verify: Option<bool>,
+        /// If true, an object that holds the value is not written (default that of `startup`)
         skip_equal: Option<bool>,
     }
 }
@@ -223,33 +306,59 @@ impl Read for SdoValue {
     }
 }
 
+impl Schema for SdoValue {
+    fn schema() -> serde_json::Value {
+        let one = serde_json::json!({ "type": ["integer", "number", "boolean", "string"] });
+        any_of([one, Vec::<u8>::schema()])
+    }
+}
+
 table! { "`startup`",
     table RawStartup {
+        /// If true, all start-up SDOs are read back and compared (default false)
         verify: Option<bool>,
+        /// If true, objects that hold their value are not written (default false)
         skip_equal: Option<bool>,
     }
 }
 
 table! { "[device.sim]",
     table RawSim {
+        /// Device that this one is connected to (name; default by order of positions)
         after: Key<String>,
+        /// Port of that device (1 to 3; default the first free)
         port: Key<u8> [1..=3],
+        /// Propagation delay of the cable to this device, one way (time, up to 1 ms; default 25 ns,
+        /// E-bus 5 ns)
         cable: Key<Ns> [0..=MS],
+        /// The cables at IN (port 0) and OUT of this device are swapped (`true`, `false`; default
+        /// `false`)
         reversed: Key<bool>,
+        /// Clock error; positive is too fast (−1000 to 1000; default a few, by position)
         drift_ppm: Key<f64>,
+        /// Clock value at power-on (time; default 0)
         offset: Key<Ns>,
+        /// Error of clock readings, up to this much (time, up to 1 ms; default 0)
         jitter: Key<Ns> [0..=MS],
+        /// From a request in AL control to the answer in AL status (time, up to 60 s; default 200
+        /// µs)
         state_change: Key<Ns> [0..=60 * S],
+        /// Of a gateway's CAN network (bit/s; default 1,000,000)
         bit_rate: Key<u32>,
+        /// Period of the gateway's SYNC (time; default `"4ms"`)
         sync: Key<Ns>,
+        /// Drives on the gateway (tables, `[[device.sim.node]]`; default none)
         node: Vec<RawNode>,
+        /// Switches and ends along a simulated axis (table; default no switches or ends)
         track: Option<RawTrack>,
     }
 }
 
 table! { "[[copy]]",
     table RawCopy {
+        /// Inputs of a device (text)
         from: Key<String> = "\"io1.Input 1\"",
+        /// Outputs of the same length (text)
         to: Key<String> = "\"io2.Output 1\"",
     }
 }
@@ -274,26 +383,43 @@ const OUTSIDE: [(&str, GroupStopScope); 2] = [
 
 table! { "[stop]",
     table RawStop {
+        /// How the other axes stop when one faults or trips (`"ramp"`, `"quick-stop"`,
+        /// `"no-power"`; default `"ramp"`)
         others: Key<StopMethod> [STOP_METHODS],
+        /// What the drive of a missing device receives (`"quick-stop"`, `"no-power"`; default
+        /// `"quick-stop"`)
         bus_lost: Key<StopMethod> [STOPS_BY_DRIVE],
+        /// Each condition alone causes an emergency stop (conditions as in `wait`; default none)
         emergency: Option<Conditions>,
+        /// Axes that stop together (tables, `[[stop.group]]`; default none)
         groups: Vec<RawGroup> as "group",
     }
 }
 
 table! { "[server]",
     table RawServer {
+        /// Cycles without a new set-point of a real-time client, after which its axes stop (1 to
+        /// 1000; default 10)
         stale_cycles: Key<u32> [1..=1000],
+        /// The longest silence of the owner, unless it asks for another (time, 100 ms to 60 s;
+        /// default `"500ms"`)
         lease: Key<Ns> [100 * MS..=60 * S],
     }
 }
 
 table! { "[[stop.group]]",
     table RawGroup {
+        /// (text)
         name: Key<String> = "\"gantry\"",
+        /// An axis is in one group at most, with all axes of its drive (names)
         axes: Option<Names> = "[\"x\", \"y\"]",
+        /// SubDevices without an axis, lost and stopped with the group (names; default none)
         devices: Option<Names>,
+        /// How the other axes of the group stop when one faults or trips (as above; default that of
+        /// `[stop]`)
         others: Key<StopMethod> [STOP_METHODS],
+        /// The rest of the machine stops within its limits, or continues (`"stop"`, `"continue"`;
+        /// default `"stop"`)
         outside: Key<GroupStopScope> [OUTSIDE],
     }
 }
@@ -310,5 +436,13 @@ impl Read for Names {
             p.add_hint(value.span(), "nothing is named here", hint);
         }
         Some(Self(names))
+    }
+}
+
+impl Schema for Names {
+    fn schema() -> serde_json::Value {
+        let mut schema = Vec::<String>::schema();
+        schema["minItems"] = 1.into();
+        schema
     }
 }

@@ -3,11 +3,13 @@
 use std::ops::RangeInclusive;
 
 use ecaxis_axis::Edge;
+use serde_json::{Map, Value as Json, json};
 use toml::Spanned;
 use toml::de::DeValue;
 
 use super::super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Written, array};
 use super::super::problem::{Problems, Span};
+use super::super::schema::{self, Schema, any_of, described, named};
 
 /// Axes with a parameter each.
 pub(crate) type Named<T> = Vec<(Spanned<String>, Spanned<T>)>;
@@ -85,25 +87,35 @@ pub(crate) struct RawCondition {
 
 table! { "a condition",
     table Bounds {
+        /// The signal is greater than this number
         above: Key<f64>,
+        /// The signal is less than this number
         below: Key<f64>,
     }
 }
 
 table! { "a wave",
     table RawWave {
+        /// Amplitude (unit)
         amplitude: Key<f64> = "1.0",
+        /// Frequency (Hz)
         frequency: Key<f64> = "2.0",
+        /// Number of periods (1 to 1,000,000)
         periods: Key<u32> [1..=1_000_000] = "5",
     }
 }
 
 table! { "a gear",
     table RawGear {
+        /// Axis that is followed
         to: Key<String> = "\"x\"",
+        /// Motion of this axis per motion of the other; negative reverses the direction (default 1)
         ratio: Key<f64>,
+        /// If true, the axis follows the reported position instead of the set-point (default false)
         actual: Key<bool>,
+        /// Distance to the followed axis (unit; default where the axis is)
         offset: Key<f64>,
+        /// Time constant of the followed motion (time; default 0, `"10ms"` with `actual`)
         smoothing: Key<Ns>,
     }
 }
@@ -113,9 +125,13 @@ const EDGES: [(&str, Edge); 2] = [("rising", Edge::Positive), ("falling", Edge::
 table! { "a probe",
     /// Exactly one of `to` and `by` is given.
     table RawProbe {
+        /// Position up to which the axis searches (unit)
         to: Key<f64>,
+        /// Distance over which the axis searches (unit)
         by: Key<f64>,
+        /// Touch probe of the drive (1 or 2; default 1)
         input: Key<u8> [1..=2],
+        /// Edge (`"rising"`, `"falling"`; default `"rising"`)
         edge: Key<Edge> [EDGES],
     }
 }
@@ -147,8 +163,15 @@ const VERBS: [(&str, &str, &[&str]); 21] = [
     ("repeat", "repeat = 3", &["step"]),
 ];
 
-/// Keys that go with verbs.
-const COMPANIONS: [&str; 5] = ["speed", "ramp", "arrive", "timeout", "step"];
+/// Keys that go with verbs, each with its description.
+#[rustfmt::skip] // one row per key
+const COMPANIONS: [(&str, &str); 5] = [
+    ("speed", "Fraction of each axis' velocity limit (above 0, up to 1; default 1)"),
+    ("ramp", "Fraction of the acceleration limit (above 0, up to 1); with `torque`: the time to the new torque"),
+    ("arrive", "If `\"together\"`, all axes arrive in the same cycle (`\"each\"`, `\"together\"`; default `\"each\"`)"),
+    ("timeout", "Time after which the step fails (time, 1 ms to a week; default `\"10s\"`)"),
+    ("step", "The steps that are repeated"),
+];
 
 const ARRIVALS: [(&str, bool); 2] = [("each", false), ("together", true)];
 
@@ -167,7 +190,8 @@ impl Read for RawStep {
 }
 
 fn read(value: Value<'_>, depth: usize, p: &mut Problems<'_>) -> Option<RawStep> {
-    let keys = VERBS.iter().map(|(verb, ..)| *verb).chain(COMPANIONS);
+    let keys = VERBS.iter().map(|(verb, ..)| *verb);
+    let keys = keys.chain(COMPANIONS.map(|(key, _)| key));
     let keys: Vec<TableKey> = keys.map(|key| (key, None)).collect();
     let table = Table::of(value, "[[step]]", &keys, p)?;
     let mut said = VERBS
@@ -192,7 +216,8 @@ fn read(value: Value<'_>, depth: usize, p: &mut Problems<'_>) -> Option<RawStep>
         p.add_hint(at.span(), message, "write a [[step]] for each");
         return None;
     }
-    for key in COMPANIONS.iter().filter(|key| !companions.contains(key)) {
+    let wrong = COMPANIONS.iter().map(|(key, _)| key);
+    for key in wrong.filter(|key| !companions.contains(key)) {
         if let Some(value) = table.get(key) {
             p.add(value.span(), format!("`{key}` does not go with `{verb}`"));
         }
@@ -470,4 +495,96 @@ fn condition(
         above,
         below,
     })
+}
+
+impl Schema for Conditions {
+    fn schema() -> Json {
+        let mut bounds = Bounds::schema();
+        bounds["minProperties"] = 1.into();
+        let condition = any_of([f64::schema(), bool::schema(), bounds]);
+        named(named(condition))
+    }
+}
+
+impl Schema for RawStep {
+    fn schema() -> Json {
+        schema::definition("step")
+    }
+}
+
+impl RawStep {
+    /// Returns the schema of a step: one verb, and the keys that go with it.
+    pub fn definition() -> Json {
+        let verbs = VERBS.map(|(verb, example, _)| {
+            let text = format!("`{example}`");
+            (verb.to_owned(), described(argument(verb), &text))
+        });
+        let companions =
+            COMPANIONS.map(|(key, text)| (key.to_owned(), described(companion(key), text)));
+        let with = |(key, _): &(&str, &str)| {
+            let goes = VERBS.iter().filter(|(.., keys)| keys.contains(key));
+            let any = goes.map(|(verb, ..)| match *key {
+                "ramp" if *verb == "torque" => typed(verb, key, Ns::schema()),
+                "ramp" => typed(verb, key, f64::schema()),
+                _ => json!({ "required": [verb] }),
+            });
+            (
+                (*key).to_owned(),
+                json!({ "anyOf": any.collect::<Vec<_>>() }),
+            )
+        };
+        json!({
+            "type": "object",
+            "properties": Map::from_iter(verbs.into_iter().chain(companions)),
+            "additionalProperties": false,
+            "oneOf": VERBS.map(|(verb, ..)| json!({ "required": [verb] })),
+            "dependencies": Map::from_iter(COMPANIONS.iter().map(with)),
+        })
+    }
+}
+
+/// Returns the schema of a step with this verb, in which a key has a type.
+fn typed(verb: &str, key: &str, schema: Json) -> Json {
+    json!({ "required": [verb], "properties": { key: schema } })
+}
+
+/// Returns the schema of a verb's argument.
+fn argument(verb: &str) -> Json {
+    let only = |schema: Json| {
+        let mut schema = named(schema);
+        schema["maxProperties"] = 1.into();
+        schema
+    };
+    match verb {
+        "enable" | "disable" | "reset" | "stop" | "home" => any_of([
+            json!({ "enum": [true] }),
+            String::schema(),
+            json!({ "type": "array", "items": { "type": "string" }, "minItems": 1 }),
+        ]),
+        "move" | "move_by" | "line" | "line_by" | "velocity" | "torque" => named(f64::schema()),
+        "sine" | "square" => only(RawWave::schema()),
+        "probe" => {
+            let mut probe = RawProbe::schema();
+            probe["oneOf"] = json!([{ "required": ["to"] }, { "required": ["by"] }]);
+            only(probe)
+        }
+        "table" => only(String::schema()),
+        "gear" => only(RawGear::schema()),
+        "mode" => named(String::schema()),
+        "dwell" => Ns::schema(),
+        "wait" => Conditions::schema(),
+        "set" => named(named(any_of([f64::schema(), bool::schema()]))),
+        _ => schema::integer(1, 1_000_000),
+    }
+}
+
+/// Returns the schema of a key that goes with a verb.
+fn companion(key: &str) -> Json {
+    match key {
+        "speed" => f64::schema(),
+        "ramp" => any_of([f64::schema(), Ns::schema()]),
+        "arrive" => ARRIVALS.schema(),
+        "timeout" => TIMEOUTS.schema(),
+        _ => Vec::<RawStep>::schema(),
+    }
 }
