@@ -5,7 +5,8 @@
 //! - `verbs`: one file or folder per subcommand, each with its arguments and `run`;
 //! - `render`: text for people: summaries, tables, fault reports, progress;
 //! - `hints`: message and advice for each failure;
-//! - `failure`: a failure for the user, with its exit code.
+//! - `failure`: a failure for the user, with its exit code;
+//! - `starter`: the demonstration and the starter, which are part of the program.
 //!
 //! Results go to stdout, progress and errors to stderr.
 
@@ -18,12 +19,15 @@ mod args;
 mod failure;
 mod hints;
 mod render;
+mod starter;
 mod verbs;
 
 use verbs::Verb;
 
 const EXAMPLES: &str = "\
 Examples:
+  ecaxis run                         the demonstration, on a simulated bus
+  ecaxis init press                  a machine file to start from
   ecaxis scan enp3s0                 the devices on the bus
   ecaxis check machine.toml          all problems in the machine file
   ecaxis explain machine.toml        the derived configuration
@@ -136,14 +140,15 @@ mod tests {
                 "ecaxis run m.toml --sim --virtual --for 1h --repeat 2 --seed 7 --json",
                 true,
             ),
-            ("ecaxis run --nic eth0 --sim", false),
+            ("ecaxis run m.toml --nic eth0 --sim", false),
+            ("ecaxis init d --rust --source s --force", true),
+            ("ecaxis init d --source s", false),
             ("ecaxis run --for 10", false),
             ("ecaxis run --repeat 0", false),
             ("ecaxis check", false),
             ("ecaxis compare", false),
             ("ecaxis compare m.toml --sim o.toml --apply", true),
             ("ecaxis compare m.toml --apply --json", false),
-            ("ecaxis scan", false),
             ("ecaxis scan eth0 --tree", true),
             ("ecaxis scan --sim m.toml --ask --json", true),
             ("ecaxis scan eth0 --sim m.toml", false),
@@ -193,7 +198,7 @@ mod tests {
             ("ecaxis run --record r.pcapng --record-limit 100", false),
             ("ecaxis run --record-limit 100MB", false),
             ("ecaxis run --replay r.pcapng --record again.pcapng", true),
-            ("ecaxis run --replay r.pcapng --nic eth0", false),
+            ("ecaxis run m.toml --replay r.pcapng --nic eth0", false),
             ("ecaxis firmware", false),
             ("ecaxis firmware info m.toml x --sim --json", true),
             ("ecaxis firmware info --nic eth0 --position 0", true),

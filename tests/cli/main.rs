@@ -3,9 +3,12 @@
 mod bench;
 mod change_log;
 mod complaints;
+mod completions;
 mod conformance;
 mod doctor;
 mod esi;
 mod identity;
+mod init;
 mod messages;
+mod mistakes;
 mod terminal;

@@ -222,19 +222,6 @@ fn help_of_every_verb_fits_80_columns_and_has_examples() {
 }
 
 #[test]
-fn completions_exist_for_every_shell() {
-    for (shell, parts) in [
-        ("bash", &["complete -F _ecaxis", "--faults"][..]),
-        ("zsh", &["#compdef ecaxis", "--faults"]),
-        ("fish", &["complete -c ecaxis", "faults"]),
-    ] {
-        let script = run(["completions", shell]).exits(0).out;
-        assert_contains(&script, &[parts, &["doctor", "explain"]].concat());
-    }
-    run(["completions", "dos"]).fails(2, &["'dos'"]);
-}
-
-#[test]
 fn man_writes_a_page_for_every_verb() {
     let folder = tempfile::tempdir().expect("a folder");
     let man = folder.path().join("man1");

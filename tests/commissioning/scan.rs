@@ -242,7 +242,7 @@ fn scan_write_includes_a_device_without_esi() {
 fn scan_rejects_wrong_arguments() {
     let bench = bench();
     for (arguments, expected) in [
-        (&["scan"][..], "<IF>"),
+        (&["scan"][..], "this computer has"),
         (&["scan", "--sim", "missing.toml"], "missing.toml"),
         (&["scan", "no-such-if"], "no-such-if"),
         (

@@ -244,6 +244,18 @@ fn first_steps_over_a_real_interface() {
     });
 }
 
+/// Both would answer each frame.
+#[test]
+fn a_second_simulated_bus_on_an_interface_is_refused() {
+    over_a_pair(|pair| {
+        let bench = bench();
+        let served = serve(&bench, &pair, "bench.toml");
+        let second = bench.ecaxis(&["sim", "bench.toml", "--nic", &pair.a]);
+        let first = format!("another ecaxis (pid {}) uses `{}`", served.id(), pair.a);
+        second.fails(1, &[&first, "= help: end that one"]);
+    });
+}
+
 /// A run leaves no traces: scans before and after it write the same file.
 #[test]
 fn a_run_leaves_the_bus_unchanged() {

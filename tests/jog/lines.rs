@@ -154,3 +154,23 @@ fn the_end_of_input_ends_the_run() {
     assert_eq!(code, 2);
     assert!(err.contains("too long"), "{err}");
 }
+
+/// The others could go on after a reset, so the run does not fail; the report is kept all the same.
+#[test]
+fn a_missing_device_leaves_a_fault_report() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_owned();
+    let cut = "[[fault]]\nkind = \"absent\"\ndevice = 1\nat = \"1s\"\n";
+    std::fs::write(at("cut.toml"), cut).expect("written");
+    let (faults, report) = (at("cut.toml"), at("report.txt"));
+    let lines = "enable\nwait\nwait 3s\nquit\n";
+    let options = ["--faults", &faults, "--fault-report", &report];
+    let (code, _, err) = script(lines, &options);
+    assert_eq!(code, 0, "{err}");
+    assert!(err.contains("full fault report: "), "{err}");
+    let text = std::fs::read_to_string(&report).expect("a report");
+    assert!(text.contains("`y` (position 1"), "{text}");
+    let (code, _, err) = script(lines, &options);
+    assert_eq!(code, 2, "{err}");
+    assert!(err.contains("report.txt exists already"), "{err}");
+}

@@ -1,8 +1,10 @@
 //! Arguments that several subcommands share, and the files they name.
 
+pub(crate) mod bus;
 pub(crate) mod files;
 pub(crate) mod numbers;
 pub(crate) mod record;
+pub(crate) mod report;
 pub(crate) mod trace;
 
 #[derive(Debug, clap::Args)]

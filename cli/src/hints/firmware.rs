@@ -1,5 +1,6 @@
 //! Advice for a firmware update that was refused or interrupted.
 
+use ecaxis_master::acyclic::AlState;
 use ecaxis_master::config::Nic;
 use ecaxis_master::mailbox::{FoeCause, FoeError};
 use ecaxis_master::report;
@@ -114,6 +115,10 @@ fn foe(error: &FoeError) -> Option<&'static str> {
 
 fn again(left: FinalDeviceState) -> String {
     match left {
+        FinalDeviceState::In { state, .. } if state != AlState::Bootstrap => {
+            "`ecaxis firmware info` shows the program that it runs; the same command tries again"
+                .to_owned()
+        }
         FinalDeviceState::In { .. } => {
             "its boot loader waits for a program; the same command tries again from there"
                 .to_owned()

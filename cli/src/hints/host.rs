@@ -56,7 +56,7 @@ pub(crate) fn concern(concern: &NicWarning) -> Option<String> {
 }
 
 /// Lists the interfaces of this computer.
-pub(super) fn interfaces() -> String {
+pub(crate) fn interfaces() -> String {
     let names = ecaxis_master::link::interface::interfaces();
     if names.is_empty() {
         return "this computer has no network interface for EtherCAT; `--sim` runs without one"

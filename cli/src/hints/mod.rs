@@ -24,8 +24,7 @@ mod service;
 
 pub(crate) use fault_report::diagnosed;
 pub(crate) use firmware::{firmware, shared_bus};
-use host::interfaces;
-pub(crate) use host::{capabilities, concern, denied, interface, overload};
+pub(crate) use host::{capabilities, concern, denied, interface, interfaces, overload};
 use service::{FRAMES, eeprom, information, parameter};
 pub(crate) use service::{image, restore, with_other_main_device};
 
@@ -502,7 +501,7 @@ fn machine_files(path: &Path) -> String {
             return format!("machine files nearby: {}", names.join(", "));
         }
     }
-    "name a machine file, such as configs/demo.toml".to_owned()
+    "`ecaxis init DIR` writes a machine file to start from".to_owned()
 }
 
 #[cfg(test)]

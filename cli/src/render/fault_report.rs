@@ -15,6 +15,7 @@ use ecaxis_tools::document::{Document, Table};
 
 use super::report;
 use crate::failure::{FAILED, Failure};
+use crate::hints::diagnosed;
 use crate::render::note;
 
 /// The page width in columns.
@@ -319,6 +320,32 @@ fn axis_cycles(fault_report: &FaultReport, out: &mut Document) {
 const VELOCITY: i8 = 9;
 const PROFILE_VELOCITY: i8 = 3;
 
+/// Prints a fault report in short on stderr and keeps it. With `advise`, the advice for a known
+/// cause replaces `hints`. Returns a line that names the kept file.
+pub(crate) fn print(
+    fault_report: &FaultReport,
+    hints: &mut Vec<String>,
+    destination: &ReportDestination,
+    advise: bool,
+) -> Option<String> {
+    let advice = diagnosed(&fault_report.cause);
+    if advise && !advice.is_empty() {
+        *hints = advice;
+    }
+    let short = short(fault_report);
+    if !short.is_empty() {
+        note(short.trim_end());
+    }
+    let kept = keep(fault_report, hints, destination).unwrap_or_else(|trouble| {
+        note(&format!("  warning: {}", trouble.message));
+        None
+    });
+    kept.map(|path| {
+        let path = path.display();
+        format!("  full fault report: {path}, and as JSON next to it")
+    })
+}
+
 /// Where a fault report is written.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum ReportDestination {
@@ -329,7 +356,7 @@ pub(crate) enum ReportDestination {
 }
 
 /// Writes the page, and the fault report as JSON next to it.
-pub(crate) fn keep(
+fn keep(
     fault_report: &FaultReport,
     hints: &[String],
     keep: &ReportDestination,

@@ -311,6 +311,14 @@ fn verify(args: &VerifyArgs) -> Result<(), Failure> {
         for line in problems.iter().chain(&remarks) {
             result(&format!("{line}\n"))?;
         }
+        if problems.is_empty() {
+            let same = other.as_ref().map(|(_, path)| path.display());
+            let same = same.map_or_else(String::new, |path| format!(", as in {path}"));
+            let bytes = there.len();
+            result(&format!(
+                "{device}: its EEPROM is right: {bytes} bytes{same}\n"
+            ))?;
+        }
     }
     if problems.is_empty() {
         return Ok(());

@@ -17,10 +17,12 @@ mod eeprom;
 pub(crate) mod esi;
 mod explain;
 mod firmware;
+mod init;
 pub(crate) mod jog;
 mod man;
 mod run;
 mod scan;
+mod schema;
 mod sdo;
 mod serve;
 mod sim;
@@ -28,6 +30,7 @@ mod sim;
 #[derive(Debug, Subcommand)]
 pub(crate) enum Verb {
     Run(run::Args),
+    Init(init::Args),
     Serve(serve::Args),
     Check(check::Args),
     Explain(explain::Args),
@@ -42,6 +45,7 @@ pub(crate) enum Verb {
     Analyze(analyze::Args),
     Firmware(firmware::Args),
     Jog(jog::Args),
+    Schema(schema::Args),
     Completions(completions::Args),
     Man(man::Args),
 }
@@ -96,6 +100,7 @@ impl Verb {
     fn run_unlogged(self) -> Result<(), Failure> {
         match self {
             Self::Run(args) => run::run(&args),
+            Self::Init(args) => init::run(&args),
             Self::Serve(args) => serve::run(&args),
             Self::Check(args) => check::run(&args),
             Self::Explain(args) => explain::run(&args),
@@ -109,6 +114,7 @@ impl Verb {
             Self::Bench(args) => bench::run(&args),
             Self::Firmware(args) => firmware::run(&args),
             Self::Jog(args) => jog::run(&args),
+            Self::Schema(args) => schema::run(&args),
             Self::Completions(args) => completions::run(&args),
             Self::Man(args) => man::run(&args),
             Self::Analyze(args) => analyze::run(&args),

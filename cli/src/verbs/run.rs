@@ -1,23 +1,24 @@
 //! `ecaxis run`: brings a machine up, runs its program and prints a summary.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
-use ecaxis_master::config::{self, ConfigError, Machine, Nic, duration};
-use ecaxis_master::post_mortem::FaultReport;
+use ecaxis_master::config::{Machine, Nic, duration};
 use ecaxis_master::session::{self, Options, Outcome, Summary};
-use ecaxis_sim::{FaultScript, SecondPort};
 use serde_json::{Value, json};
 
 use crate::access::signals;
+use crate::args::bus::BusArgs;
 use crate::args::files::{Inputs, check_output};
 use crate::args::record;
+use crate::args::report::ReportArgs;
 use crate::hints::{self, Failure};
-use crate::render::fault_report::{self, ReportDestination};
+use crate::render::fault_report;
 use crate::render::progress::ProgressPrinter;
 use crate::render::{note, print, print_json, report};
+use crate::starter;
 use crate::verbs::check;
 
 const EXAMPLES: &str = "\
@@ -38,15 +39,11 @@ is ignored.";
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// Machine file
-    #[arg(value_name = "FILE", default_value = "configs/demo.toml")]
-    file: PathBuf,
-    /// Use this network interface instead of the file's
-    #[arg(long, value_name = "IF", conflicts_with = "sim")]
-    nic: Option<String>,
-    /// Use the simulated bus instead of the file's interface
-    #[arg(long)]
-    sim: bool,
+    /// Machine file [default: the demonstration, on its simulated bus]
+    #[arg(value_name = "FILE")]
+    file: Option<PathBuf>,
+    #[command(flatten)]
+    bus: BusArgs,
     /// Run in virtual time: as fast as possible, the same every time (simulated bus only)
     #[arg(long = "virtual")]
     virtual_time: bool,
@@ -59,9 +56,6 @@ pub(crate) struct Args {
     /// Seed of the simulated bus
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Fault script for the simulated bus
-    #[arg(long, value_name = "FILE")]
-    faults: Option<PathBuf>,
     /// Bring the bus to Op without enabling the axes, until Ctrl-C or the end of `--for`
     #[arg(long, conflicts_with = "enable")]
     no_enable: bool,
@@ -82,13 +76,8 @@ pub(crate) struct Args {
     /// deviates
     #[arg(long, value_name = "FILE", conflicts_with_all = ["nic", "seed", "faults"])]
     replay: Option<PathBuf>,
-    /// Write the fault report of a failed run to this file, and as JSON next to it [default:
-    /// ecaxis-stop-TIME.txt in the current folder, on a real bus only]
-    #[arg(long, alias = "story", value_name = "FILE")]
-    fault_report: Option<PathBuf>,
-    /// Write no fault report
-    #[arg(long, alias = "no-story", conflicts_with = "fault_report")]
-    no_fault_report: bool,
+    #[command(flatten)]
+    report: ReportArgs,
     /// Overwrite existing output files
     #[arg(long)]
     force: bool,
@@ -97,19 +86,20 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let sim = args.sim || args.replay.is_some();
-    let machine = match load(&args.file, args.nic.as_deref(), sim) {
-        Ok(machine) => Machine {
-            enable: args.enable || machine.enable && !args.no_enable,
-            ..machine
-        },
-        Err(error) => {
-            let short = check::in_short(&args.file, &error);
-            let failure = hints::config(&args.file, &error);
+    let mut machine = match &args.file {
+        None => demonstration(args)
+            .inspect_err(|f| print_failure(args, &f.message, &f.hints, json!([])))?,
+        Some(file) => args.bus.load(file).map_err(|error| {
+            let failure = hints::config(file, &error);
+            let short = check::in_short(file, &error);
             print_failure(args, &short, &failure.hints, check::problems(&error));
-            return Err(failure);
-        }
+            failure
+        })?,
     };
+    machine.enable = args.enable || machine.enable && !args.no_enable;
+    if args.replay.is_some() {
+        machine.bus.nic = Nic::Sim;
+    }
     let options = options(args, &machine)
         .inspect_err(|f| print_failure(args, &f.message, &f.hints, json!([])))?;
     if !machine.enable && !args.no_enable {
@@ -140,7 +130,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     });
     failure = failure.or_else(|| summary.as_ref().and_then(unfinished));
     if let (Some(fault_report), Some(failure)) = (&fault_report, &mut failure) {
-        print_fault_report(args, fault_report, failure, &nic);
+        let keep = args.report.destination(&nic);
+        // The recorded bus cannot be fixed during a replay.
+        let advise = args.replay.is_none();
+        failure.after = fault_report::print(fault_report, &mut failure.hints, &keep, advise);
     }
     let written = if args.json {
         print_json(&json!({
@@ -183,37 +176,6 @@ fn stopped_since(summary: &Summary) -> Option<Failure> {
     Some(Failure::new(hints::FAILED, message).hint(hint))
 }
 
-/// Prints the fault report in short on stderr and writes it to a file. If the cause is known, its
-/// advice replaces the advice for the error.
-fn print_fault_report(args: &Args, fault_report: &FaultReport, failure: &mut Failure, nic: &Nic) {
-    let advice = hints::diagnosed(&fault_report.cause);
-    // The recorded bus cannot be fixed during a replay.
-    if !advice.is_empty() && args.replay.is_none() {
-        failure.hints = advice;
-    }
-    let short = fault_report::short(fault_report);
-    if !short.is_empty() {
-        note(short.trim_end());
-    }
-    let keep = match (&args.fault_report, nic) {
-        _ if args.no_fault_report => ReportDestination::No,
-        (Some(path), _) => ReportDestination::File(path.clone()),
-        (None, Nic::Interface(_)) => ReportDestination::Folder(PathBuf::new()),
-        // A simulated run is repeatable, so its fault report is not kept.
-        (None, Nic::Sim) => ReportDestination::No,
-    };
-    match fault_report::keep(fault_report, &failure.hints, &keep) {
-        Ok(Some(path)) => {
-            failure.after = Some(format!(
-                "  full fault report: {}, and as JSON next to it",
-                path.display()
-            ))
-        }
-        Ok(None) => {}
-        Err(trouble) => note(&format!("  warning: {}", trouble.message)),
-    }
-}
-
 /// Prints the failure as JSON if `--json` was given.
 fn print_failure(args: &Args, error: &str, hints: &[String], problems: Value) {
     if args.json {
@@ -224,39 +186,29 @@ fn print_failure(args: &Args, error: &str, hints: &[String], problems: Value) {
     }
 }
 
-/// Loads a machine file. `nic` and `sim` override the bus of the file.
-pub(crate) fn load(file: &Path, nic: Option<&str>, sim: bool) -> Result<Machine, ConfigError> {
-    let mut machine = config::load(file)?;
-    if sim || nic == Some("sim") {
-        machine.bus.nic = Nic::Sim;
-    } else if let Some(nic) = nic {
-        machine.bus.nic = Nic::Interface(nic.to_owned());
+/// Returns the demonstration, which no interface replaces: real drives need a file of their own.
+fn demonstration(args: &Args) -> Result<Machine, Failure> {
+    if args.bus.nic.is_some() {
+        return Err(Failure::new(hints::WRONG, "--nic: which machine file?")
+            .hint("`ecaxis scan IF --write FILE` writes one for the devices on an interface"));
     }
-    Ok(machine)
+    starter::demonstration()
 }
 
 fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
-    if let Nic::Interface(nic) = &machine.bus.nic {
-        let needs_sim = [
-            (args.virtual_time, "--virtual"),
-            (args.faults.is_some(), "--faults"),
-            (args.seed.is_some(), "--seed"),
-        ];
-        if let Some((_, option)) = needs_sim.iter().find(|(given, _)| *given) {
-            let message = format!("{option} needs the simulated bus, the machine is on `{nic}`");
-            return Err(Failure::new(hints::WRONG, message).hint("add --sim"));
-        }
-    }
+    let needs_sim = [
+        (args.virtual_time, "--virtual"),
+        (args.seed.is_some(), "--seed"),
+    ];
+    let faults = args.bus.script(machine, &needs_sim)?;
     let virtual_time = args.virtual_time || args.replay.is_some();
     let ends = machine.enable && !machine.steps.is_empty();
     if virtual_time && !ends && args.time.is_none() {
         let message = "--virtual without a program would never end";
         return Err(Failure::new(hints::WRONG, message).hint("add `--for 10s` or a [[step]]"));
     }
-    let script = args.faults.as_deref();
-    let faults = script.map(|path| faults(path, machine, None)).transpose()?;
     let inputs = Inputs::from_machine(machine)
-        .with("the fault script", script)
+        .with("the fault script", &args.bus.faults)
         .with("the recording to replay", &args.replay);
     if let Some(path) = &args.record {
         check_output("--record", path, args.force, &inputs)?;
@@ -264,21 +216,7 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
             record::check_parts(path, args.force, &inputs)?;
         }
     }
-    if let Some(path) = &args.fault_report {
-        let data = path.with_extension("json");
-        if data == *path {
-            let message = format!(
-                "--fault-report: {} is the file of the JSON data",
-                path.display()
-            );
-            return Err(Failure::new(hints::WRONG, message).hint(
-                "name the page, such as `report.txt`; the JSON data are written next to it",
-            ));
-        }
-        for path in [path, &data] {
-            check_output("--fault-report", path, args.force, &inputs)?;
-        }
-    }
+    args.report.check(args.force, &inputs)?;
     let seed = args.seed.or(faults.as_ref().and_then(|f| f.seed));
     let defaults = Options::default();
     Ok(Options {
@@ -298,30 +236,16 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
     })
 }
 
-/// The maximum size of a fault script in bytes.
-const MAX_BYTES: u64 = 16 << 20;
-
-/// Loads a fault script and checks it against the machine's simulated bus, which may be a ring.
-pub(crate) fn faults(
-    path: &Path,
-    machine: &Machine,
-    ring: Option<SecondPort>,
-) -> Result<FaultScript, Failure> {
-    let text = ecaxis_master::file::read_text(path, MAX_BYTES)
-        .map_err(|e| Failure::new(hints::WRONG, format!("cannot read {}: {e}", path.display())))?;
-    let bus = session::topology(machine, ring).map_err(|e| hints::failure(&e, &machine.bus.nic))?;
-    let script = FaultScript::parse(&text).and_then(|script| {
-        script.check(&bus)?;
-        Ok(script)
-    });
-    script.map_err(|e| Failure::new(hints::WRONG, format!("{}: {e}", path.display())))
-}
-
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
+    use ecaxis_master::config;
     use ecaxis_master::session::{Observer, Progress};
+    use ecaxis_sim::SecondPort;
 
     use super::*;
+    use crate::args::bus::faults;
 
     struct QuietObserver;
 

@@ -8,17 +8,17 @@ use std::sync::Arc;
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::change_log::ChangeLog;
 use ecaxis_master::clock::Clock;
-use ecaxis_master::config::{Nic, duration};
+use ecaxis_master::config::duration;
 use ecaxis_master::session::Options;
 use ecaxis_server::http::HttpOptions;
 use ecaxis_server::serve::{ServeError, ServerOptions, new_token, serve};
 
 use crate::access::signals;
 use crate::args::Verbosity;
+use crate::args::bus::BusArgs;
 use crate::args::files::{Inputs, check_output};
 use crate::hints::{self, Failure};
 use crate::render::note;
-use crate::verbs::run;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -42,21 +42,14 @@ pub(crate) struct Args {
     /// Machine file
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// Use this network interface instead of the file's
-    #[arg(long, value_name = "IF", conflicts_with = "sim")]
-    nic: Option<String>,
-    /// Use the simulated bus instead of the file's interface
-    #[arg(long)]
-    sim: bool,
+    #[command(flatten)]
+    bus: BusArgs,
     /// Let time advance only as clients ask (simulated bus only)
     #[arg(long = "virtual")]
     virtual_time: bool,
     /// Seed of the simulated bus
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Fault script for the simulated bus
-    #[arg(long, value_name = "FILE")]
-    faults: Option<PathBuf>,
     /// Control socket [default: NAME.sock in $RUNTIME_DIRECTORY, /run/ecaxis or
     /// $XDG_RUNTIME_DIR/ecaxis]
     #[arg(long, value_name = "PATH")]
@@ -100,27 +93,17 @@ fn mode(text: &str) -> Result<u32, String> {
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let machine = run::load(&args.file, args.nic.as_deref(), args.sim)
-        .map_err(|error| hints::config(&args.file, &error))?;
+    let loaded = args.bus.load(&args.file);
+    let machine = loaded.map_err(|error| hints::config(&args.file, &error))?;
     let nic = machine.bus.nic.clone();
-    if let Nic::Interface(name) = &nic {
-        let needs_sim = [
-            (args.virtual_time, "--virtual"),
-            (args.faults.is_some(), "--faults"),
-            (args.seed.is_some(), "--seed"),
-        ];
-        if let Some((_, option)) = needs_sim.iter().find(|(given, _)| *given) {
-            let message = format!("{option} needs the simulated bus, the machine is on `{name}`");
-            return Err(Failure::new(hints::WRONG, message).hint("add --sim"));
-        }
-    }
-    let script = args.faults.as_deref();
-    let faults = script
-        .map(|path| run::faults(path, &machine, None))
-        .transpose()?;
+    let needs_sim = [
+        (args.virtual_time, "--virtual"),
+        (args.seed.is_some(), "--seed"),
+    ];
+    let faults = args.bus.script(&machine, &needs_sim)?;
     if let Some(path) = &args.record {
         let inputs = Inputs::from_machine(&machine)
-            .with("the fault script", script)
+            .with("the fault script", &args.bus.faults)
             .with("the file with the token", &args.token_file);
         check_output("--record", path, args.force, &inputs)?;
     }

@@ -9,6 +9,7 @@ use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config;
 use ecaxis_master::link::OpenError;
 use ecaxis_master::link::SocketKind;
+use ecaxis_master::link::lock::{NicInUse, NicLock};
 use ecaxis_master::link::nic::NicLink;
 use ecaxis_master::session;
 use ecaxis_master::sys::rt_thread;
@@ -18,11 +19,11 @@ use serde_json::{Value, json};
 use ecaxis_master::text::pluralize;
 
 use crate::access::signals;
+use crate::args::bus;
 use crate::args::files::{Inputs, check_output, unwritable, write_new};
 use crate::args::trace::Trace;
 use crate::hints::{self, Failure};
 use crate::render::{note, result};
-use crate::verbs::run;
 
 /// SCHED_FIFO priority of the simulated bus, below that of a master on the same computer.
 const PRIORITY: u8 = 70;
@@ -91,7 +92,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let devices = machine.devices.len();
     let ring = args.nic2.as_ref().map(|_| SecondPort::Listens);
     let faults = args.faults.as_deref();
-    let faults = faults.map(|f| run::faults(f, &machine, ring)).transpose()?;
+    let faults = faults.map(|f| bus::faults(f, &machine, ring)).transpose()?;
     let seed = faults
         .as_ref()
         .and_then(|f| f.seed)
@@ -125,6 +126,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             }
         }
     }
+    let locks = nics
+        .iter()
+        .map(|nic| lock(nic))
+        .collect::<Result<Vec<_>, _>>()?;
     let server = Server::open(&nics).map_err(|e| hints::serve(&e))?;
     if let Some(folder) = &args.sii {
         write_images(&segment, folder)?;
@@ -167,11 +172,23 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             },
         )
         .map_err(|e| hints::serve(&e))?;
+    drop(locks);
     let report = report(&stats, &segment);
     result(&if args.json {
         format!("{report:#}\n")
     } else {
         text(&report)
+    })
+}
+
+/// Locks an interface: two simulated buses would both answer each frame. Returns `None` if the
+/// system has no locks.
+fn lock(nic: &str) -> Result<Option<NicLock>, Failure> {
+    NicLock::take(nic).map_err(|NicInUse { pid }| {
+        let pid = pid.map_or_else(String::new, |pid| format!(" (pid {pid})"));
+        let message = format!("another ecaxis{pid} uses `{nic}`, as a simulated bus or a master");
+        Failure::new(hints::FAILED, message)
+            .hint("end that one with Ctrl-C, or answer on another interface")
     })
 }
 

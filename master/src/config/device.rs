@@ -383,6 +383,11 @@ impl DeviceQuery<'_> {
                 e.to_string(),
                 "pick one by its mode (`mode = \"csp\"`), or name the modules slot by slot (`modules = [\"CSP\"]`)",
             ),
+            E::ModeNotOffered { .. } => p.add_hint(
+                at,
+                e.to_string(),
+                "pick another mode, or the ESI file of the drive; an I/O device has no `mode` and no [device.axis]",
+            ),
             _ => p.add(at, e.to_string()),
         }
     }

@@ -50,7 +50,7 @@ fn a_wrong_file_is_rejected_and_the_right_one_accepted_afterwards() {
                 let state = match (via, &**cause) {
                     (UpdateMethod::Foe, UpdateCause::Foe(error)) => {
                         assert_eq!(error.code(), Some(foe), "{what}: {error}");
-                        AlState::Bootstrap
+                        AlState::Init
                     }
                     (UpdateMethod::Program, UpdateCause::Sdo(error)) => {
                         assert_eq!(error.abort_code(), Some(sdo), "{what}: {error}");
@@ -61,6 +61,10 @@ fn a_wrong_file_is_rejected_and_the_right_one_accepted_afterwards() {
                 assert_eq!(*left, FinalDeviceState::In { state, code: 0 }, "{what}");
                 let stopped = bench.device().is_stopped();
                 assert_eq!(stopped, via == UpdateMethod::Program, "{what}");
+                // The boot loader that refused the file has started its program again.
+                if keeps && via == UpdateMethod::Foe {
+                    assert_eq!(bench.examine().runs(), RunningProgram::Program, "{what}");
+                }
                 // The device works as before, unless its program was erased.
                 bench.power(false);
                 bench.power(true);

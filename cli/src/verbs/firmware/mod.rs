@@ -12,9 +12,9 @@ use ecaxis_master::config::Nic;
 use ecaxis_master::session::Options;
 
 use crate::access::device::{DeviceArgs, Target};
+use crate::args::bus;
 use crate::args::files::{Inputs, check_output};
 use crate::hints::{Failure, WRONG};
-use crate::verbs::run;
 
 mod info;
 mod sample;
@@ -81,7 +81,7 @@ impl TargetArgs {
             ));
         }
         let faults = match (&self.faults, machine) {
-            (Some(file), Some(machine)) => Some(run::faults(file, machine, None)?),
+            (Some(file), Some(machine)) => Some(bus::faults(file, machine, None)?),
             _ => None,
         };
         if let Some(path) = &self.record {

@@ -19,6 +19,7 @@ use serde_json::json;
 use super::panel::{AxisPanel, Panel, number};
 use crate::hints;
 use crate::hints::Failure;
+use crate::render::fault_report::ReportDestination;
 use crate::render::progress::ProgressPrinter;
 use crate::render::show_failure;
 
@@ -64,6 +65,7 @@ pub(super) fn run(
     options: Options,
     stop: Arc<CancelToken>,
     json: bool,
+    destination: ReportDestination,
 ) -> Result<(), Failure> {
     let (lines, read) = sync_channel(AHEAD);
     let (say, said) = channel::<String>();
@@ -108,9 +110,8 @@ pub(super) fn run(
     let outcome = session::run_with_operator(machine, options, stop, &mut teller, Box::new(script));
     drop(teller);
     let _ = printer.join();
-    outcome
-        .result
-        .map_err(|error| hints::failure(&error, &nic))?;
+    let fault_report = outcome.fault_report.as_deref();
+    super::report_end(outcome.result, fault_report, destination, &nic)?;
     let mut failure = failure.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(failure) = failure.take() {
         return Err(failure);

@@ -20,22 +20,27 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use ecaxis_master::bringup::Step;
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config::{Machine, Nic};
+use ecaxis_master::post_mortem::FaultReport;
 use ecaxis_master::session::{self, Cause, Error, Observer, Options, Outcome, Progress};
 use ecaxis_master::supervise::operator::{
     HOLD_TO_RUN_TIMEOUT, Operator, OperatorInput, Presence, Request, RequestEvent, View,
 };
 
 use crate::access::signals;
+use crate::args::bus::BusArgs;
 use crate::args::files::{Inputs, check_output};
+use crate::args::report::ReportArgs;
 use crate::hints;
 use crate::hints::Failure;
+use crate::render::fault_report::{self, ReportDestination};
+use crate::render::note;
 use crate::render::print;
 use crate::render::report;
 use crate::render::style;
-use crate::verbs::run;
 use draw::Screen;
 use keys::Keys;
 use panel::{Messages, Panel};
@@ -79,12 +84,8 @@ pub(crate) struct Args {
     /// Machine file; its program does not run
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// Use this network interface instead of the file's
-    #[arg(long, value_name = "IF", conflicts_with = "sim")]
-    nic: Option<String>,
-    /// Use the simulated bus instead of the file's interface
-    #[arg(long)]
-    sim: bool,
+    #[command(flatten)]
+    bus: BusArgs,
     /// Read commands as lines from standard input
     #[arg(long)]
     lines: bool,
@@ -95,20 +96,19 @@ pub(crate) struct Args {
     /// With --lines: answer in JSON, one object per line
     #[arg(long, requires = "lines")]
     json: bool,
-    /// Fault script for the simulated bus
-    #[arg(long, value_name = "FILE")]
-    faults: Option<PathBuf>,
     /// Record all frames to this pcapng file
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
+    #[command(flatten)]
+    report: ReportArgs,
     /// Overwrite existing output files
     #[arg(long)]
     force: bool,
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let machine = run::load(&args.file, args.nic.as_deref(), args.sim)
-        .map_err(|e| hints::config(&args.file, &e))?;
+    let loaded = args.bus.load(&args.file);
+    let machine = loaded.map_err(|e| hints::config(&args.file, &e))?;
     if machine.axes.is_empty() {
         let message = format!("{} has no axis", args.file.display());
         return Err(Failure::new(hints::WRONG, message).hint("add a [device.axis]"));
@@ -118,7 +118,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let stop = Arc::<CancelToken>::default();
     if args.lines {
         signals::stop_on_interrupt(&stop);
-        return lines::run(machine, options, stop, args.json);
+        let destination = args.report.destination(&nic);
+        return lines::run(machine, options, stop, args.json, destination);
     }
     let terminal = Terminal::take().map_err(no_terminal)?;
     signals::stop_quietly(&stop, terminal::restore);
@@ -126,18 +127,50 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let Outcome {
         summary,
         result: ended,
+        fault_report,
         ..
     } = on(terminal, machine, options, &stop, args, &shared);
     let left = shared.left.load(Ordering::Relaxed);
     let document = summary.as_ref().map(report::summary).unwrap_or_default();
     let written = print(&document);
-    match ended {
-        // Leaving with a key is not an interruption; closing the terminal is.
-        Ok(()) if left => written,
-        Err(error) if left && error.is_interruption() => written,
-        Ok(()) => Err(Failure::interrupted()),
-        Err(error) => Err(hints::failure(&error, &nic)),
+    let ended = match ended {
+        Err(error) if left && error.is_interruption() => Ok(()),
+        ended => ended,
+    };
+    report_end(
+        ended,
+        fault_report.as_deref(),
+        args.report.destination(&nic),
+        &nic,
+    )?;
+    // Leaving with a key is not an interruption; closing the terminal is.
+    match left {
+        true => written,
+        false => Err(Failure::interrupted()),
     }
+}
+
+/// Prints and keeps the fault report, also of a group that stopped while the others went on.
+fn report_end(
+    ended: Result<(), Error>,
+    fault_report: Option<&FaultReport>,
+    destination: ReportDestination,
+    nic: &Nic,
+) -> Result<(), Failure> {
+    let mut failure = ended.err().map(|error| hints::failure(&error, nic));
+    if let Some(report) = fault_report {
+        let mut advice = Vec::new();
+        let advice = failure
+            .as_mut()
+            .map_or(&mut advice, |failure| &mut failure.hints);
+        let kept = fault_report::print(report, advice, &destination, true);
+        match (&mut failure, kept) {
+            (Some(failure), kept) => failure.after = kept,
+            (None, Some(kept)) => note(&kept),
+            (None, None) => {}
+        }
+    }
+    failure.map_or(Ok(()), Err)
 }
 
 fn no_terminal(error: terminal::NoTerminal) -> Failure {
@@ -146,24 +179,13 @@ fn no_terminal(error: terminal::NoTerminal) -> Failure {
 }
 
 fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
-    let needs_sim = [
-        (args.virtual_time, "--virtual"),
-        (args.faults.is_some(), "--faults"),
-    ];
-    if let Nic::Interface(nic) = &machine.bus.nic
-        && let Some((_, option)) = needs_sim.iter().find(|(given, _)| *given)
-    {
-        let message = format!("{option} needs the simulated bus, the machine is on `{nic}`");
-        return Err(Failure::new(hints::WRONG, message).hint("add --sim"));
-    }
-    let script = args.faults.as_deref();
-    let faults = script
-        .map(|path| run::faults(path, machine, None))
-        .transpose()?;
+    let needs_sim = [(args.virtual_time, "--virtual")];
+    let faults = args.bus.script(machine, &needs_sim)?;
+    let inputs = Inputs::from_machine(machine).with("the fault script", &args.bus.faults);
     if let Some(path) = &args.record {
-        let inputs = Inputs::from_machine(machine).with("the fault script", script);
         check_output("--record", path, args.force, &inputs)?;
     }
+    args.report.check(args.force, &inputs)?;
     let defaults = Options::default();
     Ok(Options {
         clock: if args.virtual_time {
@@ -347,6 +369,8 @@ struct Listener {
 impl Observer for Listener {
     fn progress(&mut self, progress: &Progress) {
         let (text, bad) = match progress {
+            // One message per device is enough.
+            Progress::Step(Step::StartUp { done, of, .. }) if done < of => return,
             Progress::Step(step) => (step.to_string(), false),
             Progress::PhaseLocked => ("frames leave in phase with SYNC0".to_owned(), false),
             Progress::Stopping => {

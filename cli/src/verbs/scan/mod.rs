@@ -31,7 +31,7 @@ Examples:
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// Network interface
-    #[arg(value_name = "IF", required_unless_present = "sim")]
+    #[arg(value_name = "IF")]
     nic: Option<String>,
     /// Scan the simulated bus of this machine file instead
     #[arg(long, value_name = "FILE", conflicts_with = "nic")]
@@ -73,12 +73,21 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             Bus::of(&machine)
         }
         (None, Some(nic)) => Bus::interface(nic),
-        (None, None) => return Err(Failure::new(hints::WRONG, "which network interface?")),
+        (None, None) => {
+            return Err(Failure::new(hints::WRONG, "which network interface?")
+                .hint(hints::interfaces())
+                .hint("`--sim FILE` scans the simulated bus of a machine file"));
+        }
     };
     let nic = bus.nic();
     let scan = look(bus, args.ask || args.write.is_some(), args.intrude)?;
     let seen = ScanResult::new(&nic, scan, library.as_ref());
     seen.warn(args.intrude);
+    if library.is_none() && args.write.is_none() {
+        note(
+            "note: no folder `esi` here: put the vendors' ESI files there, or name it with `--esi`",
+        );
+    }
     if let Some(path) = &args.write {
         return write::machine_file(&seen, path, library.is_some(), args.force);
     }

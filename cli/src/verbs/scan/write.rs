@@ -11,6 +11,7 @@ use crate::access::bus;
 use crate::args::files::replace;
 use crate::hints::{self, Failure};
 use crate::render::{note, result};
+use crate::starter::{self, SCHEMA};
 
 /// Fails if the file exists, because it may contain manual changes.
 pub(super) fn refuse(path: &Path, force: bool) -> Result<(), Failure> {
@@ -48,7 +49,12 @@ pub(super) fn machine_file(
     for (image, bytes) in &images {
         replace(image, bytes)?;
     }
-    replace(path, text.as_bytes())?;
+    replace(path, starter::with_schema(&text).as_bytes())?;
+    // A schema that is there may be of a newer version.
+    let schema = path.with_file_name(SCHEMA);
+    if force || !schema.exists() {
+        replace(&schema, starter::schema().as_bytes())?;
+    }
     let devices = seen.scan.devices.len();
     let axes = text.matches("[device.axis]").count();
     let of_them = if axes == 1 { "an axis" } else { "axes" };

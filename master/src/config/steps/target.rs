@@ -182,6 +182,12 @@ pub(super) fn within(
         ),
         _ => format!("{n} {unit} is outside the axis' limits, {low} to {high} {unit}"),
     };
-    p.add(value.span(), message);
+    let hint = match what {
+        TargetKind::Velocity => "correct the step, or `limits.velocity` of the axis",
+        TargetKind::Torque => "correct the step, or `limits.torque` of the axis",
+        _ if limits.position.is_none() => "the drive counts no further; correct the step",
+        _ => "correct the step, or `limits.position` of the axis",
+    };
+    p.add_hint(value.span(), message, hint);
     false
 }
