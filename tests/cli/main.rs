@@ -6,6 +6,7 @@ mod complaints;
 mod completions;
 mod conformance;
 mod doctor;
+mod documents;
 mod esi;
 mod identity;
 mod init;
