@@ -40,7 +40,7 @@ impl<W: Write + Seek> McapFile<W> {
         let mut writer = options.library(library).create(file)?;
         let mut channels = Vec::new();
         for topic in topics.list().iter().filter(|topic| wanted(topic.source)) {
-            let schema = topic.schema;
+            let schema = &topic.schema;
             let schema = writer.add_schema(schema.name, "ros2msg", schema.text.as_bytes())?;
             let channel = writer.add_channel(schema, &topic.name, "cdr", &BTreeMap::new())?;
             channels.push((channel, topic.source));

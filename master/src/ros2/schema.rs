@@ -1,16 +1,18 @@
 //! Message definitions in the format `ros2msg`: the message, then each message that it contains.
 
+use std::borrow::Cow;
+
 /// A message type.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Schema {
     pub name: &'static str,
-    pub text: &'static str,
+    pub text: Cow<'static, str>,
 }
 
 macro_rules! with_header {
-    ($($part:expr),+) => {
+    ($($part:expr),*) => {
         concat!(
-            $($part,)+
+            $($part,)*
             "================================================================================\n",
             "MSG: std_msgs/Header\n",
             "builtin_interfaces/Time stamp\n",
@@ -26,19 +28,19 @@ macro_rules! with_header {
 /// `sensor_msgs/msg/JointState`.
 pub const JOINT_STATE: Schema = Schema {
     name: "sensor_msgs/msg/JointState",
-    text: with_header!(
+    text: Cow::Borrowed(with_header!(
         "std_msgs/Header header\n",
         "string[] name\n",
         "float64[] position\n",
         "float64[] velocity\n",
         "float64[] effort\n"
-    ),
+    )),
 };
 
 /// `diagnostic_msgs/msg/DiagnosticArray`.
 pub const DIAGNOSTIC_ARRAY: Schema = Schema {
     name: "diagnostic_msgs/msg/DiagnosticArray",
-    text: with_header!(
+    text: Cow::Borrowed(with_header!(
         "std_msgs/Header header\n",
         "diagnostic_msgs/DiagnosticStatus[] status\n",
         "================================================================================\n",
@@ -56,13 +58,13 @@ pub const DIAGNOSTIC_ARRAY: Schema = Schema {
         "MSG: diagnostic_msgs/KeyValue\n",
         "string key\n",
         "string value\n"
-    ),
+    )),
 };
 
 /// `ecaxis_msgs/msg/Axis`: one axis in one cycle.
 pub const AXIS: Schema = Schema {
     name: "ecaxis_msgs/msg/Axis",
-    text: with_header!(
+    text: Cow::Borrowed(with_header!(
         "# One axis in one cycle, in the units of the machine file. NaN: no value.\n",
         "# frame_id is the name of the axis.\n",
         "std_msgs/Header header\n",
@@ -91,13 +93,13 @@ pub const AXIS: Schema = Schema {
         "uint8 FAULT=7\n",
         "uint8 UNKNOWN=255\n",
         "uint8 state\n"
-    ),
+    )),
 };
 
 /// `ecaxis_msgs/msg/Bus`: one cycle of the bus.
 pub const BUS: Schema = Schema {
     name: "ecaxis_msgs/msg/Bus",
-    text: with_header!(
+    text: Cow::Borrowed(with_header!(
         "# One cycle of the bus. NaN: no value in this cycle.\n",
         "std_msgs/Header header\n",
         "# The number of the cycle's samples since the start.\n",
@@ -115,16 +117,49 @@ pub const BUS: Schema = Schema {
         "float64 exchange\n",
         "float64 phase_error\n",
         "float64 work\n"
-    ),
+    )),
 };
 
-/// `ecaxis_msgs/msg/Inputs`: all inputs in one cycle.
-pub const INPUTS: Schema = Schema {
-    name: "ecaxis_msgs/msg/Inputs",
-    text: with_header!(
-        "# The inputs in one cycle.\n",
-        "std_msgs/Header header\n",
-        "string[] name\n",
-        "float64[] value\n"
-    ),
-};
+/// Returns `ecaxis_msgs/msg/Inputs` of a machine: a field for each input.
+#[must_use]
+pub fn inputs(names: &[String]) -> Schema {
+    let mut text = String::from("# The inputs in one cycle.\nstd_msgs/Header header\n");
+    let mut fields = vec!["header".to_owned()];
+    for name in names {
+        let field = unique(&field(name), &fields);
+        // A line of its own for the name, whatever its characters.
+        let name: String = name.chars().filter(|c| !c.is_control()).collect();
+        text += &format!("# {name}\nfloat64 {field}\n");
+        fields.push(field);
+    }
+    Schema {
+        name: "ecaxis_msgs/msg/Inputs",
+        text: Cow::Owned(text + with_header!()),
+    }
+}
+
+/// Returns a name as a field, which has lower-case letters, digits and single `_`.
+fn field(name: &str) -> String {
+    let plain = |c: char| {
+        if c.is_ascii_alphanumeric() {
+            c.to_ascii_lowercase()
+        } else {
+            '_'
+        }
+    };
+    let plain: String = name.chars().map(plain).collect();
+    let words: Vec<_> = plain.split('_').filter(|word| !word.is_empty()).collect();
+    let field = words.join("_");
+    match field.starts_with(|c: char| c.is_ascii_alphabetic()) {
+        true => field,
+        false => format!("input_{field}").trim_end_matches('_').to_owned(),
+    }
+}
+
+/// Returns the name, with a number if it is in use.
+pub(super) fn unique<T: AsRef<str>>(name: &str, used: &[T]) -> String {
+    let is_used = |name: &str| used.iter().any(|used| used.as_ref() == name);
+    let numbered = (2_u64..).map(|n| format!("{name}_{n}"));
+    let mut names = std::iter::once(name.to_owned()).chain(numbered);
+    names.find(|name| !is_used(name)).unwrap_or_default()
+}

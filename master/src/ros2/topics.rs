@@ -64,7 +64,7 @@ struct TopicAxis {
 pub struct Topics {
     topics: Vec<Topic>,
     axes: Vec<TopicAxis>,
-    inputs: Vec<String>,
+    inputs: usize,
     /// The time in ns since 1970 at which the clock of the samples was 0.
     epoch: Nanos,
 }
@@ -106,14 +106,8 @@ impl Topics {
             .collect();
         let mut topics = Vec::new();
         let mut add = |name: String, schema, source| {
-            let taken = |name: &str| topics.iter().any(|topic: &Topic| topic.name == name);
-            let mut free = name.clone();
-            let mut n = 2;
-            while taken(&free) {
-                free = format!("{name}_{n}");
-                n += 1;
-            }
-            let name = free;
+            let used: Vec<&str> = topics.iter().map(|topic: &Topic| &*topic.name).collect();
+            let name = schema::unique(&name, &used);
             topics.push(Topic {
                 name,
                 schema,
@@ -132,7 +126,11 @@ impl Topics {
         );
         add("/ecaxis/bus".into(), schema::BUS, Source::Bus);
         if !inputs.is_empty() {
-            add("/ecaxis/inputs".into(), schema::INPUTS, Source::Inputs);
+            add(
+                "/ecaxis/inputs".into(),
+                schema::inputs(&inputs),
+                Source::Inputs,
+            );
         }
         for (index, axis) in axes.iter().enumerate() {
             let name = format!("/ecaxis/axis/{}", token(&axis.name));
@@ -141,7 +139,7 @@ impl Topics {
         Self {
             topics,
             axes,
-            inputs,
+            inputs: inputs.len(),
             epoch,
         }
     }
@@ -161,7 +159,7 @@ impl Topics {
             Source::Bus => COUNT_COLUMNS.len()..AXES_AT,
             Source::JointStates => AXES_AT..end,
             Source::Axis(index) => axis(index)..axis(index + 1),
-            Source::Inputs => end..end + self.inputs.len(),
+            Source::Inputs => end..end + self.inputs,
         }
     }
 
@@ -217,11 +215,6 @@ impl Topics {
     fn inputs(&self, time: Nanos, row: &Row<'_>, bytes: &mut Vec<u8>) {
         let mut to = CdrEncoder::new(bytes);
         header(&mut to, time, "");
-        to.length(self.inputs.len());
-        for name in &self.inputs {
-            to.string(name);
-        }
-        to.length(self.inputs.len());
         for word in self.words(Source::Inputs) {
             to.f64(row.value(word));
         }
