@@ -98,7 +98,8 @@ fn init_rust_writes_a_project_that_builds_and_moves() {
     let built = ecaxis();
     let target = built.ancestors().nth(2).expect("the target folder");
     let cargo = |words: &str| {
-        let mut command = Command::new(env!("CARGO"));
+        // Outside of `cargo test`, the one of rustup selects the toolchain for dependencies too.
+        let mut command = Command::new(std::env::var_os("CARGO").unwrap_or("cargo".into()));
         command.args(words.split(' ')).current_dir(&project);
         command.env("CARGO_TARGET_DIR", target).stdin(Stdio::null());
         command.args(["--config", "profile.dev.package.\"*\".debug=false"]);
