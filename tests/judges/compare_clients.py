@@ -7,6 +7,9 @@ of the real-time thread for each cycle, and the rows that the clients got and mi
 
     ECAXIS_PROFILE=release python tests/judges/compare_clients.py [--axes 32] [--cycle 250us] [--clients 5]
 
+In a third kind of turn, as many pairs of other processes exchange the same number of bytes over the loopback interface:
+what the computer loses by that is not the server's. `--cpu 1` pins the cycle to a CPU and keeps all else from it.
+
 Nothing is asserted about times.
 """
 
@@ -31,9 +34,11 @@ import rig
 HISTOGRAM = "ecaxis_wakeup_lateness_seconds_bucket"
 
 
-def machine(folder, axes, cycle):
+def machine(folder, axes, cycle, cpu):
     built = rig.Machine()
     built._text[0] = f'[bus]\nnic = "sim"\ncycle = "{cycle}"\nlost_frames = 1000\nwatchdog = "6s"\n'
+    if cpu is not None:
+        built._text[0] += f"cpu = {cpu}\n"
     for n in range(axes):
         rig.drive(built, f"a{n}", rig.ROOT / "configs/esi/EPOS4.xml", "EPOS4")
     return built.write(folder)
@@ -82,6 +87,25 @@ def client(port, rows, missed):
             missed.value += lost
 
 
+def foreign_pair(rate):
+    """Sends bytes to itself through a process of its own, at a rate in bytes per second."""
+    os.nice(10)
+    listener = socket.create_server(("127.0.0.1", 0))
+    sender = socket.create_connection(listener.getsockname())
+    receiver, _ = listener.accept()
+    if os.fork() == 0:
+        # Ends with its parent, which closes the connection.
+        sender.close()
+        while receiver.recv(1 << 20):
+            pass
+        os._exit(0)
+    receiver.close()
+    block = bytes(int(rate * 0.05))
+    while True:
+        sender.sendall(block)
+        time.sleep(0.05)
+
+
 def histogram(address):
     text = urllib.request.urlopen(f"{address}/metrics").read().decode()
     found = re.findall(rf'{HISTOGRAM}{{le="([^"]+)"}} (\S+)', text)
@@ -97,10 +121,13 @@ def switches(process):
     raise RuntimeError("there is no real-time thread")
 
 
-def turn(address, process, clients, seconds):
+def turn(address, process, clients, seconds, foreign=None):
     port = urlsplit(address).port
     counts = [(multiprocessing.Value("Q"), multiprocessing.Value("Q")) for _ in range(clients)]
-    readers = [multiprocessing.Process(target=client, args=(port, *count), daemon=True) for count in counts]
+    if foreign is None:
+        readers = [multiprocessing.Process(target=client, args=(port, *count), daemon=True) for count in counts]
+    else:
+        readers = [multiprocessing.Process(target=foreign_pair, args=(foreign,)) for _ in counts]
     for reader in readers:
         reader.start()
     time.sleep(1)
@@ -120,7 +147,7 @@ def turn(address, process, clients, seconds):
     late = "  ".join(f">{limit * 1e6:.0f} µs {share:7.3%}" for limit, share in later.items())
     missed = sum(missed.value for _, missed in counts)
     print(
-        f"{clients} clients: {cycles:.0f} cycles, p99 at most {p99 * 1e6:.0f} µs, {late}, "
+        f"{clients} {'clients' if foreign is None else 'foreign pairs'}: {cycles:.0f} cycles, p99 at most {p99 * 1e6:.0f} µs, {late}, "
         f"switches {per_cycle[0]:.3f} + {per_cycle[1]:.4f}, rows {got / max(1, clients) / cycles:.3f} of each, missed {missed}"
     )
 
@@ -132,20 +159,27 @@ def main():
     parser.add_argument("--clients", type=int, default=5)
     parser.add_argument("--turns", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=8)
+    parser.add_argument("--cpu", type=int)
     arguments = parser.parse_args()
     program = rig.binary()
+    if arguments.cpu is not None:
+        os.sched_setaffinity(0, os.sched_getaffinity(0) - {arguments.cpu})
     with tempfile.TemporaryDirectory(prefix="ecaxis-judge-") as folder:
         folder = pathlib.Path(folder)
-        file = machine(folder, arguments.axes, arguments.cycle)
+        file = machine(folder, arguments.axes, arguments.cycle, arguments.cpu)
         command = [str(program), "serve", str(file), "--sim", "--socket", str(folder / "s.sock"), "--http", "127.0.0.1:0", "--keep", "10s"]
         with rig.process(command, stdout=subprocess.PIPE) as child:
             address = child.stdout.readline().split("/#")[0]
             while json.load(urllib.request.urlopen(f"{address}/api/state"))["bus"]["state"] != "op":
                 time.sleep(0.2)
             time.sleep(2)
+            state = json.load(urllib.request.urlopen(f"{address}/api/machine"))
+            # A row of a batch: its number, its time, and all signals.
+            rate = 8 * (2 + len(state["samples"]["signals"])) * 1e9 / state["cycle_ns"]
             for _ in range(arguments.turns):
-                for clients in (0, arguments.clients):
-                    turn(address, child.pid, clients, arguments.seconds)
+                turn(address, child.pid, 0, arguments.seconds)
+                turn(address, child.pid, arguments.clients, arguments.seconds)
+                turn(address, child.pid, arguments.clients, arguments.seconds, foreign=rate)
             child.send_signal(signal.SIGINT)
             child.wait(30)
 
