@@ -402,6 +402,20 @@ pub enum CommandError {
     /// The axis is homing.
     #[error("the axis is homing")]
     Homing,
+    /// After an external position the axis could no longer stop within the range.
+    #[error(
+        "at {position} with velocity {velocity}, the axis cannot stop within the range [{low}, {high}]"
+    )]
+    NoRoomToStop {
+        /// The velocity to the position.
+        velocity: f64,
+        /// The position.
+        position: f64,
+        /// The lower end of the range.
+        low: f64,
+        /// The upper end of the range.
+        high: f64,
+    },
     /// An external position is too far from the previous one.
     #[error("a step of {step} in one cycle is more than the {most} of the velocity limit")]
     Step {

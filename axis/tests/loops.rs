@@ -188,6 +188,61 @@ fn external_set_points_are_accepted_or_rejected() {
 }
 
 #[test]
+fn external_set_points_leave_room_to_stop_within_the_range() {
+    const END: f64 = 5.0;
+    let mut config = looped(Mode::Csp, SLOW);
+    config.limits.position = Some([-END, END]);
+    let (most, acceleration) = (config.limits.velocity, config.limits.acceleration);
+    for sign in [1.0, -1.0] {
+        let mut rig = enabled(config.clone());
+        let mut at = rig.axis.status().target_position;
+        let mut velocity = 0.0_f64;
+        let refused = loop {
+            velocity = (velocity + acceleration * DT).min(most);
+            match rig.axis.set_point(at + sign * velocity * DT) {
+                Ok(()) => at = rig.cycle().target_position,
+                Err(error) => break error,
+            }
+        };
+        assert!(
+            matches!(refused, CommandError::NoRoomToStop { .. }),
+            "{refused}"
+        );
+        // Without a set-point the axis decelerates within its limits, and within the range.
+        for _ in 0..2000 {
+            let target = rig.cycle().target_position;
+            assert!((-END..=END).contains(&target), "{target}");
+        }
+        let status = rig.cycle();
+        assert!(status.at_rest && status.trip.is_none(), "{status:?}");
+        assert!((END - status.target_position.abs()) < 0.1, "{status:?}");
+    }
+}
+
+#[test]
+fn external_set_points_may_stop_at_the_end_of_the_range() {
+    const END: f64 = 5.0;
+    let mut config = looped(Mode::Csp, SLOW);
+    config.limits.position = Some([-END, END]);
+    let acceleration = config.limits.acceleration;
+    let mut rig = enabled(config);
+    let start = rig.axis.status().target_position;
+    // Constant acceleration, then the same deceleration.
+    let half = 400;
+    let scale = (END - start) / f64::from(half * half);
+    assert!(2.0 * scale / (DT * DT) <= acceleration);
+    for k in 1..=2 * half {
+        let position = match k <= half {
+            true => start + scale * f64::from(k * k) / 2.0,
+            false => END - scale * f64::from((2 * half - k) * (2 * half - k)) / 2.0,
+        };
+        rig.axis.set_point(position).unwrap();
+        rig.cycle();
+    }
+    assert_eq!(rig.axis.status().target_position, END);
+}
+
+#[test]
 fn external_set_points_end_with_lost_frames() {
     let mut rig = enabled(looped(Mode::Csp, SLOW));
     for _ in 0..2 {

@@ -412,6 +412,22 @@ impl Axis {
                     high,
                 });
             }
+            // From here the axis must be able to stop, whatever comes next.
+            let slower = limits.acceleration * self.dt_s / 2.0;
+            let braking = (velocity.abs() - slower).max(0.0).powi(2) / (2.0 * limits.acceleration);
+            let room = if velocity < 0.0 {
+                position - low
+            } else {
+                high - position
+            };
+            if braking > room * SET_POINT_ROUNDING + f64::EPSILON * position.abs() * 8.0 {
+                return Err(CommandError::NoRoomToStop {
+                    velocity,
+                    position,
+                    low,
+                    high,
+                });
+            }
         }
         self.external_setpoint = Some(before.then(position, velocity, self.dt_s));
         self.plan = Plan::External;

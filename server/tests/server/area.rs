@@ -203,6 +203,33 @@ fn late_set_points_are_bridged() {
 }
 
 #[test]
+fn an_axis_stops_within_its_range_whatever_the_client_does() {
+    // The client is gone shortly before the end of the range at 60 mm, or goes on beyond it.
+    for gone_at in [59.9, 59.97, 61.0] {
+        let server = Server::in_virtual_time(demo());
+        let mut client = server.owner("test");
+        client.done("enable", json!({"axis": "x"}));
+        client.done("move", json!({"axis": "x", "to": 59.0}));
+        let area = attach(&mut client);
+        let (mut at, mut velocity, mut cycle) = (client.position("x"), 0.0, 0);
+        let mut farthest: f64 = 0.0;
+        for _ in 0..400 {
+            if at < gone_at {
+                velocity = f64::min(velocity + 1.0, 12.0);
+                at += velocity * 1e-3;
+                cycle += 1;
+                area.write(cycle, &[(1, at), (0, 0.0)]);
+            }
+            client.ok("advance", json!({"cycles": 1}));
+            farthest = farthest.max(client.position("x"));
+        }
+        assert!((59.9..=60.0).contains(&farthest), "{gone_at}: {farthest}");
+        assert_eq!(client.axis("x")["at_rest"], json!(true));
+        assert_eq!(client.kept_events("area").len(), 1, "{gone_at}");
+    }
+}
+
+#[test]
 fn nothing_in_the_area_is_trusted() {
     let server = Server::in_virtual_time(demo());
     for (kind, value, text) in [
