@@ -84,7 +84,16 @@ def within_limits(rows, dt=1e-3):
     return None
 
 
+def move_back(watcher):
+    """The clients begin where the axis is: it would reach the end of its range."""
+    watcher.ask("take", name="judge")
+    if watcher.ask("state")["axes"][0]["enabled"]:
+        watcher.ask("move", axis="x", to=0.0, speed=1.0, wait=True)
+    watcher.ask("release")
+
+
 def trial(report, watcher, name, command, kill):
+    move_back(watcher)
     first, events = watcher.words[6], watcher.ask("state")["events"]
     with rig.process(command, stdout=subprocess.PIPE) as child:
         child.stdout.readline()
