@@ -49,8 +49,8 @@ fn with_esi(text: &str, old: &str, new: &str) -> Machine {
 fn every_emergency_is_reported_once_from_bring_up_to_the_end() {
     let sent = [
         ("5ms", 0, 0x1000),
-        ("32ms", 0, 0x1001),
-        ("40ms", 1, 0x1002),
+        ("24ms", 0, 0x1001),
+        ("30ms", 1, 0x1002),
         ("400ms", 0, 0x1003),
         ("1500ms", 1, 0x1004),
         ("1500ms", 1, 0x1005),

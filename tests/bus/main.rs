@@ -13,6 +13,7 @@ mod copy;
 mod cycles;
 mod damaged_eeprom;
 mod demo;
+mod eeproms;
 mod fsoe;
 mod homing;
 mod long_segment;

@@ -14,6 +14,7 @@ use ecaxis_master::bringup::bring_up;
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{self, Locator, Machine};
+use ecaxis_master::link::scan_answers::ScanAnswers;
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::mailbox::worker::EmergencySink;
 use ecaxis_master::mailbox::{CoeClient, Emergencies, FoeClient, MailboxTransport, ObjectList};
@@ -444,7 +445,9 @@ fn a_written_alias_applies_after_the_next_power_on() {
                 .expect("found");
             assert_eq!(found.position, 0);
             let image = plan(&by_alias.rt_config().devices).expect("a plan");
-            let bus = bring_up(wire.main_device(), &by_alias, image, &|_| {}, &Deaf).await;
+            let answers = ScanAnswers::default();
+            let main_device = wire.main_device();
+            let bus = bring_up(main_device, &answers, &by_alias, image, &|_| {}, &Deaf).await;
             let bus = bus.unwrap_or_else(|error| panic!("{error}"));
             let x = &bus.devices[DeviceIndex(0)].at;
             assert_eq!((x.name.as_str(), x.position), ("x", 0));

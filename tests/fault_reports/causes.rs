@@ -49,7 +49,7 @@ fn evidence_long_before_the_stop_is_ignored() {
     let loss = fault("frame-loss", "1.8s", "count = 60");
     for at in ["300ms", "1.49s"] {
         let script =
-            fault("frame-duplicate", at, "count = 5") + &fault("watchdog", "1.5s", "device = 1");
+            fault("frame-duplicate", at, "count = 5") + &fault("watchdog", "1500600us", "device = 1");
         let expected = "`a1` (position 1) left Op by its process data watchdog of 100 ms, though";
         first_line(&axes(2), &script, expected);
     }

@@ -2,7 +2,8 @@
 """Compares the bring-up of ecaxis with that of pysoem, on the same simulated bus over a veth pair.
 
 Both write the same start-up SDOs, use distributed clocks with SYNC0, and bring all drives to Op. They
-alternate: pysoem, ecaxis, pysoem, ecaxis. Needs root and `requirements.txt`:
+alternate: pysoem, ecaxis, pysoem, ecaxis, with the same real-time priority. Needs root and
+`requirements.txt`:
 
     ECAXIS_PROFILE=release python tests/judges/compare_bringup.py [--drives 1 3 16 64] [--rounds 5]
 
@@ -21,6 +22,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import cycle
 import pcapng
 import rig
 
@@ -57,8 +59,6 @@ def downloads(recording):
 def by_pysoem(nic, sdos):
     """Returns the seconds from opening the interface until all drives are in Op."""
     import pysoem
-
-    import cycle
 
     master = pysoem.Master()
     start = time.monotonic()
@@ -106,7 +106,8 @@ def pysoem_process(nic, sdos):
 def by_ecaxis(program, file, nic, *options):
     """Returns the seconds from the start and from the first frame until all drives are in Op, and the
     table of the steps with `-v`, which itself takes time."""
-    command = [str(program), "run", str(file), "--nic", nic, "--no-enable", "--for", "10ms", "--no-fault-report"]
+    command = ["chrt", "-f", str(cycle.PRIORITY), str(program), "run", str(file), "--nic", nic]
+    command += ["--no-enable", "--for", "10ms", "--no-fault-report"]
     start, scan, op = time.monotonic(), None, None
     with rig.process([*command, *options], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as child:
         lines = []
@@ -163,8 +164,6 @@ def main():
     parser.add_argument("--pysoem", metavar="NIC", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.pysoem:
-        import cycle
-
         content = json.load(sys.stdin)
         sdos = {int(s): [(i, n, bytes.fromhex(d)) for i, n, d in each] for s, each in content.items()}
         with cycle.real_time():

@@ -11,6 +11,8 @@ PERIOD = 1_000_000  # ns
 # This computer may stall.
 TIMEOUT_US = 10_000_000
 NO_FRAME = -1
+# SCHED_FIFO: below the kernel threads and above the simulated bus.
+PRIORITY = 75
 
 STATES = {1: "Init", 2: "PreOp", 3: "Boot", 4: "SafeOp", 8: "Op"}
 
@@ -75,9 +77,9 @@ class Cycle:
 
 @contextlib.contextmanager
 def real_time():
-    """Sets the priority of a MainDevice: below the kernel threads and above the simulated bus."""
+    """Sets the priority of a MainDevice."""
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(75))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except OSError as error:
         print(f"     without real-time priority: {error}", flush=True)
     try:

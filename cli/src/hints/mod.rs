@@ -72,6 +72,9 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         Cause::Sii(_) | Cause::DamagedEeprom(_) => {
             "`ecaxis eeprom verify` shows the problems, `ecaxis esi sii` generates an image from an ESI file, `ecaxis eeprom write` repairs the EEPROM".to_owned()
         }
+        Cause::EepromChanged => {
+            "start again, and do not exchange devices or write EEPROMs meanwhile".to_owned()
+        }
         Cause::NoMailbox => {
             "devices without a mailbox, such as digital terminals, have no parameters".to_owned()
         }

@@ -61,7 +61,8 @@ pub fn size_of(image: &[u8]) -> usize {
     word.map_or(HEADER_BYTES, |word| declared_size(*word))
 }
 
-fn declared_size(word: [u8; 2]) -> usize {
+/// Returns the size in bytes that the size word declares.
+pub(crate) fn declared_size(word: [u8; 2]) -> usize {
     let kibit = usize::from(u16::from_le_bytes(word)).saturating_add(1);
     kibit.saturating_mul(128).clamp(HEADER_BYTES, MAX_BYTES)
 }
@@ -160,8 +161,7 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
         let mut word = word;
         let mut rest = bytes;
         while !rest.is_empty() {
-            let status = self.command(word, READ).await?;
-            let data: [u8; 8] = self.registers.read(registers::EEPROM_DATA).await?;
+            let (status, data) = self.read_once(word).await?;
             let brought = if status & EIGHT_BYTES != 0 { 8 } else { 4 };
             let (now, later) = rest.split_at_mut(brought.min(rest.len()));
             for (to, from) in now.iter_mut().zip(data) {
@@ -171,6 +171,15 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
             word = word.saturating_add(if brought == 8 { 4 } else { 2 });
         }
         Ok(())
+    }
+
+    /// Returns 0x0502 and the four or eight bytes that one read brings
+    /// ([`EIGHT_BYTES`](sii::control::EIGHT_BYTES)).
+    ///
+    /// # Errors
+    /// As [`Eeprom::read`].
+    pub async fn read_once(&self, word: u32) -> Result<(u16, [u8; 8]), Error> {
+        self.command(word, READ).await
     }
 
     /// Reads the image up to the end mark of its categories, independent of its size word. Without
@@ -296,8 +305,8 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
         self.command(0, RELOAD).await.map(drop)
     }
 
-    /// Runs a command and returns the status when it is done.
-    async fn command(&self, word: u32, command: u16) -> Result<u16, Error> {
+    /// Runs a command. Returns the status when it is done, and the data register.
+    async fn command(&self, word: u32, command: u16) -> Result<(u16, [u8; 8]), Error> {
         let [c0, c1] = command.to_le_bytes();
         let [a0, a1, a2, a3] = word.to_le_bytes();
         let mut status = 0;
@@ -308,10 +317,11 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
             self.registers
                 .write(registers::EEPROM_CONTROL, &[c0, c1, a0, a1, a2, a3])
                 .await?;
-            status = self.done(word).await?;
+            let data;
+            (status, data) = self.done(word).await?;
             let failed = status & (REFUSED | NOT_ENABLED);
             if failed == 0 {
-                return Ok(status);
+                return Ok((status, data));
             }
             // The error remains until an empty command is written.
             self.registers
@@ -324,15 +334,17 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
         Err(self.failed(EepromError::NotAcknowledged { word, status }))
     }
 
-    async fn done(&self, word: u32) -> Result<u16, Error> {
+    /// Waits for the end of a command. One datagram reads control, address and data.
+    async fn done(&self, word: u32) -> Result<(u16, [u8; 8]), Error> {
         let wire = self.registers.wire;
         let time = u64::try_from(EEPROM_TIMEOUT.as_nanos()).unwrap_or(u64::MAX);
         let end = wire.now().saturating_add(time);
         loop {
-            let status = u16::from_le_bytes(self.registers.read(registers::EEPROM_CONTROL).await?);
+            let [s0, s1, _, _, _, _, data @ ..]: [u8; 14] =
+                self.registers.read(registers::EEPROM_CONTROL).await?;
+            let status = u16::from_le_bytes([s0, s1]);
             if status & BUSY == 0 {
-                // Reads work even if the controller failed to load its own configuration.
-                return Ok(status & !NOT_LOADED);
+                return Ok((status, data));
             }
             if wire.now() >= end {
                 return Err(self.failed(EepromError::Busy { word }));
@@ -406,14 +418,15 @@ mod tests {
         async fn read(&self, _: u16, register: u16, to: &mut [u8]) -> Result<u16, DatagramError> {
             let at = usize::try_from(self.word.get()).expect("small") * 2;
             let beyond = at >= self.bytes.len() && !self.wraps;
-            match register {
-                registers::EEPROM_CONTROL if beyond => to.copy_from_slice(&REFUSED.to_le_bytes()),
-                registers::EEPROM_DATA => {
-                    for (n, byte) in to.iter_mut().enumerate() {
-                        *byte = self.bytes[(at + n) % self.bytes.len()];
-                    }
+            to.fill(0);
+            if register == registers::EEPROM_CONTROL {
+                let (status, data) = to.split_at_mut(2);
+                if beyond {
+                    status.copy_from_slice(&REFUSED.to_le_bytes());
                 }
-                _ => to.fill(0),
+                for (n, byte) in data.iter_mut().skip(4).enumerate() {
+                    *byte = self.bytes[(at + n) % self.bytes.len()];
+                }
             }
             Ok(1)
         }

@@ -120,7 +120,7 @@ pub(super) async fn explain_scan(
 }
 
 /// Returns what is wrong with a device's EEPROM; `None` if nothing is, or it cannot be read.
-async fn damaged_eeprom(
+pub(super) async fn damaged_eeprom(
     wire: &DatagramClient,
     device: &DeviceRef,
     state: al::AlState,

@@ -26,6 +26,7 @@ use crate::concurrent::try_join_all;
 use crate::config::state_timeouts::mailbox_timeouts;
 use crate::config::{AdoptedUnits, DeviceConfig, LimitConflict, MAX_SUBDEVICES, Machine};
 use crate::datagram::DatagramClient;
+use crate::link::scan_answers::{ScanAnswers, ScanFindings};
 use crate::mailbox::CoeClient;
 use crate::mailbox::worker::EmergencySink;
 use crate::report::{Cause, DevicePlace, Error};
@@ -37,6 +38,7 @@ pub mod align;
 pub(crate) mod clocks;
 mod device;
 pub mod drive_units;
+mod eeproms;
 mod identify;
 mod limits;
 mod mailbox;
@@ -121,9 +123,10 @@ impl Bus {
 }
 
 /// Brings the segment from any state to SafeOp. Passes emergencies of the devices to the listener,
-/// on success and on failure.
+/// on success and on failure. `answers` are those of the MainDevice's PDU loop.
 pub async fn bring_up(
     main_device: &'static MainDevice<'static>,
+    answers: &ScanAnswers,
     machine: &Machine,
     image: ImagePlan,
     progress: &dyn Fn(Step),
@@ -133,13 +136,16 @@ pub async fn bring_up(
     progress(Step::Scan);
     let times = StepTimes::default();
     let scan = async {
-        enumerate::count(&wire)
+        let count = enumerate::count(&wire)
             .await
             .map_err(|error| match *error.cause {
                 Cause::Datagram(_) => error.with_action("scanning"),
                 _ => error,
             })?;
         al::acknowledge_errors_in_init(&wire).await;
+        let ahead = Box::pin(eeproms::read_ahead(&wire, machine, count));
+        let ahead = times.measure("EEPROMs", None, ahead).await?;
+        answers.replace(ahead);
         // ethercrab's tables are large, and futures hold them by value.
         let scan = Box::pin(main_device.init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now));
         let scan = caught(mailbox::repair_during(&wire, machine, scan)).await;
@@ -148,11 +154,16 @@ pub async fn bring_up(
             Ok(Err(error)) => ScanFailure::Failed(error),
             Err(panic) => ScanFailure::Panicked(panic),
         };
+        answers.replace(ScanFindings::default());
         Err(identify::explain_scan(&wire, machine, failure).await)
     };
-    let scan = times.measure("scan, EEPROM, PreOp", None, Box::pin(scan));
+    let scan = times.measure("scan, PreOp", None, Box::pin(scan));
     let group = scan.await?;
-    let assign = identify::assign(&wire, main_device, &group, machine, progress);
+    let ahead = answers.replace(ScanFindings::default());
+    let assign = async {
+        eeproms::compare(&wire, machine, &ahead).await?;
+        identify::assign(&wire, main_device, &group, machine, progress).await
+    };
     let order = times.measure("identification", None, assign).await?;
     progress(Step::Found {
         devices: order.len(),

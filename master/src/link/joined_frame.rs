@@ -6,7 +6,7 @@ use ecaxis_ecat::registers;
 use super::{Link, LinkError, MAX_FRAME};
 
 /// The bytes in front of the first datagram: Ethernet header and EtherCAT header.
-const FRAME_HEADER: usize = 16;
+pub(super) const FRAME_HEADER: usize = 16;
 /// The EtherCAT header: the length of the datagrams in bits 0 to 10, and type 1 in bits 12 to 15.
 const LENGTH: u16 = 0x07ff;
 const TYPE: u16 = 0x1000;

@@ -9,6 +9,7 @@
 //!   interface;
 //! - [`capture`]: records the frames of any link;
 //! - [`replay`]: a recording in place of a bus;
+//! - [`scan_answers`]: answers ethercrab's scan from what was found before;
 //! - [`pdu_loop`]: connects ethercrab to a link.
 
 use std::fmt;
@@ -23,6 +24,7 @@ pub mod lock;
 pub mod nic;
 pub mod pdu_loop;
 pub mod replay;
+pub mod scan_answers;
 pub mod sim;
 mod socket_kind;
 pub mod source_address;

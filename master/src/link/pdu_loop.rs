@@ -4,12 +4,14 @@
 
 use std::future::Future;
 use std::pin::pin;
+use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 use std::time::Duration;
 
 use ethercrab::{MainDevice, MainDeviceConfig, PduRx, PduStorage, PduTx, RetryBehaviour, Timeouts};
 
 use super::joined_frame::{JoinedFrame, datagrams};
+use super::scan_answers::ScanAnswers;
 use super::{Link, LinkError, MAX_DATA, MAX_FRAME};
 use crate::clock::{self, Clock, Nanos};
 
@@ -41,6 +43,8 @@ pub struct PduLoop {
     tx: PduTx<'static>,
     rx: PduRx<'static>,
     joined: JoinedFrame,
+    /// Answers reads of EEPROMs in place of their devices.
+    pub scan_answers: Arc<ScanAnswers>,
     /// Frames that ethercrab rejected: late, unknown or damaged.
     pub refused: u64,
 }
@@ -80,17 +84,14 @@ pub fn main_device(cycle_ns: Nanos, pre_op: Duration) -> (&'static MainDevice<'s
         retry_behaviour: RetryBehaviour::Count(3),
     };
     let device = Box::leak(Box::new(MainDevice::new(pdu_loop, timeouts, config)));
-    let joined = JoinedFrame::default();
-    let refused = 0;
-    (
-        device,
-        PduLoop {
-            tx,
-            rx,
-            joined,
-            refused,
-        },
-    )
+    let port = PduLoop {
+        tx,
+        rx,
+        joined: JoinedFrame::default(),
+        scan_answers: Arc::default(),
+        refused: 0,
+    };
+    (device, port)
 }
 
 impl PduLoop {
@@ -109,24 +110,32 @@ impl PduLoop {
         sent
     }
 
-    /// Sends the datagrams of all frames that ethercrab has ready, in as few frames as possible.
-    /// Returns the number of datagrams.
-    pub fn send_all(&mut self, link: &mut dyn Link) -> Result<usize, LinkError> {
-        let mut sent = 0;
+    /// Sends the datagrams of all frames that ethercrab has ready, in as few frames as possible,
+    /// except for those that are answered at once.
+    fn send_all(&mut self, link: &mut dyn Link) -> Result<Moved, LinkError> {
+        let mut moved = Moved::default();
         while let Some(frame) = self.tx.next_sendable_frame() {
             let mut flushed = Ok(());
+            let mut answer = None;
             let _ = frame.send_blocking(|bytes| {
-                if !self.joined.append(bytes) {
+                answer = self.scan_answers.answer(bytes);
+                if answer.is_none() && !self.joined.append(bytes) {
                     flushed = self.joined.flush(link);
                     self.joined.append(bytes);
                 }
                 Ok(bytes.len())
             });
             flushed?;
-            sent += 1;
+            match answer {
+                Some(frame) => {
+                    self.receive(&frame);
+                    moved.answered = true;
+                }
+                None => moved.sent = true,
+            }
         }
         self.joined.flush(link)?;
-        Ok(sent)
+        Ok(moved)
     }
 
     /// Passes the datagrams of a received frame to ethercrab if they are ethercrab's. Datagrams that
@@ -141,6 +150,13 @@ impl PduLoop {
             }
         }
     }
+}
+
+/// What became of the datagrams that were ready.
+#[derive(Debug, Clone, Copy, Default)]
+struct Moved {
+    sent: bool,
+    answered: bool,
 }
 
 /// True if a frame is EtherCAT with ethercrab's source address.
@@ -163,10 +179,14 @@ pub fn drive_pdu_loop<F: Future>(
         if let Poll::Ready(output) = future.as_mut().poll(&mut context) {
             return Ok(output);
         }
-        let mut moved = port.send_all(link)? > 0;
+        let Moved { sent, answered } = port.send_all(link)?;
+        let mut moved = sent;
         while let Some(len) = link.recv(&mut buf)? {
             port.receive(&buf[..len]);
             moved = true;
+        }
+        if answered {
+            continue;
         }
         idle = if moved { 0 } else { idle.saturating_add(1) };
         match clock {

@@ -123,6 +123,8 @@ pub enum Cause {
     Sii(#[source] SiiError),
     #[error("its EEPROM is damaged: {0}")]
     DamagedEeprom(SiiWarning),
+    #[error("its EEPROM changed during the scan")]
+    EepromChanged,
     #[error("the EEPROM describes no mailbox")]
     NoMailbox,
     #[error("is in {state}, where it has no CoE mailbox")]

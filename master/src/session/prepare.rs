@@ -342,7 +342,16 @@ fn bring_up_catching_panics(
     } = carried;
     // ethercrab panics on some wire content, for example on a SubDevice without an open port.
     let run = std::panic::AssertUnwindSafe(|| {
-        let bring_up = Box::pin(bring_up(main_device, machine, image, &report, log));
+        let answers = port.scan_answers.clone();
+        // ethercrab's tables make the future large: nothing holds it on the stack.
+        let bring_up = Box::pin(bring_up(
+            main_device,
+            &answers,
+            machine,
+            image,
+            &report,
+            log,
+        ));
         drive_pdu_loop(port, link, clock, stop.run_until_requested(bring_up))
     });
     match std::panic::catch_unwind(run) {
