@@ -21,6 +21,7 @@ TOWARDS_ENABLED = {
     "Operation enabled": 0x0F,
     "Fault": 0x80,
 }
+CONTROLWORD = 0x6040
 CSP = 8
 TYPES = {8: "b", 16: "h", 32: "i"}
 
@@ -45,9 +46,13 @@ class Drive:
         return struct.unpack_from("<" + TYPES[bits], self.slave.input, self.device.offset(index))[0]
 
     def set(self, index, value):
-        bits = next(e[2] for e in self.device.rx if e[0] == index)
-        kind = "<" + (TYPES[bits].upper() if index == 0x6040 else TYPES[bits])
-        struct.pack_into(kind, self.outputs, self.device.offset(index, "rx"), value)
+        at = 0
+        for entry, _, bits, _ in self.device.rx:
+            # A drive may have an object in several places.
+            if entry == index:
+                kind = TYPES[bits].upper() if index % 0x800 == CONTROLWORD % 0x800 else TYPES[bits]
+                struct.pack_into("<" + kind, self.outputs, at // 8, value)
+            at += bits
         self.slave.output = bytes(self.outputs)
 
     @property

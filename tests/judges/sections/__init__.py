@@ -18,6 +18,7 @@ from .faults import faults
 from .gateway import gateway
 from .mailbox import mailbox
 from .monitoring import monitoring
+from .oddities import oddities
 from .operation import operation
 from .page import page
 from .parameters import parameters
@@ -26,7 +27,7 @@ from .ring import ring
 from .service import service
 from .viewers import viewers
 
-__all__ = ["Bench", "bringup", "eeproms", "ethercrab", "faults", "gateway", "mailbox", "monitoring", "operation", "overlap", "page", "parameters", "recordings", "ring", "service", "viewers"]
+__all__ = ["Bench", "bringup", "eeproms", "ethercrab", "faults", "gateway", "mailbox", "monitoring", "oddities", "operation", "overlap", "page", "parameters", "recordings", "ring", "service", "viewers"]
 
 MAXON = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml"
 OWN = rig.ROOT / "configs/esi"
