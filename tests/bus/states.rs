@@ -53,6 +53,50 @@ fn drives(bus: &str, timeouts: &str, ms: u64) -> Machine {
     bench.machine(&(text + "[[step]]\nmove = { x = 1.0, y = 1.0 }\n"))
 }
 
+/// ETG.1000.6, 6.4: a broadcast requests a state from all devices. A controller takes no other request
+/// until its processor has read it, so slow devices are not asked again.
+#[test]
+fn way_back_requests_each_state_once_from_all_devices() {
+    for ms in [1, 150, 500] {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (options, recording) = recorded(virtual_time(), folder.path());
+        let timeouts = "<PreopTimeout>900</PreopTimeout><SafeopOpTimeout>900</SafeopOpTimeout>\
+             <BackToInitTimeout>900</BackToInitTimeout><BackToSafeopTimeout>900</BackToSafeopTimeout>";
+        run_well(drives("", timeouts, ms), options);
+        let requests = datagrams(&recording).into_iter();
+        let is_request = |d: &Datagram| matches!(d.command, BWR | FPWR) && d.register() == 0x0120;
+        let requests = requests.filter(|d| d.sent && is_request(d));
+        let requests: Vec<_> = requests.map(|d| (d.command, d.data[0])).collect();
+        let op = requests.iter().rposition(|(_, state)| *state == 8);
+        let back = requests.get(op.expect("Op") + 1..);
+        assert_eq!(back, Some(&[(BWR, 4), (BWR, 2), (BWR, 1)][..]), "{ms} ms");
+    }
+}
+
+/// ETG.1000.6, 6.4: a device that refuses a state is asked alone, with the acknowledgement of its error.
+#[test]
+fn way_back_asks_only_the_device_alone_that_refuses() {
+    let script = "[[fault]]\nkind = \"refuse-state\"\ndevice = 1\nstate = \"preop\"\ncode = 0x0011\nat = \"120ms\"\n";
+    let folder = tempfile::tempdir().expect("a folder");
+    let (options, recording) = recorded(faults(script), folder.path());
+    let (outcome, _) = run(drives("", "", 1), options);
+    let error = outcome.result.expect_err("it refuses").to_string();
+    assert!(
+        error.contains("`y`") && error.contains("refused PreOp"),
+        "{error}"
+    );
+    let requests = datagrams(&recording).into_iter();
+    let alone = requests.filter(|d| d.sent && d.command == FPWR && d.register() == 0x0120);
+    let alone: Vec<_> = alone.map(|d| (d.station(), d.data[0])).collect();
+    // On the way up ethercrab requests PreOp, then we request SafeOp, from each device.
+    let back = alone.get(4..).unwrap_or_default();
+    assert_eq!(back.first(), Some(&(0x1001, 0x14)), "{alone:x?}");
+    assert!(
+        back.iter().all(|(station, _)| *station == 0x1001),
+        "{alone:x?}"
+    );
+}
+
 /// Runs [`drives`].
 fn run_slow(bus: &str, timeouts: &str, ms: u64) -> Result<(), String> {
     let (outcome, _) = run(drives(bus, timeouts, ms), virtual_time());
@@ -99,13 +143,13 @@ fn way_back_to_safe_op_has_its_own_time_out() {
     );
 }
 
-/// Returns what was written to a station, and the request of Op to all: the register, and the byte
-/// at `byte` of its data.
+/// Returns what was written to a station, and the states that were requested from all: the register,
+/// and the byte at `byte` of its data.
 fn written(datagrams: &[Datagram], station: u16, registers: &[(u16, usize)]) -> Vec<(u16, u8)> {
-    let op_of_all = |d: &Datagram| d.command == BWR && d.register() == 0x0120 && d.data == [8, 0];
+    let state_of_all = |d: &Datagram| d.command == BWR && d.register() == 0x0120;
     let sent = datagrams
         .iter()
-        .filter(|d| d.sent && (d.command == FPWR && d.station() == station || op_of_all(d)));
+        .filter(|d| d.sent && (d.command == FPWR && d.station() == station || state_of_all(d)));
     let found = sent.filter_map(|datagram| {
         let (register, byte) = registers.iter().find(|(r, _)| *r == datagram.register())?;
         Some((*register, *datagram.data.get(*byte)?))

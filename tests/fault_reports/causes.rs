@@ -48,8 +48,8 @@ fn evidence_long_before_the_stop_is_ignored() {
     let patient = axes(3).replace("cycle =", "lost_frames = 20\ncycle =");
     let loss = fault("frame-loss", "1.8s", "count = 60");
     for at in ["300ms", "1.49s"] {
-        let script =
-            fault("frame-duplicate", at, "count = 5") + &fault("watchdog", "1500600us", "device = 1");
+        let script = fault("frame-duplicate", at, "count = 5")
+            + &fault("watchdog", "1500600us", "device = 1");
         let expected = "`a1` (position 1) left Op by its process data watchdog of 100 ms, though";
         first_line(&axes(2), &script, expected);
     }

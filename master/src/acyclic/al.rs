@@ -105,16 +105,31 @@ pub(crate) fn awaits_sync(error: &Error) -> bool {
     al_status_code::SYNC_LOST.contains(code) || *code == al_status_code::DC_SYNC_IO_ERROR
 }
 
-/// Requests a lower state from all devices at the same time, even if some fail. Returns the first
-/// error at the end; one of the wire comes first.
+/// Requests a lower state from all devices that are not in it, at the same time, even if some fail.
+/// Returns the first error at the end; one of the wire comes first. A request that a device has
+/// received at `since` is not repeated: its controller takes no other one before the device has read
+/// it.
 pub async fn lower_state(
     wire: &impl MailboxTransport,
     transitions: &[Transition<'_>],
     wanted: AlState,
+    since: u64,
 ) -> Result<(), Error> {
     let changes = transitions.iter().map(async |transition| {
         let one = std::slice::from_ref(transition);
-        Ok::<_, Infallible>(change_states(wire, one, wanted).await)
+        let station = transition.device.station;
+        let mut control = [0];
+        let (received, status) = (
+            wire.read(station, registers::AL_CONTROL, &mut control)
+                .await,
+            read_status(wire, station).await,
+        );
+        let is_requested = received == Ok(1) && control == [wanted.code()];
+        let has_error = !matches!(status, Ok(Some((status, _))) if status & ERROR == 0);
+        Ok::<_, Infallible>(match is_requested && !has_error {
+            true => wait_state_since(wire, one, wanted, since).await,
+            false => change_states(wire, one, wanted).await,
+        })
     });
     let Ok(changes) = try_join_all(changes).await;
     let mut errors: Vec<Error> = changes.into_iter().filter_map(Result::err).collect();

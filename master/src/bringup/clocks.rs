@@ -146,21 +146,6 @@ pub(super) async fn await_pulses(wire: &DatagramClient, plan: &ClockPlan) {
     wire.delay(Duration::from_nanos(wait)).await;
 }
 
-/// Stops SYNC0 and SYNC1 of devices that are back in PreOp or Init. Active pulses would indicate a
-/// running MainDevice.
-pub(crate) async fn stop(wire: &impl MailboxTransport, stations: impl Iterator<Item = u16>) {
-    for station in stations {
-        // On an error, the segment still goes to Init.
-        if let Err(error) = wire
-            .write(station, registers::DC_CYCLIC_CONTROL, &[0, 0])
-            .await
-        {
-            tracing::debug!("SYNC0 goes on: {error}");
-            break;
-        }
-    }
-}
-
 /// Sets the clocks, with the first device that has a system time as reference. ethercrab uses the
 /// first device with receive times, even if it has no system time. Its offsets are old by the time
 /// of the changes to PreOp, in which the clocks drift apart.

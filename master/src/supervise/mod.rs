@@ -14,15 +14,15 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
 
 use crate::acyclic::{AlState, DeviceRef, Transition, al};
-use crate::bringup::{Bus, BusDevice, clocks, enable_op_only};
+use crate::bringup::{Bus, BusDevice, enable_op_only};
 use crate::cancel::CancelToken;
 use crate::clock::{self, Nanos};
 use crate::config::steps::enables;
 use crate::config::{Machine, Step};
 use crate::datagram::{CyclicMailboxTransport, DatagramClient};
-use crate::mailbox::Mailboxes;
 use crate::mailbox::worker::{MailboxWorker, run_with_workers};
-use crate::post_mortem::{Witnessed, snapshot};
+use crate::mailbox::{DatagramError, Mailboxes};
+use crate::post_mortem::Witnessed;
 use crate::report::events::{clock_off, reference_replaced};
 use crate::report::{Cause, EmergencyLog, Error, GroupStop, ProbeCapture, Progress, Status};
 use crate::rt::bus_monitor::StopCause;
@@ -36,6 +36,7 @@ mod explain;
 mod groups;
 pub mod operator;
 mod program;
+mod shut_down;
 
 /// The period at which the supervisor reads the cycle's snapshot.
 const TICK: Duration = Duration::from_millis(1);
@@ -43,7 +44,7 @@ const TICK: Duration = Duration::from_millis(1);
 const FIRST_CYCLES: u64 = 20;
 /// The maximum number of refused commands that wait for processing.
 const REFUSALS: usize = 256;
-/// The time in ns after which devices on their way to Op are read one by one.
+/// The time in ns after which devices on their way to a state are read one by one.
 const BROADCAST_WAIT: Nanos = 100_000_000;
 const STATUS_PERIOD: Nanos = 200_000_000;
 
@@ -182,10 +183,7 @@ impl Supervisor {
         let snapshot = self.poll_and_query().await?;
         // A device with an error needs an acknowledgement first.
         let broadcast = self.is_everywhere(AlState::SafeOp, &snapshot)
-            && self
-                .wire
-                .write_all(registers::AL_CONTROL, &[op.code(), 0])
-                .await
+            && self.request_everywhere(op).await
                 == Ok(snapshot.al_status.map_or(0, |(_, devices)| devices));
         if !broadcast {
             return al::change_states(&self.wire, &self.transitions_to_op(), op).await;
@@ -201,6 +199,13 @@ impl Supervisor {
             }
         }
         al::wait_state_since(&self.wire, &self.transitions_to_op(), op, requested).await
+    }
+
+    /// Requests a state from all devices with one datagram, without an acknowledgement. Returns the
+    /// number of devices that take it.
+    async fn request_everywhere(&self, wanted: AlState) -> Result<u16, DatagramError> {
+        let control = [wanted.code(), 0];
+        self.wire.write_all(registers::AL_CONTROL, &control).await
     }
 
     fn transitions_to_op(&self) -> Vec<Transition<'_>> {
@@ -428,109 +433,6 @@ impl Supervisor {
         }
     }
 
-    /// Stops the axes, removes power and sets the segment back to Init, as far as it answers.
-    /// `failed`: the run already has an error.
-    async fn shut_down(&mut self, failed: bool) -> Result<(), Error> {
-        self.report(Progress::Stopping);
-        self.send(RtCommand::Stop).await;
-        let result = self.wait_for_standstill(failed).await;
-        let stations = self.stations();
-        if let Some(witnessed) = &mut self.witnessed {
-            snapshot::retry_absent(&self.wire, &stations, &mut witnessed.looks).await;
-        } else if let Err(error) = &result {
-            self.witness(error).await;
-        }
-        self.pass_events_on();
-        let is_stopped = |device: DeviceIndex| self.is_stopped(self.machine.group_of(device));
-        let (stopped, others): (Vec<_>, Vec<_>) = self
-            .bus
-            .devices
-            .enumerate()
-            .partition(|(device, _)| is_stopped(*device));
-        let mut lowered = Ok(());
-        for state in [AlState::SafeOp, AlState::PreOp, AlState::Init] {
-            if state == AlState::Init {
-                self.end_sync().await;
-            }
-            let (others, stopped) = (transitions(&others, state), transitions(&stopped, state));
-            match al::lower_state(&self.wire, &others, state).await {
-                Ok(()) => self.report(Progress::Step(crate::bringup::Step::State(state))),
-                Err(error) => {
-                    let silent = al::is_wire(&error);
-                    self.report(Progress::Warning(error.to_string()));
-                    if lowered.is_ok() {
-                        lowered = Err(error);
-                    }
-                    if silent {
-                        break;
-                    }
-                }
-            }
-            // Stopped groups follow as far as they can; their errors do not count.
-            if let Err(error) = al::lower_state(&self.wire, &stopped, state).await {
-                tracing::debug!("{error}");
-            }
-            if state == AlState::SafeOp {
-                self.disable_op_only().await;
-            }
-        }
-        result.and(lowered)
-    }
-
-    /// Disables the SyncManagers that are enabled in Op only, as far as the devices answer.
-    async fn disable_op_only(&self) {
-        for device in self.bus.devices.iter() {
-            if let Err(error) = enable_op_only(&self.wire, device, false).await {
-                tracing::debug!("{error}");
-            }
-        }
-    }
-
-    /// Stops SYNC0. PreOp does not need it, and in Init it would look like a running machine.
-    async fn end_sync(&self) {
-        let devices = self.machine.devices.iter().zip(&self.bus.devices);
-        let pulsed = devices.filter(|(config, _)| config.selection.dc.is_some());
-        clocks::stop(&self.wire, pulsed.map(|(_, device)| device.at.station)).await;
-    }
-
-    /// Waits until nothing more can stop any axis. Each axis ends its stop in bounded time.
-    async fn wait_for_standstill(&mut self, failed: bool) -> Result<(), Error> {
-        loop {
-            clock::delay(TICK).await;
-            let snapshot = self.outer.snapshots.read();
-            let ended = snapshot.stopping.is_some() && snapshot.stop_ended;
-            if ended || self.outer.commands.is_abandoned() {
-                break;
-            }
-        }
-        // Until this point, anything the cycle finds is a failure of this run.
-        self.send(RtCommand::StopBusMonitor).await;
-        while self.outer.snapshots.read().commands_taken < self.commands_sent
-            && !self.outer.commands.is_abandoned()
-        {
-            clock::delay(TICK).await;
-        }
-        let snapshot = self.outer.snapshots.read().clone();
-        // The machine may have failed at the same time as the requested stop.
-        let unsaid = snapshot.stopping.filter(|_| !failed);
-        let mut causes = snapshot.failure.into_iter().chain(unsaid);
-        if let Some(failure) = causes.find(StopCause::is_failure) {
-            return Err(self.explain_stop(failure, None, &snapshot).await);
-        }
-        // Axes of a stopped group may not answer; their group's stop has been reported.
-        let mut axes = snapshot.axes.enumerate();
-        let powered = axes.find(|(axis, status)| {
-            status.state.has_power() && !self.is_stopped(self.group_of(*axis))
-        });
-        match powered {
-            Some((axis, status)) => Err(Cause::NotDisabled {
-                state: status.state,
-            }
-            .with_device(self.device_of(axis))),
-            None => Ok(()),
-        }
-    }
-
     async fn send(&mut self, command: RtCommand) {
         self.send_all(&[command]).await;
     }
@@ -566,13 +468,4 @@ impl Supervisor {
     fn axis_name(&self, axis: AxisIndex) -> String {
         self.machine.axes[axis].name.clone()
     }
-}
-
-/// Returns the changes of these devices back to a state.
-fn transitions<'d>(
-    devices: &[(DeviceIndex, &'d BusDevice)],
-    state: AlState,
-) -> Vec<Transition<'d>> {
-    let devices = devices.iter();
-    devices.map(|(_, d)| d.transition(state, true)).collect()
 }

@@ -1,0 +1,171 @@
+//! The way back from Op: standstill, then SafeOp, PreOp and Init.
+
+use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_ecat::registers;
+
+use super::{BROADCAST_WAIT, Supervisor, TICK};
+use crate::acyclic::{AlState, Transition, al};
+use crate::bringup::{BusDevice, enable_op_only};
+use crate::clock::{self, Nanos};
+use crate::post_mortem::snapshot;
+use crate::report::{Cause, Error, Progress};
+use crate::rt::bus_monitor::StopCause;
+use crate::rt::channel::RtCommand;
+
+impl Supervisor {
+    /// Stops the axes, removes power and sets the segment back to Init, as far as it answers.
+    /// `failed`: the run already has an error.
+    pub(super) async fn shut_down(&mut self, failed: bool) -> Result<(), Error> {
+        self.report(Progress::Stopping);
+        self.send(RtCommand::Stop).await;
+        let result = self.wait_for_standstill(failed).await;
+        let stations = self.stations();
+        if let Some(witnessed) = &mut self.witnessed {
+            snapshot::retry_absent(&self.wire, &stations, &mut witnessed.looks).await;
+        } else if let Err(error) = &result {
+            self.witness(error).await;
+        }
+        self.pass_events_on();
+        let mut lowered = Ok(());
+        for state in [AlState::SafeOp, AlState::PreOp, AlState::Init] {
+            if state == AlState::Init {
+                self.end_sync().await;
+            }
+            let requested = clock::now();
+            let changed = match self.lower_everywhere(state, requested).await {
+                true => Ok(()),
+                false => self.lower_each(state, requested).await,
+            };
+            match changed {
+                Ok(()) => self.report(Progress::Step(crate::bringup::Step::State(state))),
+                Err(error) => {
+                    let silent = al::is_wire(&error);
+                    self.report(Progress::Warning(error.to_string()));
+                    if lowered.is_ok() {
+                        lowered = Err(error);
+                    }
+                    if silent {
+                        break;
+                    }
+                }
+            }
+            if state == AlState::SafeOp {
+                self.disable_op_only().await;
+            }
+        }
+        result.and(lowered)
+    }
+
+    /// Disables the SyncManagers that are enabled in Op only, as far as the devices answer.
+    async fn disable_op_only(&self) {
+        for device in self.bus.devices.iter() {
+            if let Err(error) = enable_op_only(&self.wire, device, false).await {
+                tracing::debug!("{error}");
+            }
+        }
+    }
+
+    /// Stops SYNC0 and SYNC1. PreOp does not need them, and in Init they would look like a running
+    /// machine.
+    async fn end_sync(&self) {
+        let mut devices = self.machine.devices.iter();
+        if !devices.any(|config| config.selection.dc.is_some()) {
+            return;
+        }
+        let stop = self.wire.write_all(registers::DC_CYCLIC_CONTROL, &[0, 0]);
+        // On an error, the segment still goes to Init.
+        if let Err(error) = stop.await {
+            tracing::debug!("SYNC0 goes on: {error}");
+        }
+    }
+
+    /// Requests a lower state from all devices with one datagram. Returns true once the cycle's
+    /// broadcast read of AL status finds all of them in it. Returns false if a device has an error, is
+    /// missing or needs longer.
+    async fn lower_everywhere(&mut self, wanted: AlState, requested: Nanos) -> bool {
+        if self.request_everywhere(wanted).await.is_err() {
+            return false;
+        }
+        while clock::now().saturating_sub(requested) <= BROADCAST_WAIT
+            && !self.outer.commands.is_abandoned()
+        {
+            clock::delay(TICK).await;
+            let snapshot = self.outer.snapshots.read().clone();
+            if self.is_everywhere(wanted, &snapshot) {
+                return true;
+            }
+            // Those that answer may all be there.
+            let ended = |(status, _)| status == wanted.code() || AlState::has_error(status);
+            if snapshot.al_status.is_some_and(ended) {
+                return false;
+            }
+        }
+        false
+    }
+
+    /// Requests a lower state from each device that is not in it.
+    async fn lower_each(&mut self, wanted: AlState, requested: Nanos) -> Result<(), Error> {
+        let is_stopped = |device: DeviceIndex| self.is_stopped(self.machine.group_of(device));
+        let devices = self.bus.devices.enumerate();
+        let (stopped, others): (Vec<_>, Vec<_>) =
+            devices.partition(|(device, _)| is_stopped(*device));
+        let changed =
+            al::lower_state(&self.wire, &transitions(&others, wanted), wanted, requested).await;
+        if changed.as_ref().is_err_and(al::is_wire) {
+            return changed;
+        }
+        // Stopped groups follow as far as they can; their errors do not count.
+        let stopped = transitions(&stopped, wanted);
+        if let Err(error) = al::lower_state(&self.wire, &stopped, wanted, requested).await {
+            tracing::debug!("{error}");
+        }
+        changed
+    }
+
+    /// Waits until nothing more can stop any axis. Each axis ends its stop in bounded time.
+    async fn wait_for_standstill(&mut self, failed: bool) -> Result<(), Error> {
+        loop {
+            clock::delay(TICK).await;
+            let snapshot = self.outer.snapshots.read();
+            let ended = snapshot.stopping.is_some() && snapshot.stop_ended;
+            if ended || self.outer.commands.is_abandoned() {
+                break;
+            }
+        }
+        // Until this point, anything the cycle finds is a failure of this run.
+        self.send(RtCommand::StopBusMonitor).await;
+        while self.outer.snapshots.read().commands_taken < self.commands_sent
+            && !self.outer.commands.is_abandoned()
+        {
+            clock::delay(TICK).await;
+        }
+        let snapshot = self.outer.snapshots.read().clone();
+        // The machine may have failed at the same time as the requested stop.
+        let unsaid = snapshot.stopping.filter(|_| !failed);
+        let mut causes = snapshot.failure.into_iter().chain(unsaid);
+        if let Some(failure) = causes.find(StopCause::is_failure) {
+            return Err(self.explain_stop(failure, None, &snapshot).await);
+        }
+        // Axes of a stopped group may not answer; their group's stop has been reported.
+        let mut axes = snapshot.axes.enumerate();
+        let powered = axes.find(|(axis, status)| {
+            status.state.has_power() && !self.is_stopped(self.group_of(*axis))
+        });
+        match powered {
+            Some((axis, status)) => Err(Cause::NotDisabled {
+                state: status.state,
+            }
+            .with_device(self.device_of(axis))),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Returns the changes of these devices back to a state.
+fn transitions<'d>(
+    devices: &[(DeviceIndex, &'d BusDevice)],
+    state: AlState,
+) -> Vec<Transition<'d>> {
+    let devices = devices.iter();
+    devices.map(|(_, d)| d.transition(state, true)).collect()
+}
