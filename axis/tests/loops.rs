@@ -194,7 +194,7 @@ fn external_set_points_leave_room_to_stop_within_the_range() {
     config.limits.position = Some([-END, END]);
     let (most, acceleration) = (config.limits.velocity, config.limits.acceleration);
     for sign in [1.0, -1.0] {
-        let mut rig = enabled(config.clone());
+        let mut rig = enabled(config);
         let mut at = rig.axis.status().target_position;
         let mut velocity = 0.0_f64;
         let refused = loop {
