@@ -174,7 +174,7 @@ impl<'a, W: MailboxTransport> Eeprom<'a, W> {
     }
 
     /// Returns 0x0502 and the four or eight bytes that one read brings
-    /// ([`EIGHT_BYTES`](sii::control::EIGHT_BYTES)).
+    /// ([`EIGHT_BYTES`]).
     ///
     /// # Errors
     /// As [`Eeprom::read`].
