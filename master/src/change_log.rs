@@ -5,9 +5,10 @@ use std::fs::{File, OpenOptions};
 use std::io::{self, Write as _};
 use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use rustix::fs::{FlockOperation, flock};
+use rustix::fs::{FlockOperation, OFlags, flock};
+use rustix::io::Errno;
 use serde_json::{Map, Value, json};
 
 /// The environment variable with the path of the log.
@@ -16,6 +17,8 @@ pub const VARIABLE: &str = "ECAXIS_CHANGE_LOG";
 const DEFAULT: &str = "/var/log/ecaxis/changes.jsonl";
 /// A longer file is renamed: `changes.jsonl.1` is the newest of the old ones.
 const MAX_BYTES: u64 = 10 << 20;
+/// The longest wait for another writer.
+const LOCK_TIMEOUT: Duration = Duration::from_secs(1);
 /// The old files that are kept.
 const KEPT: u32 = 9;
 
@@ -85,12 +88,14 @@ impl ChangeLog {
     fn open_locked(&self) -> io::Result<File> {
         loop {
             let mut options = OpenOptions::new();
+            // Without it, opening a pipe would wait for its reader.
+            options.custom_flags(OFlags::NONBLOCK.bits().cast_signed());
             let file = options
                 .create(true)
                 .append(true)
                 .mode(0o640)
                 .open(&self.path)?;
-            flock(&file, FlockOperation::LockExclusive)?;
+            lock(&file)?;
             // Another program may have renamed it meanwhile.
             match std::fs::metadata(&self.path) {
                 Ok(now) if now.ino() == file.metadata()?.ino() => return Ok(file),
@@ -118,9 +123,36 @@ impl ChangeLog {
     }
 }
 
+/// Locks a file. Waits for other writers, but not for one that hangs.
+fn lock(file: &File) -> io::Result<()> {
+    let end = Instant::now() + LOCK_TIMEOUT;
+    loop {
+        match flock(file, FlockOperation::NonBlockingLockExclusive) {
+            Err(Errno::WOULDBLOCK) if Instant::now() < end => {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            done => return Ok(done?),
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn neither_a_pipe_nor_a_writer_that_hangs_is_waited_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let pipe = folder.path().join("pipe");
+        let mode = rustix::fs::Mode::from_raw_mode(0o600);
+        rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, mode, 0).unwrap();
+        assert!(ChangeLog::new(pipe).append(entry(1)).is_err());
+        let log = ChangeLog::new(folder.path().join("changes.jsonl"));
+        let held = log.open_locked().unwrap();
+        assert!(log.append(entry(1)).is_err());
+        drop(held);
+        log.append(entry(2)).unwrap();
+    }
 
     fn entry(number: usize) -> Map<String, Value> {
         let mut entry = Map::new();
