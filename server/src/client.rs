@@ -1,6 +1,7 @@
 //! One client: carries out its requests.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -69,6 +70,33 @@ pub struct Client {
     /// The time of the last jog.
     jogged: AtomicU64,
     gone: AtomicBool,
+}
+
+/// An entry of the change log, which is written when this value is dropped: also for a request
+/// whose client is gone before the outcome.
+struct Change {
+    changes: SyncSender<Map<String, Value>>,
+    entry: Map<String, Value>,
+    outcome: String,
+}
+
+impl Change {
+    fn end(mut self, result: &Result<Map<String, Value>, OpError>) {
+        self.outcome = match result {
+            Ok(_) => "ok".to_owned(),
+            Err(error) => error.message.clone(),
+        };
+    }
+}
+
+impl Drop for Change {
+    fn drop(&mut self) {
+        let mut entry = std::mem::take(&mut self.entry);
+        entry.insert("outcome".to_owned(), json!(self.outcome));
+        if self.changes.try_send(entry).is_err() {
+            tracing::warn!("the change log is too slow: an entry is lost");
+        }
+    }
 }
 
 impl Client {
@@ -161,7 +189,9 @@ impl Client {
             Ok(op) => {
                 let change = self.change(&op);
                 let result = self.carry_out(op, request.wait, &mut area).await;
-                self.log_change(change, &result);
+                if let Some(change) = change {
+                    change.end(&result);
+                }
                 result
             }
         };
@@ -178,10 +208,14 @@ impl Client {
         Answer { body, status, area }
     }
 
-    /// Returns the entry of the change log for an operation that belongs there.
-    fn change(&self, op: &Op) -> Option<Map<String, Value>> {
-        self.hub.options.changes.as_ref()?;
-        if !op.is_change() || matches!(op, Op::Jog { .. }) && !self.begins_jog() {
+    /// Begins the entry of the change log for an operation that belongs there. Clients that may not
+    /// command have no entries: they could fill the log.
+    fn change(&self, op: &Op) -> Option<Change> {
+        let changes = self.hub.options.changes.clone()?;
+        if !op.is_change()
+            || self.refusal().is_some()
+            || matches!(op, Op::Jog { .. }) && !self.begins_jog()
+        {
             return None;
         }
         let mut entry = Map::new();
@@ -191,7 +225,12 @@ impl Client {
         let client = json!({"id": self.id, "name": self.name(), "peer": self.peer});
         entry.insert("client".to_owned(), client);
         entry.insert("command".to_owned(), json!(op));
-        Some(entry)
+        let outcome = "the client was gone before the outcome".to_owned();
+        Some(Change {
+            changes,
+            entry,
+            outcome,
+        })
     }
 
     /// True if a jog begins: the messages of one follow each other within [`JOG_PAUSE_NS`].
@@ -199,24 +238,6 @@ impl Client {
         let now = clock::now();
         let before = self.jogged.swap(now, Ordering::Relaxed);
         before == 0 || now.saturating_sub(before) > JOG_PAUSE_NS
-    }
-
-    fn log_change(
-        &self,
-        entry: Option<Map<String, Value>>,
-        result: &Result<Map<String, Value>, OpError>,
-    ) {
-        let (Some(mut entry), Some(changes)) = (entry, &self.hub.options.changes) else {
-            return;
-        };
-        let outcome = match result {
-            Ok(_) => "ok",
-            Err(error) => &error.message,
-        };
-        entry.insert("outcome".to_owned(), json!(outcome));
-        if changes.try_send(entry).is_err() {
-            tracing::warn!("the change log is too slow: an entry is lost");
-        }
     }
 
     async fn carry_out(
@@ -463,5 +484,28 @@ fn object(value: Value) -> Map<String, Value> {
     match value {
         Value::Object(map) => map,
         _ => Map::new(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_request_without_an_outcome_has_an_entry() {
+        let (changes, entries) = std::sync::mpsc::sync_channel(2);
+        let change = || Change {
+            changes: changes.clone(),
+            entry: Map::new(),
+            outcome: "gone".to_owned(),
+        };
+        // The future of the request was dropped.
+        drop(change());
+        change().end(&Ok(Map::new()));
+        let outcomes: Vec<_> = entries
+            .try_iter()
+            .map(|entry| entry["outcome"].clone())
+            .collect();
+        assert_eq!(outcomes, ["gone", "ok"]);
     }
 }

@@ -146,7 +146,8 @@ pub fn new_token() -> io::Result<String> {
 /// Serves the machine until `stop` is cancelled. Blocks.
 ///
 /// # Errors
-/// Fails if the server cannot listen, or the recording failed. A failure of the machine is reported to the clients instead.
+/// Fails if the server cannot listen, or the recording failed. A failure of the machine is reported
+/// to the clients instead.
 pub fn serve(
     mut machine: Machine,
     run: Options,

@@ -2,6 +2,7 @@
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
+use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
@@ -131,7 +132,7 @@ fn samples_and_history_are_exact() {
     let mut client = server.owner("test");
     client.done("enable", json!({"axis": "x"}));
     client.done("move", json!({"axis": "x", "to": 2.0, "speed": 0.05}));
-    std::thread::sleep(std::time::Duration::from_millis(300));
+    std::thread::sleep(Duration::from_millis(300));
     let path = "/api/samples?signals=x.target_position&count=400";
     let frame = request(&server, "GET", path, &[], "").body;
     let u32_at = |at: usize| u32::from_le_bytes(frame[at..at + 4].try_into().unwrap());
@@ -169,4 +170,24 @@ fn samples_and_history_are_exact() {
     assert_eq!(reply.status, 404);
     let reply = request(&server, "GET", "/api/recordings/..%2Fs.sock", &[], "");
     assert_eq!(reply.status, 404);
+}
+
+#[test]
+fn a_client_that_may_not_command_cannot_fill_the_change_log() {
+    let server = Server::with_http(demo(), true);
+    let stop =
+        |headers: &[(&str, &str)]| request(&server, "POST", "/api/stop", headers, "{}").status;
+    assert_eq!(stop(&[]), 401);
+    let token = format!("Bearer {TOKEN}");
+    assert_eq!(stop(&[("Authorization", &token)]), 200);
+    let end = Instant::now() + Duration::from_secs(10);
+    while server.changes().is_empty() && Instant::now() < end {
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let outcomes: Vec<_> = server
+        .changes()
+        .iter()
+        .map(|entry| entry["outcome"].clone())
+        .collect();
+    assert_eq!(outcomes, [json!("ok")]);
 }
