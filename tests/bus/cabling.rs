@@ -1,7 +1,11 @@
 //! Cables: IN and OUT swapped at a device, propagation delays.
 
+use std::fmt::Write as _;
+
+use ecaxis_master::config::Machine;
+use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::recordings::{FPWR, datagrams};
-use ecaxis_test_support::{axes, machine, recorded, run, run_badly, virtual_time};
+use ecaxis_test_support::{axes, faults, machine, recorded, run, run_badly, virtual_time};
 
 /// Returns four drives, one with swapped cables.
 fn with_reversed(device: usize) -> String {
@@ -40,6 +44,72 @@ fn swapped_cables_of_the_last_device_change_nothing() {
         !warnings.iter().any(|w| w.contains("swapped")),
         "{warnings:?}"
     );
+}
+
+const LIMITS: &str = "limits = { position = [-1000.0, 1000.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 1.0 }";
+
+/// A drive with three ports; `first` at its port 1, `second` at its port 2. Frames pass `first`
+/// before `second`.
+fn branches() -> Machine {
+    let bench = Bench::new();
+    bench.write("junction.xml", &bench.read("esi/EPOS4.xml"));
+    bench.change("junction.xml", |esi| esi.replace("\"YY\"", "\"YYY\""));
+    let mut text = String::from("[bus]\ncycle = \"1ms\"\n");
+    for (position, name, esi, sim) in [
+        (0, "junction", "junction.xml", ""),
+        (
+            1,
+            "first",
+            "esi/EPOS4.xml",
+            "after = \"junction\"\nport = 1",
+        ),
+        (
+            2,
+            "second",
+            "esi/EPOS4.xml",
+            "after = \"junction\"\nport = 2",
+        ),
+    ] {
+        let _ = write!(
+            text,
+            "[[device]]\nname = \"{name}\"\nesi = \"{esi}\"\nposition = {position}\nmode = \"csp\"\n\
+             [device.axis]\nunit = \"turn\"\nper_turn = 1.0\nencoder = 2000\n{LIMITS}\n\
+             [device.sim]\n{sim}\n"
+        );
+    }
+    text += "[[stop.group]]\nname = \"own\"\naxes = [\"first\"]\noutside = \"continue\"\n";
+    text += "[[step]]\nenable = [\"second\"]\n[[step]]\ndwell = \"4s\"\n";
+    bench.machine(&text)
+}
+
+/// ETG.1500, feature 1102. Without it, the clock of `second` would be 1,050 ns off: twice 500 ns
+/// through the drive in the first branch, and 25 ns for its cable (`docs/network.md`).
+#[test]
+fn delays_are_measured_again_when_a_branch_disappears_and_returns() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let off = "[[fault]]\nkind = \"power-off\"\ndevice = 1\nat = \"1s\"\nfor = \"1s\"\n";
+    let (options, recording) = recorded(faults(off), folder.path());
+    run(branches(), options).0.result.expect("the others run");
+    let mut delays = Vec::new();
+    for datagram in datagrams(&recording)
+        .iter()
+        .filter(|datagram| datagram.sent)
+    {
+        let delay = <[u8; 4]>::try_from(&datagram.data[..]).map(u32::from_le_bytes);
+        if let (FPWR, 0x0928, Ok(delay)) = (datagram.command, datagram.register(), delay) {
+            delays.push((datagram.station(), delay));
+        }
+    }
+    // Bring-up writes all; afterwards only what has changed is written.
+    let later: Vec<_> = delays.split_off(delays.len().saturating_sub(2));
+    let before = delays.iter().rfind(|(station, _)| *station == 0x1002);
+    let before = before.expect("written by bring-up").1;
+    let expected = [before - 1_050, before];
+    assert_eq!(later.len(), 2, "{delays:?}, {later:?}");
+    for ((station, delay), expected) in later.iter().zip(expected) {
+        assert_eq!(*station, 0x1002, "{delays:?}, {later:?}");
+        assert!(delay.abs_diff(expected) <= 20, "{delays:?}, {later:?}");
+    }
 }
 
 /// Returns the delays (0x0928) that a run writes, by station.

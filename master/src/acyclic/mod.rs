@@ -5,6 +5,7 @@
 //! as far as needed: another MainDevice may be driving it.
 //!
 //! - [`al`]: AL states;
+//! - [`delays`]: propagation delays;
 //! - [`enumerate`]: the devices of a segment and their addresses;
 //! - [`device`]: finds one device by its locator;
 //! - [`eeprom`]: the EEPROM interface of one device;
@@ -21,6 +22,7 @@ pub use crate::report::DeviceRef;
 pub use al::{AlState, StateError, Transition};
 
 pub mod al;
+pub mod delays;
 pub mod device;
 pub mod eeprom;
 pub mod enumerate;

@@ -171,6 +171,7 @@ impl RunBuilder<'_> {
                     stopped: Vec::new(),
                     last_status: clock::now(),
                     witnessed: None,
+                    clock_tree: None,
                 };
                 Ok(Prepared { parts, supervisor })
             }

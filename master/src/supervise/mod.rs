@@ -12,6 +12,7 @@ use std::time::Duration;
 use ecaxis_axis::{Command, CommandError};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
+use tokio::sync::watch;
 
 use crate::acyclic::{AlState, DeviceRef, Transition, al};
 use crate::bringup::{Bus, BusDevice, enable_op_only};
@@ -28,8 +29,10 @@ use crate::report::{Cause, EmergencyLog, Error, GroupStop, ProbeCapture, Progres
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::{COMMANDS_PER_CYCLE, Event, HostEndpoint, RtCommand, Snapshot};
 use crate::rt::exchange::{DiagnosticRegister, SubDeviceDiagnostics};
+use clock_tree::ClockTree;
 use groups::StoppedGroup;
 
+mod clock_tree;
 mod coordinated;
 pub(crate) mod diagnosis_history;
 mod explain;
@@ -90,6 +93,8 @@ pub struct Supervisor {
     pub last_status: Nanos,
     /// The state of the bus at the failure.
     pub witnessed: Option<Witnessed>,
+    /// What the delays depend on, for the task that measures them again.
+    pub(crate) clock_tree: Option<watch::Sender<ClockTree>>,
 }
 
 /// The result of the machine's program.
@@ -114,7 +119,14 @@ impl Supervisor {
     pub async fn run(mut self) -> (ProgramOutcome, Result<(), Error>) {
         let workers = std::mem::take(&mut self.workers);
         let heartbeat = self.outer.heartbeat.clone();
-        let mut work = pin!(run_with_workers(workers, self.run_inner()));
+        let delays = self.keep_delays();
+        let work = async {
+            tokio::select! {
+                done = self.run_inner() => done,
+                never = delays => match never {},
+            }
+        };
+        let mut work = pin!(run_with_workers(workers, work));
         poll_fn(|context| {
             heartbeat.beat();
             work.as_mut().poll(context)
@@ -373,6 +385,7 @@ impl Supervisor {
         let snapshot = self.outer.snapshots.read().clone();
         self.pass_events_on();
         self.report_limits(&snapshot);
+        self.follow_clock_tree(&snapshot);
         if clock::now().saturating_sub(self.last_status) >= STATUS_PERIOD {
             self.last_status = clock::now();
             self.report(Progress::Status(Status::new(&self.machine, &snapshot)));

@@ -5,7 +5,6 @@
 //! they are free. States and mailboxes are not used unless [`Options::intrude`] is set.
 //!
 //! - [`registers`]: the controller's registers;
-//! - [`delays`]: propagation delays;
 //! - [`other_main_device`]: evidence of another MainDevice;
 //! - [`coe_info`]: answers over the CoE mailbox;
 //! - [`esi_match`]: matching ESI files;
@@ -19,15 +18,15 @@ use ecaxis_esi::sii::{self, General, Protocols, Sii};
 
 use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::acyclic::al::{self, AlState};
+use ecaxis_master::acyclic::delays::{self, MeasuredDevice};
 use ecaxis_master::acyclic::device::{read_image, with_mailbox};
 use ecaxis_master::acyclic::eeprom::EepromAccess;
 use ecaxis_master::acyclic::enumerate::{self, EnumeratedDevice};
-use ecaxis_master::acyclic::topology::{ParentPort, open_ports, parents};
+use ecaxis_master::acyclic::topology::{ParentPort, parents};
 use ecaxis_master::mailbox::MailboxTransport;
 use ecaxis_master::report::{Cause, Error};
 
 pub mod coe_info;
-pub mod delays;
 pub mod esi_match;
 pub mod other_main_device;
 pub mod registers;
@@ -42,8 +41,6 @@ use registers::{CONTROLLER_BYTES, Controller};
 
 /// The time to detect another MainDevice.
 const WATCH: Duration = Duration::from_millis(50);
-/// The number of latched receive times; the delays are averages.
-const LATCHES: u32 = 8;
 
 /// The extent of a scan.
 #[derive(Debug, Clone, Copy, Default)]
@@ -291,40 +288,17 @@ async fn measure_delays(
         }
         return Ok(());
     }
-    let places: Vec<_> = devices
+    let measured: Vec<_> = devices
         .iter()
-        .map(|device| delays::TreeNode {
-            open: open_ports(device.found.dl_status),
-            uplink: device.uplink,
+        .map(|device| MeasuredDevice {
+            position: device.position(),
+            dl_status: device.found.dl_status,
+            receive_times: device.controller.has_receive_times(),
         })
         .collect();
-    let mut sums = vec![0_i64; devices.len()];
-    let mut measured = vec![false; devices.len()];
-    for _ in 0..LATCHES {
-        wire.write_all(esc::DC_RECEIVE_TIME, &[0; 4])
-            .await
-            .map_err(|error| Error::from(Cause::Datagram(error)).with_action(STEP))?;
-        let mut times = Vec::with_capacity(devices.len());
-        for device in devices.iter() {
-            times.push(if device.controller.has_receive_times() {
-                let bytes: [u8; 16] =
-                    enumerate::at(wire, device.position(), STEP, esc::DC_RECEIVE_TIME).await?;
-                Some(registers::receive_times(bytes))
-            } else {
-                None
-            });
-        }
-        let delays = delays::delays(&places, &times);
-        for ((sum, measured), delay) in sums.iter_mut().zip(&mut measured).zip(delays) {
-            if let Some(delay) = delay {
-                *sum += delay;
-                *measured = true;
-            }
-        }
-    }
-    for ((device, sum), measured) in devices.iter_mut().zip(sums).zip(measured) {
-        let mean = sum / i64::from(LATCHES);
-        device.delay_ns = measured.then(|| u32::try_from(mean.max(0)).unwrap_or(u32::MAX));
+    let delays = delays::measure(wire, &measured).await?;
+    for (device, delay) in devices.iter_mut().zip(delays) {
+        device.delay_ns = delay;
     }
     Ok(())
 }

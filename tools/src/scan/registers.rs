@@ -2,11 +2,12 @@
 
 use std::fmt;
 
+use ecaxis_master::acyclic::delays::has_receive_times;
+
 /// The size of registers 0x0000 to 0x0009.
 pub const CONTROLLER_BYTES: usize = 10;
 
 /// Bits of 0x0008.
-const DC: u16 = 0x0004;
 const DC_64_BIT: u16 = 0x0008;
 const NO_LRW: u16 = 0x0200;
 
@@ -83,7 +84,7 @@ impl Controller {
     /// True if it supports distributed clocks, or at least receive times.
     #[must_use]
     pub fn has_receive_times(&self) -> bool {
-        self.features & DC != 0
+        has_receive_times(self.features)
     }
 
     /// Returns the size of the distributed clock in bits.
@@ -100,19 +101,6 @@ impl Controller {
     pub fn knows_lrw(&self) -> bool {
         self.features & NO_LRW == 0
     }
-}
-
-/// Parses 0x0900 to 0x090F: local times in ns at which a frame arrived at each port.
-#[must_use]
-pub fn receive_times(bytes: [u8; 16]) -> [u32; 4] {
-    let mut times = [0; 4];
-    for (time, word) in times.iter_mut().zip(bytes.chunks_exact(4)) {
-        *time = word
-            .iter()
-            .rev()
-            .fold(0, |time, byte| time << 8 | u32::from(*byte));
-    }
-    times
 }
 
 #[cfg(test)]
@@ -136,12 +124,5 @@ mod tests {
         assert!(!without.has_receive_times() && !without.knows_lrw());
         assert_eq!(without.ports[3], PortKind::Ebus);
         assert_eq!(without.clock_bits(), 32);
-    }
-
-    #[test]
-    fn receive_times_are_little_endian() {
-        let mut bytes = [0; 16];
-        bytes[4..8].copy_from_slice(&0x1234_5678_u32.to_le_bytes());
-        assert_eq!(receive_times(bytes), [0, 0x1234_5678, 0, 0]);
     }
 }

@@ -1,0 +1,159 @@
+//! Measures the propagation delays again after ports have opened or closed during operation
+//! (ETG.1500, feature 1102). A frame reaches the devices after a branch earlier once that branch is
+//! gone, and their clocks would run ahead by its round-trip delay.
+
+use std::convert::Infallible;
+use std::future::{Future, pending};
+use std::time::Duration;
+
+use ecaxis_ecat::index::{DeviceIndex, IndexVec};
+use ecaxis_ecat::registers;
+use tokio::sync::watch;
+
+use super::Supervisor;
+use crate::acyclic::delays::{self, MeasuredDevice};
+use crate::acyclic::enumerate;
+use crate::acyclic::topology::open_ports;
+use crate::clock;
+use crate::datagram::DatagramClient;
+use crate::mailbox::MailboxTransport;
+use crate::report::{Cause, Error};
+use crate::rt::channel::Snapshot;
+use crate::rt::exchange::DiagnosticRegister;
+
+const STEP: &str = "measuring propagation delays";
+/// A plug bounces: the ports must rest for this time.
+const SETTLING_TIME: Duration = Duration::from_millis(100);
+/// A difference in ns below this is noise of the receive times, and no delay is written.
+const NOISE_NS: u32 = 40;
+
+/// What the propagation delays depend on.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct ClockTree {
+    /// The ports that forward frames.
+    open: IndexVec<DeviceIndex, [bool; 4]>,
+    reference: Option<DeviceIndex>,
+}
+
+impl Supervisor {
+    /// Returns a task that measures the delays whenever [`ClockTree`] changes. It never ends.
+    pub(super) fn keep_delays(&mut self) -> impl Future<Output = Infallible> + use<> {
+        let devices = self.bus.devices.iter();
+        let tree = ClockTree {
+            open: devices.map(|device| open_ports(device.dl_status)).collect(),
+            reference: None,
+        };
+        let changes = self.bus.dc.as_ref().map(|_| {
+            let (sender, changes) = watch::channel(tree);
+            self.clock_tree = Some(sender);
+            changes
+        });
+        let clocks = self.bus.devices.iter();
+        let clocks: IndexVec<DeviceIndex, _> = clocks
+            .map(|device| (device.at.station, device.follows))
+            .collect();
+        let wire = self.wire;
+        async move {
+            if let Some(changes) = changes {
+                follow(&wire, &clocks, changes).await;
+            }
+            pending().await
+        }
+    }
+
+    /// Passes on what the cycle has read of the ports.
+    pub(super) fn follow_clock_tree(&self, snapshot: &Snapshot) {
+        let Some(tree) = &self.clock_tree else {
+            return;
+        };
+        let reference = snapshot.phase.and_then(|phase| phase.reference);
+        tree.send_if_modified(|now| {
+            let last = now.reference;
+            now.reference = reference.or(last);
+            let mut changed = last.is_some() && last != now.reference;
+            for (open, found) in now.open.iter_mut().zip(&snapshot.diagnoses) {
+                if found.answers && found.has_read(DiagnosticRegister::DlStatus) {
+                    let read = open_ports(found.dl_status);
+                    changed |= std::mem::replace(open, read) != read;
+                }
+            }
+            changed
+        });
+    }
+}
+
+/// Measures the delays after each change, until the sender is dropped. `clocks`: the station address
+/// of each device, and whether its clock follows the reference clock.
+async fn follow(
+    wire: &DatagramClient,
+    clocks: &IndexVec<DeviceIndex, (u16, bool)>,
+    mut changes: watch::Receiver<ClockTree>,
+) {
+    while changes.changed().await.is_ok() {
+        clock::delay(SETTLING_TIME).await;
+        if changes.has_changed().unwrap_or(true) {
+            continue;
+        }
+        let reference = changes.borrow().reference;
+        let reference = reference.and_then(|device| clocks.get(device)).copied();
+        let still_valid = || !changes.has_changed().unwrap_or(true);
+        if let Some((reference, _)) = reference
+            && let Err(error) = update(wire, clocks, reference, still_valid).await
+        {
+            // The next change starts another measurement.
+            tracing::info!("{error}");
+        }
+    }
+}
+
+/// Measures all delays and writes those that have changed.
+async fn update(
+    wire: &DatagramClient,
+    clocks: &IndexVec<DeviceIndex, (u16, bool)>,
+    reference: u16,
+    still_valid: impl Fn() -> bool,
+) -> Result<(), Error> {
+    let mut stations = Vec::new();
+    let mut devices = Vec::new();
+    for position in 0..enumerate::count(wire).await? {
+        let word = async |register| {
+            let bytes = enumerate::at(wire, position, STEP, register).await?;
+            Ok::<_, Error>(u16::from_le_bytes(bytes))
+        };
+        stations.push(word(registers::STATION_ADDRESS).await?);
+        devices.push(MeasuredDevice {
+            position,
+            dl_status: word(registers::DL_STATUS).await?,
+            receive_times: delays::has_receive_times(word(registers::FEATURES).await?),
+        });
+    }
+    let measured = delays::measure(wire, &devices).await?;
+    let measured = || stations.iter().copied().zip(&measured);
+    let find = |wanted| measured().find(|(station, _)| *station == wanted);
+    let Some((_, Some(first))) = find(reference) else {
+        return Ok(());
+    };
+    for (station, delay) in measured() {
+        let follows = clocks.contains(&(station, true));
+        let (Some(delay), true) = (delay, follows && station != reference) else {
+            continue;
+        };
+        let delay = delay.saturating_sub(*first);
+        let failed = |error| Error::from(Cause::Datagram(error)).with_action(STEP);
+        let mut written = [0; 4];
+        let register = registers::DC_SYSTEM_TIME_DELAY;
+        let read = wire.read(station, register, &mut written).await;
+        let written = u32::from_le_bytes(written);
+        if read.map_err(failed)? == 0 || written.abs_diff(delay) <= NOISE_NS {
+            continue;
+        }
+        // A later change may have moved the devices.
+        if !still_valid() {
+            return Ok(());
+        }
+        tracing::info!("station 0x{station:04x}: propagation delay {written} ns, now {delay} ns");
+        let write = wire.write(station, register, &delay.to_le_bytes()).await;
+        write.map_err(failed)?;
+    }
+    Ok(())
+}
