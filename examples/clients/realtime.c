@@ -106,13 +106,17 @@ int main(int count, char **arguments) {
     memset(rows, 0xff, sizeof rows);
     printf("running\n");
     fflush(stdout);
+    int pauses = 0;
     while (row < end) {
         uint64_t now = __atomic_load_n(&samples[WRITTEN], __ATOMIC_ACQUIRE);
         if (now == row) {
             struct timespec pause = {0, 20000};
             nanosleep(&pause, NULL);
+            if (++pauses > 50000)
+                return fprintf(stderr, "no cycle for a second: the server has ended, or the bus is down\n"), 1;
             continue;
         }
+        pauses = 0;
         skipped += now - row - 1;
         /* The rows since then: does each have the set-point that was written for it? */
         for (uint64_t n = row; n < now; n++) {

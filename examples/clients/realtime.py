@@ -73,11 +73,15 @@ def main():
     sets, written, used, skipped, renewed = {}, 0, 0, 0, row
     axis = commands[AXES_AT]
     print("running", flush=True)
+    seen = time.monotonic()
     while row < end:
         now = samples[WRITTEN]
         if now == row:
             time.sleep(20e-6)
+            if time.monotonic() - seen > 1:
+                raise SystemExit("no cycle for a second: the server has ended, or the bus is down")
             continue
+        seen = time.monotonic()
         skipped += now - row - 1
         for n in range(row, now):
             expected = sets.pop(n, None)

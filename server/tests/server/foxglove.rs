@@ -1,7 +1,7 @@
 //! Viewers over the Foxglove WebSocket protocol.
 
 use std::collections::HashMap;
-use std::io::{Read, Write};
+use std::io::Write;
 use std::net::TcpStream;
 use std::time::Duration;
 
@@ -14,7 +14,7 @@ use crate::fuzz::Random;
 use crate::harness::{Server, TOKEN, demo};
 use crate::hostile::{count, damage, resident};
 use crate::http::request;
-use crate::websocket::{frame, read_frame, upgrade};
+use crate::websocket::{frame, read_frame, read_now, upgrade};
 
 const PROTOCOL: &str = "Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n";
 
@@ -303,9 +303,6 @@ fn random_frames_of_viewers_break_nothing() {
             "{head}"
         );
         stream
-            .set_read_timeout(Some(Duration::from_micros(100)))
-            .unwrap();
-        stream
     };
     let (mut stream, mut buffer) = (connect(), [0; 65536]);
     let before = resident();
@@ -327,7 +324,8 @@ fn random_frames_of_viewers_break_nothing() {
             damage(&mut random, &mut bytes);
         }
         let sent = stream.write_all(&bytes);
-        if sent.is_err() || round % 64 == 0 || matches!(stream.read(&mut buffer), Ok(0)) {
+        let closed = matches!(read_now(&mut stream, &mut buffer), Ok(0));
+        if sent.is_err() || round % 64 == 0 || closed {
             stream = connect();
         }
     }

@@ -20,6 +20,14 @@ pub fn tcp(server: &Server) -> TcpStream {
     stream
 }
 
+/// Reads what has arrived, without waiting: a time-out would last a tick of the kernel at least.
+pub fn read_now(stream: &mut TcpStream, buffer: &mut [u8]) -> std::io::Result<usize> {
+    stream.set_nonblocking(true)?;
+    let read = stream.read(buffer);
+    stream.set_nonblocking(false)?;
+    read
+}
+
 /// Opens a WebSocket that may command (RFC 6455).
 pub fn websocket(server: &Server) -> TcpStream {
     let authorization = format!("Authorization: Bearer {TOKEN}\r\n");
