@@ -163,7 +163,8 @@ impl RawSocket {
         message.msg_iov = &raw mut part;
         message.msg_iovlen = 1;
         message.msg_control = (&raw mut control).cast();
-        message.msg_controllen = size_of_val(&control);
+        // Its type depends on the C library.
+        message.msg_controllen = size_of_val(&control) as _;
         // SAFETY: every pointer in `message` is valid for the length next to it.
         let len = unsafe { libc::recvmsg(self.fd.as_raw_fd(), &raw mut message, 0) };
         let Ok(len) = usize::try_from(len) else {
