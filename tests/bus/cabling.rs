@@ -34,6 +34,44 @@ fn device_with_swapped_in_and_out_is_named_with_its_port() {
     }
 }
 
+/// SOEM reaches Op on such a segment. Here too, if nothing depends on clocks and on the order.
+#[test]
+fn swapped_cables_do_not_matter_without_clocks_and_positions() {
+    let by_alias = |mut text: String| {
+        for device in 0..4 {
+            let place = format!("position = {device}\n");
+            text = text.replace(&place, &format!("alias = {}\n", 100 + device));
+        }
+        text
+    };
+    let without_clocks =
+        |text: String| text.replace("mode = \"csp\"", "mode = \"csp\"\ndc = \"off\"");
+    for swapped in 0..3 {
+        let text = without_clocks(with_reversed(swapped));
+        let (outcome, heard) = run(machine(&by_alias(text.clone())), virtual_time());
+        let summary = outcome.summary.expect("comes up");
+        outcome.result.expect("moves");
+        for axis in &summary.axes {
+            assert!(
+                axis.final_error_counts
+                    .is_some_and(|error| error.abs() <= 1),
+                "{axis:?}"
+            );
+        }
+        let warning = "swapped at the device at position 3: frames enter at its port 1";
+        assert!(
+            heard.warnings().iter().any(|w| w.contains(warning)),
+            "{:?}",
+            heard.warnings()
+        );
+        // A position would mean another drive, and SYNC0 needs the delays.
+        for text in [text, by_alias(with_reversed(swapped))] {
+            let (error, _) = run_badly(machine(&text), virtual_time());
+            assert!(error.contains("IN and OUT are swapped at"), "{error}");
+        }
+    }
+}
+
 /// Behind the last device there is nothing that frames could pass before it.
 #[test]
 fn swapped_cables_of_the_last_device_change_nothing() {

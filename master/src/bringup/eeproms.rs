@@ -79,6 +79,7 @@ pub(super) async fn read_ahead(
     Ok(ScanFindings {
         eeproms: eeproms.collect(),
         all_in_init,
+        as_line: None,
     })
 }
 

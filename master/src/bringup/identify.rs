@@ -1,7 +1,9 @@
 //! Identifies the SubDevices on the bus and compares them with the machine file.
 
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
+use ecaxis_ecat::registers::DL_STATUS;
 use ecaxis_esi::model::{Identification, Identity};
 use ethercrab::error::{Error, TimeoutError};
 use ethercrab::{MainDevice, SubDeviceIdentity};
@@ -10,7 +12,8 @@ use super::{Group, ScanFailure, Step, align, scan_error};
 use crate::acyclic::device::read_sii;
 use crate::acyclic::eeprom::EepromAccess;
 use crate::acyclic::enumerate::{EnumeratedDevice, FIRST_STATION, count, read_device};
-use crate::acyclic::{DeviceRef, al, topology};
+use crate::acyclic::{DeviceRef, al, enumerate, topology};
+use crate::concurrent::try_join_all;
 use crate::config::{DeviceConfig, Locator, Machine};
 use crate::datagram::DatagramClient;
 use crate::report::{self, Cause};
@@ -83,13 +86,9 @@ pub(super) async fn explain_scan(
     if matches!(failure, ScanFailure::Failed(Error::Topology))
         && let Some(at) = topology::reversed(all.iter().map(|found| found.dl_status))
     {
-        let status = all.get(at).map_or(0, |found| found.dl_status);
-        let open = (0..).zip(topology::open_ports(status)).skip(1);
-        let port = open
-            .into_iter()
-            .find_map(|(port, open)| open.then_some(port));
+        let port = entry_port(all.get(at).map_or(0, |found| found.dl_status));
         let there = present(wire, machine, &all).await;
-        return reversed(machine, at, port.unwrap_or(0), &there);
+        return reversed(machine, at, port, &there);
     }
     let late = Error::Timeout(TimeoutError::StateTransition);
     if let (ScanFailure::Failed(error), Some((device, actual))) = (&failure, behind)
@@ -160,6 +159,42 @@ async fn present(
         products.push(sii.ok().and_then(|sii| product(sii.identity)));
     }
     products
+}
+
+/// Returns the port at which frames enter a device that they do not enter at port 0.
+fn entry_port(dl_status: u16) -> u8 {
+    let open = (0..).zip(topology::open_ports(dl_status)).skip(1);
+    let mut open = open.into_iter();
+    open.find_map(|(port, open)| open.then_some(port))
+        .unwrap_or(0)
+}
+
+/// Returns the station addresses if a device with swapped IN and OUT does not matter: nothing uses
+/// clocks, and no position in the file means another device because of it.
+pub(super) async fn tolerate_reversed(
+    wire: &DatagramClient,
+    machine: &Machine,
+    count: u16,
+    progress: &dyn Fn(Step),
+) -> Option<RangeInclusive<u16>> {
+    let first = positions(machine).next().map(|(position, _)| position);
+    let clocks = machine.devices.iter().any(|d| d.selection.dc.is_some());
+    if clocks || first == Some(0) {
+        return None;
+    }
+    let each = (0..count).map(|at| enumerate::at(wire, at, "reading its ports", DL_STATUS));
+    let status = try_join_all(each).await.ok()?;
+    let status: Vec<u16> = status.into_iter().map(u16::from_le_bytes).collect();
+    let at = topology::reversed(status.iter().copied())?;
+    if first.is_some_and(|first| usize::from(first) <= at) {
+        return None;
+    }
+    let port = entry_port(status.get(at).copied().unwrap_or(0));
+    progress(Step::Warning(format!(
+        "IN and OUT are swapped at the device at position {at}: frames enter at its port {port} instead of port 0. \
+         No device uses distributed clocks, so the run goes on"
+    )));
+    Some(FIRST_STATION..=FIRST_STATION.saturating_add(count - 1))
 }
 
 /// Names the device whose IN and OUT are swapped. `at`: its index on the bus; `port`: the port at which

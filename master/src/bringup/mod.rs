@@ -144,7 +144,8 @@ pub async fn bring_up(
             })?;
         al::acknowledge_errors_in_init(&wire).await;
         let ahead = Box::pin(eeproms::read_ahead(&wire, machine, count));
-        let ahead = times.measure("EEPROMs", None, ahead).await?;
+        let mut ahead = times.measure("EEPROMs", None, ahead).await?;
+        ahead.as_line = identify::tolerate_reversed(&wire, machine, count, progress).await;
         answers.replace(ahead);
         // ethercrab's tables are large, and futures hold them by value.
         let scan = Box::pin(main_device.init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now));

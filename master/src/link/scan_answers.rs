@@ -4,13 +4,16 @@
 //!   datagrams, and each read takes the EEPROM hundreds of microseconds.
 //! - The request of Init, if all devices are in Init. A controller takes no other request until its
 //!   processor has read this one (ESC data sheet, AL control), and the scan is fast.
+//! - The DL status, if frames enter a device at another port than port 0. ethercrab measures the
+//!   delays of every segment and rejects such a topology, even if nothing uses clocks.
 
 use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 use std::sync::{Mutex, PoisonError};
 
 use ecaxis_ecat::al_state::AlState;
 use ecaxis_ecat::datagram::{Command, HEADER, Header, WORKING_COUNTER};
-use ecaxis_ecat::registers::{AL_CONTROL, EEPROM_CONTROL, EEPROM_DATA};
+use ecaxis_ecat::registers::{AL_CONTROL, DL_STATUS, EEPROM_CONTROL, EEPROM_DATA};
 use ecaxis_ecat::sii::control::{EIGHT_BYTES, READ};
 
 use super::joined_frame::FRAME_HEADER;
@@ -102,7 +105,13 @@ pub struct ScanFindings {
     pub eeproms: BTreeMap<u16, EepromWords>,
     /// The number of devices if all are in Init without an error and have read their last request.
     pub all_in_init: Option<u16>,
+    /// The station addresses of all devices if they are shown as a line.
+    pub as_line: Option<RangeInclusive<u16>>,
 }
+
+/// The DL status of a device in a line, and of the last one: links and loops of the ports.
+const IN_LINE: u16 = 0x5a30;
+const LAST_IN_LINE: u16 = 0x5610;
 
 impl ScanFindings {
     /// Returns data and working counter of the answer to a datagram; `None` if the bus must answer.
@@ -114,7 +123,17 @@ impl ScanFindings {
         {
             return Some((data.to_vec(), self.all_in_init?));
         }
-        let device = self.eeproms.get_mut(&u16::from_le_bytes([s0, s1]))?;
+        let station = u16::from_le_bytes([s0, s1]);
+        if let (Command::FPRD, DL_STATUS, [_, _]) = (header.command, register, data) {
+            let line = self.as_line.as_ref()?;
+            let status = match station == *line.end() {
+                true => LAST_IN_LINE,
+                false => IN_LINE,
+            };
+            let known = line.contains(&station);
+            return known.then(|| (status.to_le_bytes().to_vec(), 1));
+        }
+        let device = self.eeproms.get_mut(&station)?;
         Some((device.answer(header.command, register, data)?, 1))
     }
 }
@@ -165,7 +184,7 @@ mod tests {
         let answers = ScanAnswers::default();
         answers.replace(ScanFindings {
             eeproms: BTreeMap::from([(STATION, words)]),
-            all_in_init: None,
+            ..ScanFindings::default()
         });
         answers
     }
@@ -305,6 +324,21 @@ mod tests {
         assert!(!request(Command::BWR, 2) && !request(Command::FPWR, 1));
         answers.replace(ScanFindings::default());
         assert!(!request(Command::BWR, 0x11));
+    }
+
+    /// ETG.1000.4, DL status: link of ports 0 and 1 in bits 4 and 5, open ports in bits 9 and 11.
+    #[test]
+    fn dl_status_is_that_of_a_line_if_wanted() {
+        let answers = answers(EIGHT_BYTES);
+        let status = |station| ask(&answers, Command::FPRD, (station, DL_STATUS), &[0, 0]);
+        assert_eq!(status(STATION), None);
+        answers.replace(ScanFindings {
+            as_line: Some(0x1000..=0x1002),
+            ..ScanFindings::default()
+        });
+        let found = [0x0fff, 0x1000, 0x1001, 0x1002, 0x1003].map(status);
+        let [inner, last] = [vec![0x30, 0x5a], vec![0x10, 0x56]].map(Some);
+        assert_eq!(found, [None, inner.clone(), inner, last, None]);
     }
 
     #[test]
