@@ -51,16 +51,17 @@ fn with_names(shell: Shell, script: &str) -> String {
             let (head, tail) = script.split_once("\n_ecaxis() {").unwrap_or((script, ""));
             text = format!("{head}\n{}\n_ecaxis() {{{tail}", include_str!("names.zsh"));
             text = text.replace(":IF:_default", ":IF:_net_interfaces");
-            text = text.replace(
-                "Network interface:_default",
-                "Network interface:_net_interfaces",
-            );
-            let lines = text
-                .lines()
-                .map(|line| match line.contains("Machine file, device") {
-                    true => line.replace(":_default'", ":_ecaxis_devices'"),
-                    false => line.to_owned(),
-                });
+            let lines = text.lines().map(|line| {
+                if line.contains(" -- Network interface") {
+                    line.replace(":_default'", ":_net_interfaces'")
+                } else if line.contains("'*::words -- ") || line.contains(":device -- ") {
+                    // With two colons, zsh offers no options after the first of the words.
+                    let line = line.replace("'*::words", "'*:words");
+                    line.replace(":_default'", ":_ecaxis_devices'")
+                } else {
+                    line.to_owned()
+                }
+            });
             text = lines.map(|line| line + "\n").collect();
         }
         Shell::Fish => {

@@ -20,11 +20,15 @@ _ecaxis_names() {
 }
 
 _ecaxis_named() {
-    local cur="${COMP_WORDS[COMP_CWORD]}" names
+    local cur="${COMP_WORDS[COMP_CWORD]}" names IFS=$' \t\n'
     _ecaxis "$1" "$2" "$3"
     [[ "${cur}" == -* || "$3" == -* ]] && return 0
     names="$(_ecaxis_names)"
-    [[ -z "${names}" ]] || COMPREPLY=( $(compgen -W "${names}" -- "${cur}") )
+    [[ -n "${names}" ]] || return 0
+    # A name may contain spaces.
+    IFS=$'\n'
+    COMPREPLY=( $(compgen -W "${names}" -- "${cur}") )
+    [[ "${#COMPREPLY[@]}" = 0 ]] || COMPREPLY=( $(printf '%q\n' "${COMPREPLY[@]}") )
 }
 
 complete -F _ecaxis_named -o bashdefault -o default ecaxis
