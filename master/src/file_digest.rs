@@ -51,6 +51,8 @@ impl fmt::Debug for FileDigest {
 pub struct UsedFile {
     pub path: PathBuf,
     pub sha256: FileDigest,
+    /// The trusted key of a verified signature, with its name.
+    pub signed_by: Option<String>,
 }
 
 impl UsedFile {
@@ -59,6 +61,7 @@ impl UsedFile {
         Self {
             path: path.to_owned(),
             sha256: FileDigest::of(bytes),
+            signed_by: None,
         }
     }
 }

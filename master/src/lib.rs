@@ -23,6 +23,7 @@
 //! - [`text`]: formatting of counts with nouns;
 //! - [`mod@file`]: reads whole files of bounded length;
 //! - [`file_digest`]: SHA-256 of the files that a machine is made of;
+//! - [`signature`]: verifies the signatures of these files;
 //! - [`sys`]: system calls; all unsafe code.
 
 #![deny(unsafe_code)]
@@ -52,6 +53,7 @@ pub mod ros2;
 pub mod rt;
 pub mod samples;
 pub mod session;
+pub mod signature;
 pub mod supervise;
 pub mod sys;
 pub mod text;

@@ -57,7 +57,15 @@ fn each_change_has_an_entry_with_its_user_and_outcome() {
         let ran = run(line);
         assert_eq!(ran.code, code, "{line}: {}{}", ran.out, ran.err);
     }
-    let entries = entries(&log);
+    let mut entries = entries(&log);
+    // Before its first frame, an update enters which file it is about to write.
+    let is_begin =
+        |entry: &Value| entry["command"][0] == "firmware" && entry["outcome"] == "begins";
+    let begins: Vec<_> = entries.extract_if(.., |entry| is_begin(entry)).collect();
+    assert_eq!(begins.len(), 1);
+    assert!(begins[0]["file"].as_str().unwrap().ends_with("/new.bin"));
+    assert_eq!(begins[0]["sha256"].as_str().unwrap().len(), 64);
+    assert_eq!(begins[0]["signed_by"], Value::Null);
     // A run has two entries.
     assert_eq!(entries.len(), changes.len() + 1, "{entries:#?}");
     let uid = rustix::process::getuid().as_raw();

@@ -12,4 +12,5 @@ mod identity;
 mod init;
 mod messages;
 mod mistakes;
+mod signatures;
 mod terminal;

@@ -461,6 +461,8 @@ pub(crate) fn config(path: &Path, error: &ConfigError) -> Failure {
         }
         ConfigError::Io { .. } => failure.hint("check the file's permissions"),
         ConfigError::NotText { .. } => failure.hint("a machine file is TOML, in UTF-8"),
+        ConfigError::Policy(_) => failure.hint(POLICY),
+        ConfigError::Signature(error) => failure.hint(error.hint()),
         ConfigError::Problems(problems) if problems.len() > 1 => {
             let message = format!(
                 "{error}\n\n{} problems in {}",
@@ -472,6 +474,9 @@ pub(crate) fn config(path: &Path, error: &ConfigError) -> Failure {
         ConfigError::Problems(_) => failure,
     }
 }
+
+/// The advice for a policy that cannot be used.
+pub(crate) const POLICY: &str = "correct the file that ECAXIS_POLICY or /etc/ecaxis/policy.toml names; docs/signatures.md describes it";
 
 /// Suggests machine files in the neighbourhood of a missing one.
 fn machine_files(path: &Path) -> String {

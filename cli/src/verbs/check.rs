@@ -42,6 +42,11 @@ fn as_json(path: &Path, loaded: &Result<Machine, ConfigError>) -> serde_json::Va
     match loaded {
         Ok(machine) => json!({
             "ok": true, "error": null, "sha256": machine.sha256.to_string(), "devices": machine.devices.len(), "problems": [],
+            "files": machine.files.iter().map(|file| json!({
+                "file": file.path.display().to_string(),
+                "sha256": file.sha256.to_string(),
+                "signed_by": file.signed_by,
+            })).collect::<Vec<_>>(),
         }),
         Err(e) => json!({ "ok": false, "error": in_short(path, e), "problems": problems(e) }),
     }
@@ -56,7 +61,10 @@ pub(crate) fn in_short(path: &Path, error: &ConfigError) -> String {
         ConfigError::Problems(problems) => {
             format!("{} problems in {}", problems.len(), path.display())
         }
-        ConfigError::Io { .. } | ConfigError::NotText { .. } => error.to_string(),
+        ConfigError::Io { .. }
+        | ConfigError::NotText { .. }
+        | ConfigError::Policy(_)
+        | ConfigError::Signature(_) => error.to_string(),
     }
 }
 
@@ -64,7 +72,10 @@ pub(crate) fn in_short(path: &Path, error: &ConfigError) -> String {
 pub(crate) fn problems(error: &ConfigError) -> serde_json::Value {
     let problems = match error {
         ConfigError::Problems(problems) => problems.as_slice(),
-        ConfigError::Io { .. } | ConfigError::NotText { .. } => &[],
+        ConfigError::Io { .. }
+        | ConfigError::NotText { .. }
+        | ConfigError::Policy(_)
+        | ConfigError::Signature(_) => &[],
     };
     let each = problems.iter().map(|p| {
         json!({
@@ -88,6 +99,14 @@ fn summary(machine: &Machine) -> Document {
         pluralize(machine.steps.len(), "step"),
     ));
     out.line(format!("sha256 {}", machine.sha256));
+    // Without a policy, no signature was looked at.
+    if machine.files.iter().any(|file| file.signed_by.is_some()) {
+        for file in &machine.files {
+            let signer = file.signed_by.as_ref();
+            let signed = signer.map_or("not signed".to_owned(), |key| format!("signed by {key}"));
+            out.line(format!("{}: {signed}", file.path.display()));
+        }
+    }
     for device in &machine.devices {
         let selection = &device.selection;
         let mode = selection.mode.map_or("I/O".to_owned(), |m| m.to_string());

@@ -15,12 +15,15 @@ use super::raw::{RawBus, RawDevice, RawMachine};
 use super::sim;
 use super::steps::{self, Resolved, ResolvedAxis, ResolvedDevice};
 
+use crate::file_digest::{FileDigest, UsedFile};
+
 use super::{
     AxisSetup, Bus, Locator, MAX_SUBDEVICES, Machine, Nic, ServerSetup, Signal, Spin, signal,
 };
 
 /// Returns `None` only if a problem has been reported.
-pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Option<Machine> {
+pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) -> Option<Machine> {
+    let path = &*file.path;
     let cycle_span = raw.bus.cycle.place().unwrap_or_default();
     let bus = bus(raw.bus, p);
     unique_names(&raw.devices, p);
@@ -118,7 +121,11 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
     connections.check(&devices, p);
     Some(Machine {
         path: path.to_owned(),
-        sha256: p.sha256(),
+        sha256: FileDigest::of_machine(file, &p.files.files),
+        files: std::iter::once(file)
+            .chain(&p.files.files)
+            .cloned()
+            .collect(),
         bus: bus?,
         devices,
         axes: axes.into(),

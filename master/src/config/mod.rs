@@ -77,13 +77,14 @@ use raw::RawMachine;
 
 use crate::esi_library::{RevisionMatch, SiiImage};
 use crate::file;
-use crate::file_digest::FileDigest;
+use crate::file_digest::{FileDigest, UsedFile};
 use crate::link::SocketKind;
 pub use crate::rt::config::{Condition, ExchangeMode, GroupStopScope};
 use crate::rt::config::{GroupConfig, RtConfig};
 pub use crate::rt::controller::{AxisRef, InputRef, OutputRef};
 use crate::rt::image::{OpOnly, ProcessData};
 pub use crate::rt::spin::Spin;
+use crate::signature::{SignaturePolicy, SignedKind};
 
 /// The maximum number of SubDevices on a bus; a power of two, as ethercrab's group needs.
 pub(crate) const MAX_SUBDEVICES: usize = 512;
@@ -94,6 +95,8 @@ pub struct Machine {
     pub path: PathBuf,
     /// SHA-256 of this file and the files that it names.
     pub sha256: FileDigest,
+    /// This file and the files that it names.
+    pub files: Vec<UsedFile>,
     pub bus: Bus,
     /// The devices, in bus order if every device is located by position, otherwise in file order.
     pub devices: IndexVec<DeviceIndex, DeviceConfig>,
@@ -460,32 +463,53 @@ impl Machine {
 /// The maximum length of a machine file in bytes.
 const MAX_BYTES: u64 = 16 << 20;
 
+/// Reads and checks a machine file and the ESI files it names, with the policy of the environment
+/// for their signatures.
+///
+/// # Errors
+/// Fails like [`load_with`], and with [`ConfigError::Policy`].
+pub fn load(path: &Path) -> Result<Machine, ConfigError> {
+    load_with(path, &SignaturePolicy::of_environment()?)
+}
+
 /// Reads and checks a machine file and the ESI files it names.
 ///
 /// # Errors
-/// [`ConfigError::Io`] if the file cannot be read, [`ConfigError::NotText`] if it is not text,
-/// otherwise all mistakes in it.
-pub fn load(path: &Path) -> Result<Machine, ConfigError> {
+/// [`ConfigError::Io`] if the file cannot be read, [`ConfigError::Signature`] if the policy refuses
+/// it, [`ConfigError::NotText`] if it is not text, otherwise all mistakes in it.
+pub fn load_with(path: &Path, policy: &SignaturePolicy) -> Result<Machine, ConfigError> {
     let bytes = file::read(path, MAX_BYTES).map_err(|source| ConfigError::Io {
         path: path.to_owned(),
         source,
     })?;
+    let file = policy.verify(SignedKind::Machine, path, &bytes)?;
     let text = String::from_utf8(bytes).map_err(|e| ConfigError::NotText {
         path: path.to_owned(),
         source: e.utf8_error(),
     })?;
-    parse(path, &text)
+    parse_file(file, &text, policy)
 }
 
 /// The maximum number of TOML syntax errors reported.
 const MOST_SYNTAX_ERRORS: usize = 10;
 
-/// Checks a machine file's text. `path` is the base of relative ESI file names.
+/// Checks a machine file's text. `path` is the base of relative ESI file names. No signature is
+/// looked at.
 ///
 /// # Errors
 /// All mistakes in the file.
 pub fn parse(path: &Path, text: &str) -> Result<Machine, ConfigError> {
-    let mut problems = problem::Problems::new(path, text);
+    let file = UsedFile::new(path, text.as_bytes());
+    parse_file(file, text, &SignaturePolicy::default())
+}
+
+fn parse_file(
+    file: UsedFile,
+    text: &str,
+    policy: &SignaturePolicy,
+) -> Result<Machine, ConfigError> {
+    let path = &*file.path;
+    let mut problems = problem::Problems::new(path, text, policy);
     let start = text.trim_start_matches('\u{feff}').trim_start();
     if start.starts_with('<') {
         let at = text.len() - start.len();
@@ -514,7 +538,7 @@ pub fn parse(path: &Path, text: &str) -> Result<Machine, ConfigError> {
         return Err(problems.into_error());
     }
     let raw = RawMachine::read(&root, "", &mut problems);
-    match raw.and_then(|raw| check::machine(path, raw, &mut problems)) {
+    match raw.and_then(|raw| check::machine(&file, raw, &mut problems)) {
         Some(machine) if problems.is_empty() => Ok(machine),
         _ => Err(problems.into_error()),
     }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use strsim::osa_distance;
 
-use crate::file_digest::{FileDigest, UsedFile};
+use crate::signature::{PolicyError, SignatureError, SignaturePolicy, VerifiedFiles};
 
 /// The reason why a machine file is rejected.
 #[derive(Debug, thiserror::Error)]
@@ -23,6 +23,10 @@ pub enum ConfigError {
         path: PathBuf,
         source: std::str::Utf8Error,
     },
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+    #[error(transparent)]
+    Signature(#[from] SignatureError),
     /// All mistakes in the file, in line order.
     #[error("{}", all(.0))]
     Problems(Vec<Problem>),
@@ -100,17 +104,11 @@ pub(crate) struct Problems<'s> {
     /// The problems by their first byte.
     found: BTreeMap<usize, Vec<Problem>>,
     /// The files that were read for the machine file.
-    pub files: Vec<UsedFile>,
+    pub files: VerifiedFiles<'s>,
 }
 
 impl<'s> Problems<'s> {
-    /// Returns the digest of the machine file and the files that were read for it.
-    pub fn sha256(&self) -> FileDigest {
-        let machine = UsedFile::new(self.path, self.text.as_bytes());
-        FileDigest::of_machine(&machine, &self.files)
-    }
-
-    pub fn new(path: &'s Path, text: &'s str) -> Self {
+    pub fn new(path: &'s Path, text: &'s str, policy: &'s SignaturePolicy) -> Self {
         Self {
             path,
             text,
@@ -118,7 +116,7 @@ impl<'s> Problems<'s> {
                 .chain(text.match_indices('\n').map(|(at, _)| at + 1))
                 .collect(),
             found: BTreeMap::new(),
-            files: Vec::new(),
+            files: VerifiedFiles::new(policy),
         }
     }
 
@@ -261,7 +259,8 @@ mod tests {
     #[test]
     fn problem_puts_the_caret_under_the_marked_text() {
         let text = "a = 1\n\tβeta = \"zwölf\" # c\nc = 2";
-        let mut problems = Problems::new(Path::new("m.toml"), text);
+        let policy = SignaturePolicy::default();
+        let mut problems = Problems::new(Path::new("m.toml"), text, &policy);
         let at = text.find("\"zw").unwrap();
         problems.add_hint(
             at..at + "\"zwölf\"".len(),
@@ -279,7 +278,8 @@ mod tests {
     #[test]
     fn problem_accepts_a_span_past_the_end() {
         for text in ["", "x", "ä", "x\n"] {
-            let mut problems = Problems::new(Path::new("m.toml"), text);
+            let policy = SignaturePolicy::default();
+            let mut problems = Problems::new(Path::new("m.toml"), text, &policy);
             for start in 0..4 {
                 problems.add(start..9, "m");
             }

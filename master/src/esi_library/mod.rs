@@ -18,7 +18,7 @@ use ecaxis_esi as esi;
 use serde::{Deserialize, Serialize};
 
 use crate::file;
-use crate::file_digest::UsedFile;
+use crate::signature::{SignatureError, SignaturePolicy, SignedKind, VerifiedFiles};
 
 /// The maximum number of files in a library. More files indicate a wrong path.
 const MAX_FILES: usize = 10_000;
@@ -41,6 +41,8 @@ pub enum LoadError {
         path: PathBuf,
         source: esi::sii::SiiError,
     },
+    #[error(transparent)]
+    Signature(#[from] SignatureError),
 }
 
 /// The EEPROM image of a device, from a file.
@@ -51,14 +53,15 @@ pub struct SiiImage {
     pub sii: esi::sii::Sii,
 }
 
-/// Reads the file of an EEPROM image.
-pub fn load_sii(path: &Path) -> Result<SiiImage, LoadError> {
+/// Reads the file of an EEPROM image, verifies it and adds it to `used`.
+pub(crate) fn load_sii(path: &Path, used: &mut VerifiedFiles<'_>) -> Result<SiiImage, LoadError> {
     /// More than the EEPROM interface of a SubDevice can address.
     const MAX_BYTES: u64 = 512 * 1024;
     let bytes = file::read(path, MAX_BYTES).map_err(|source| LoadError::Read {
         path: path.to_owned(),
         source,
     })?;
+    used.add(SignedKind::Esi, path, &bytes)?;
     let sii = esi::sii::parse(&bytes).map_err(|source| LoadError::Sii {
         path: path.to_owned(),
         source,
@@ -81,31 +84,38 @@ fn read(path: &Path) -> Result<Vec<u8>, LoadError> {
 fn parse(
     path: &Path,
     wanted: &dyn Fn(&esi::DeviceHeader) -> bool,
-    used: &mut Vec<UsedFile>,
+    used: &mut VerifiedFiles<'_>,
 ) -> Result<esi::EsiFile, LoadError> {
     let bytes = read(path)?;
-    used.push(UsedFile::new(path, &bytes));
+    used.add(SignedKind::Esi, path, &bytes)?;
     esi::parse_where(&bytes, wanted).map_err(|source| LoadError::Esi {
         path: path.to_owned(),
         source: Box::new(source),
     })
 }
 
+/// Reads a file for the index of a library. Signatures count when a file is loaded.
+fn index(path: &Path) -> Result<esi::EsiFile, LoadError> {
+    let policy = SignaturePolicy::default();
+    parse(path, &|_| false, &mut VerifiedFiles::new(&policy))
+}
+
 /// Reads an ESI file with the devices that `wanted` accepts, and adds the modules of the files that
 /// its `InfoReference`s name, from the same folder. A referenced file that cannot be read is a
-/// warning of the file.
+/// warning of the file. Signatures are not looked at.
 pub fn load(
     path: &Path,
     wanted: &dyn Fn(&esi::DeviceHeader) -> bool,
 ) -> Result<esi::EsiFile, LoadError> {
-    load_with(path, wanted, &mut Vec::new())
+    let policy = SignaturePolicy::default();
+    load_with(path, wanted, &mut VerifiedFiles::new(&policy))
 }
 
-/// Like [`load`]; adds the files that it reads to `used`.
+/// Like [`load`]; verifies the files that it reads and adds them to `used`.
 pub(crate) fn load_with(
     path: &Path,
     wanted: &dyn Fn(&esi::DeviceHeader) -> bool,
-    used: &mut Vec<UsedFile>,
+    used: &mut VerifiedFiles<'_>,
 ) -> Result<esi::EsiFile, LoadError> {
     let mut file = parse(path, wanted, used)?;
     let folder = path.parent().unwrap_or(Path::new(""));
@@ -130,8 +140,12 @@ pub(crate) fn load_with(
         let added = if seen.len() > MAX_REFERENCES {
             Err("too many files are referred to".to_owned())
         } else {
-            sibling(folder, &name)
-                .and_then(|path| parse(&path, &|_| false, used).map_err(|e| e.to_string()))
+            match sibling(folder, &name).map(|path| parse(&path, &|_| false, used)) {
+                Ok(Ok(file)) => Ok(file),
+                Ok(Err(error @ LoadError::Signature(_))) => return Err(error),
+                Ok(Err(error)) => Err(error.to_string()),
+                Err(problem) => Err(problem),
+            }
         };
         match added {
             Ok(other) => {
@@ -325,7 +339,7 @@ impl Library {
     /// Returns a library with the devices of one file.
     pub fn of_file(path: &Path) -> Result<Self, LoadError> {
         let file = PathBuf::from(path.file_name().unwrap_or_default());
-        let mut entries = devices(&file, parse(path, &|_| false, &mut Vec::new())?);
+        let mut entries = devices(&file, index(path)?);
         entries.sort_by_key(|e| (e.vendor, e.product, e.revision));
         Ok(Self {
             folder: path.parent().unwrap_or(Path::new("")).to_owned(),
@@ -378,12 +392,12 @@ impl Library {
 type Record = Result<Vec<Entry>, String>;
 
 fn describe(folder: &Path, file: &Path) -> Record {
-    let parsed =
-        parse(&folder.join(file), &|_| false, &mut Vec::new()).map_err(|error| match error {
-            LoadError::Esi { source, .. } => source.to_string(),
-            LoadError::Read { source, .. } => source.to_string(),
-            LoadError::Sii { source, .. } => source.to_string(),
-        })?;
+    let parsed = index(&folder.join(file)).map_err(|error| match error {
+        LoadError::Esi { source, .. } => source.to_string(),
+        LoadError::Read { source, .. } => source.to_string(),
+        LoadError::Sii { source, .. } => source.to_string(),
+        LoadError::Signature(source) => source.to_string(),
+    })?;
     Ok(devices(file, parsed))
 }
 

@@ -218,6 +218,7 @@ fn load(path: &Path, wanted: &dyn Fn(&DeviceHeader) -> bool) -> Result<EsiFile, 
                     "the file is damaged or is not an ESI file; download it from the vendor's site"
                 }
             }),
+            LoadError::Signature(source) => failure.hint(source.hint()),
             LoadError::Read { .. } | LoadError::Sii { .. } => failure,
         }
     })

@@ -5,6 +5,9 @@ use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use clap::ValueEnum;
+use ecaxis_master::change_log::ChangeLog;
+use ecaxis_master::file_digest::UsedFile;
+use ecaxis_master::signature::{SignaturePolicy, SignedKind};
 use ecaxis_tools::document::Document;
 use ecaxis_tools::firmware::{
     self, DeviceIdentity, Expected, ReadBack, UpdateMethod, UpdateProgress, UpdateReport,
@@ -14,8 +17,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
 use super::{TargetArgs, show, wrong};
-use crate::access::bus;
 use crate::access::device::Target;
+use crate::access::{bus, change_log};
 use crate::args::numbers::number;
 use crate::hints::{self, Failure};
 use crate::render::{note, output, print, print_json, style};
@@ -128,7 +131,7 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
         vendor: args.expect_vendor.or(identity.map(|i| i.vendor)),
         product: args.expect_product.or(identity.map(|i| i.product)),
     };
-    let file = read(&path)?;
+    let (file, used) = read(&path)?;
     let bytes = file.len();
     let name = match &args.name {
         Some(name) => name.clone(),
@@ -142,6 +145,9 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
     let (password, read_back, write) = (args.password, args.read_back, args.yes);
     let teller = ProgressReporter::new(plain);
     let bus = if write { bus.alone() } else { bus };
+    if let Some(log) = ChangeLog::of_environment().filter(|_| write) {
+        change_log::append_file(&log, &used);
+    }
     let visited = bus.visit(async move |wire, others| {
         if others > 0 && write {
             return Err(hints::shared_bus());
@@ -188,14 +194,19 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
     }
 }
 
-fn read(path: &Path) -> Result<Vec<u8>, Failure> {
+/// Reads the file and verifies its signature.
+fn read(path: &Path) -> Result<(Vec<u8>, UsedFile), Failure> {
     let failed = |why: String| wrong(&format!("cannot read {}: {why}", path.display()));
     let file = ecaxis_master::file::read(path, MOST).map_err(|e| failed(e.to_string()))?;
     if file.is_empty() {
         return Err(wrong(&format!("{} is empty", path.display()))
             .hint("name a firmware file from the device's vendor"));
     }
-    Ok(file)
+    let policy = SignaturePolicy::of_environment();
+    let policy = policy.map_err(|error| wrong(&error.to_string()).hint(hints::POLICY))?;
+    let used = policy.verify(SignedKind::Firmware, path, &file);
+    let used = used.map_err(|error| wrong(&error.to_string()).hint(error.hint()))?;
+    Ok((file, used))
 }
 
 fn planned(visited: &UpdateOutcome, bytes: usize, path: &Path) -> Document {

@@ -11,7 +11,6 @@ use crate::config::fields::KeyExt;
 use crate::config::problem::{Problems, Span, suggestion, unreadable};
 use crate::config::raw::RawDevice;
 use crate::esi_library::{self, Library, LoadError, SiiImage};
-use crate::file_digest::UsedFile;
 
 /// Data shared by all devices: the ESI folder, the files read so far, and the cycle.
 pub(crate) struct EsiFiles<'f> {
@@ -45,11 +44,10 @@ impl<'f> EsiFiles<'f> {
         let image = match self.images.get(&path) {
             Some(known) => known.clone(),
             None => {
-                let read = esi_library::load_sii(&path).map_err(|e| refused(e, ".sii"));
+                let read = esi_library::load_sii(&path, &mut p.files);
+                let read = read.map_err(|e| refused(e, ".sii"));
                 let read = read.map_err(|(message, hint)| p.add_hint(name.span(), message, hint));
                 let image = read.ok().map(Arc::new);
-                let used = image.as_deref().map(|i| UsedFile::new(&i.path, &i.bytes));
-                p.files.extend(used);
                 self.images.insert(path, image.clone());
                 image
             }
@@ -201,6 +199,7 @@ fn refused(error: LoadError, extension: &str) -> (String, String) {
             };
             (unreadable(&path, &source), hint)
         }
+        LoadError::Signature(error) => (error.to_string(), error.hint().to_owned()),
         LoadError::Esi { .. } => (
             error.to_string(),
             "the file is damaged or is not an ESI file".to_owned(),

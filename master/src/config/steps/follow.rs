@@ -13,7 +13,7 @@ use crate::config::problem::{Problems, unreadable};
 use crate::config::raw::{RawGear, RawWave};
 use crate::config::{Action, AxisSetup, TableFile};
 use crate::file;
-use crate::file_digest::UsedFile;
+use crate::signature::SignedKind;
 
 /// The maximum length of a table in bytes.
 const MAX_TABLE_BYTES: u64 = 64 << 20;
@@ -126,7 +126,11 @@ impl ProgramChecker<'_> {
                 return None;
             }
         };
-        p.files.push(UsedFile::new(&path, text.as_bytes()));
+        let used = p.files.add(SignedKind::Tables, &path, text.as_bytes());
+        if let Err(error) = used {
+            p.add_hint(file.span(), error.to_string(), error.hint());
+            return None;
+        }
         let (index, axis) = self.positioned(name, "table", p)?;
         let limits = &axis.config.limits;
         let table = Table::parse(&text, Interpolation::Cubic).and_then(|table| {
