@@ -85,8 +85,11 @@ def within_limits(rows, dt=1e-3):
 
 
 def move_back(watcher):
-    """The clients begin where the axis is: it would reach the end of its range."""
-    watcher.ask("take", name="judge")
+    """The clients begin where the axis is: it would reach the end of its range.
+
+    The server may not know yet that the last client has left.
+    """
+    watcher.ask("take", name="judge", force=True)
     if watcher.ask("state")["axes"][0]["enabled"]:
         watcher.ask("move", axis="x", to=0.0, speed=1.0, wait=True)
     watcher.ask("release")
