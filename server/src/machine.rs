@@ -138,6 +138,14 @@ impl Observer for Reporter<'_> {
             Progress::GroupReleased { group } => {
                 hub.event(json!({"event": "group_released", "group": group}));
             }
+            Progress::DeviceReturned {
+                device,
+                after_ns,
+                restarted,
+            } => hub.event(json!({
+                "event": "device_returned", "device": device.name, "after_s": *after_ns as f64 * 1e-9,
+                "restarted": restarted,
+            })),
             Progress::Warning(text) => warning(hub, text),
             Progress::Denied(denied) => warning(hub, &denied.to_string()),
             Progress::Overload(risk) => warning(hub, &risk.to_string()),

@@ -6,3 +6,4 @@ mod causes;
 mod failures;
 mod groups;
 mod limits;
+mod returns;

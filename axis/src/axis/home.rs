@@ -41,6 +41,12 @@ impl HomingRun {
 }
 
 impl Axis {
+    /// Takes the position of a drive that has restarted as it is. It has no home any more.
+    pub fn forget_home(&mut self) {
+        self.home.homed = false;
+        self.actual.start_over(&self.config.scale);
+    }
+
     pub(super) fn home(&mut self, timeout_s: f64) -> Result<(), CommandError> {
         if !timeout_s.is_finite() {
             return Err(CommandError::NotFinite {

@@ -3,8 +3,9 @@
 use std::time::{Duration, Instant};
 
 use ecaxis_axis::Mode;
+use ecaxis_master::acyclic::DeviceRef;
 use ecaxis_master::bringup::{Step, StepTime};
-use ecaxis_master::clock::Clock;
+use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config::{Bus, Nic, TorqueUnit};
 use ecaxis_master::session::{AxisLine, Observer, Progress, Status};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -159,6 +160,11 @@ impl Observer for ProgressPrinter {
                     "the group `{group}` has been reset and can be enabled again"
                 ));
             }
+            Progress::DeviceReturned {
+                device,
+                after_ns,
+                restarted,
+            } => note(&device_returned(device, *after_ns, *restarted)),
             Progress::BringUpTimes(steps) if self.times => {
                 note(bring_up_times(steps).trim_end());
             }
@@ -253,4 +259,14 @@ fn axis_text(axis: &AxisLine) -> String {
         Mode::Cst => format!("{name} {torque:.4} {torque_unit}"),
         _ => format!("{name} {position:.3} {unit}"),
     }
+}
+/// Describes a device that is in Op again.
+pub fn device_returned(device: &DeviceRef, after_ns: Nanos, restarted: bool) -> String {
+    let after = after_ns as f64 * 1e-9;
+    let home = if restarted {
+        "; it had no power, so home is lost"
+    } else {
+        ""
+    };
+    format!("{device} is in Op again after {after:.2} s{home}; reset its axes, then enable them")
 }

@@ -20,6 +20,7 @@ use crate::report::{Cause, Error};
 use crate::rt::image::ImagePlan;
 use crate::rt::phase::{ClockPlan, extend};
 use ecaxis_ecat::registers;
+use ecaxis_esi::select::DcSettings;
 
 const STEP: &str = "starting SYNC0";
 
@@ -29,7 +30,7 @@ const DISTRIBUTION_PERIOD: Duration = Duration::from_micros(100);
 const SETTLING_TIMEOUT: Nanos = 100_000_000;
 
 /// The first pulse must still be in the future when the last device receives its start time.
-const START_DELAY: Nanos = 20_000_000;
+pub(super) const START_DELAY: Nanos = 20_000_000;
 const START_DELAY_PER_DEVICE: Nanos = 500_000;
 /// A clock of 32 bits takes a time that is half a wrap ahead, 2.1 s, for the past.
 const MAX_START_DELAY: Nanos = 2_000_000_000;
@@ -43,7 +44,7 @@ const SHORT_MARGIN_DIVISOR: u64 = 20;
 /// How often a device that does not count the distributed time is asked again.
 const FOLLOWER_ATTEMPTS: u32 = 3;
 /// Lost datagrams can use up the delay; then the start is repeated with a longer one.
-const MAX_ATTEMPTS: u32 = 4;
+pub(super) const MAX_ATTEMPTS: u32 = 4;
 
 /// Returns `None` if no device uses distributed clocks.
 pub(super) async fn configure(
@@ -88,19 +89,7 @@ pub(super) async fn configure(
         let starts = wanting.iter().map(async |(dc, device)| {
             let own = system_time(wire, &device.at).await?;
             let first = extend(start.wrapping_add_signed(i64::from(dc.sync0_shift_ns)), own);
-            for (register, data) in [
-                (registers::DC_CYCLIC_CONTROL, &[0, 0][..]),
-                (registers::DC_START_TIME, &first.to_le_bytes()),
-                (registers::DC_SYNC0_CYCLE, &dc.sync0_cycle_ns.to_le_bytes()),
-                (registers::DC_SYNC1_CYCLE, &dc.sync1_delay_ns.to_le_bytes()),
-                (
-                    registers::DC_CYCLIC_CONTROL,
-                    &dc.assign_activate.to_le_bytes(),
-                ),
-            ] {
-                write(wire, &device.at, STEP, register, data).await?;
-            }
-            Ok::<(), Error>(())
+            start_pulses(wire, &device.at, dc, first).await
         });
         try_join_all(starts).await?;
         // A device with a start time in the past never generates a pulse.
@@ -138,6 +127,28 @@ pub(super) async fn configure(
     Err(Cause::NoStart.with_device(&reference))
 }
 
+/// Starts SYNC0 and SYNC1 of a device at a system time.
+pub(super) async fn start_pulses(
+    wire: &DatagramClient,
+    at: &DeviceRef,
+    dc: &DcSettings,
+    first: u64,
+) -> Result<(), Error> {
+    for (register, data) in [
+        (registers::DC_CYCLIC_CONTROL, &[0, 0][..]),
+        (registers::DC_START_TIME, &first.to_le_bytes()),
+        (registers::DC_SYNC0_CYCLE, &dc.sync0_cycle_ns.to_le_bytes()),
+        (registers::DC_SYNC1_CYCLE, &dc.sync1_delay_ns.to_le_bytes()),
+        (
+            registers::DC_CYCLIC_CONTROL,
+            &dc.assign_activate.to_le_bytes(),
+        ),
+    ] {
+        write(wire, at, STEP, register, data).await?;
+    }
+    Ok(())
+}
+
 /// Waits until all devices have seen pulses of SYNC0.
 pub(super) async fn await_pulses(wire: &DatagramClient, plan: &ClockPlan) {
     const PULSES: u64 = 5;
@@ -150,11 +161,6 @@ pub(super) async fn await_pulses(wire: &DatagramClient, plan: &ClockPlan) {
 /// first device with receive times, even if it has no system time. Its offsets are old by the time
 /// of the changes to PreOp, in which the clocks drift apart.
 pub(super) async fn set_offsets(wire: &DatagramClient, devices: &[BusDevice]) -> Result<(), Error> {
-    const STEP: &str = "setting the clocks";
-    /// The value after reset; writing it restarts the control loop at the frequency of the
-    /// oscillator.
-    const DEFAULT_SPEED_START: u16 = 0x1000;
-
     let clocks = || devices.iter().filter(|device| device.dc);
     let Some(reference) = clocks().min_by_key(|device| device.at.position) else {
         return Ok(());
@@ -164,32 +170,50 @@ pub(super) async fn set_offsets(wire: &DatagramClient, devices: &[BusDevice]) ->
         behind.saturating_sub(reference.propagation_delay)
     };
     let restarts = clocks().map(async |device| {
-        let start = DEFAULT_SPEED_START.to_le_bytes();
         let delay = delay(device).to_le_bytes();
         let at = &device.at;
-        write(wire, at, STEP, registers::DC_SPEED_COUNTER_START, &start).await?;
+        restart_control(wire, at).await?;
         write(wire, at, STEP, registers::DC_SYSTEM_TIME_DELAY, &delay).await
     });
     try_join_all(restarts).await?;
+    let then = latch(wire, &reference.at).await?;
+    let others = clocks().filter(|device| device.at != reference.at);
+    let offsets = others.map(|device| set_offset(wire, &device.at, then, delay(device)));
+    try_join_all(offsets).await.map(|_| ())
+}
+
+/// Restarts the control loop of a clock at the frequency of its oscillator.
+pub(super) async fn restart_control(wire: &DatagramClient, at: &DeviceRef) -> Result<(), Error> {
+    /// The value after reset.
+    const DEFAULT_SPEED_START: u16 = 0x1000;
+    let start = DEFAULT_SPEED_START.to_le_bytes();
+    write(wire, at, STEP, registers::DC_SPEED_COUNTER_START, &start).await
+}
+
+/// Latches the receive times. Returns the system time at which the frame was at the reference clock.
+pub(super) async fn latch(wire: &DatagramClient, reference: &DeviceRef) -> Result<u64, Error> {
     let latched = wire.write_all(registers::DC_RECEIVE_TIME, &[0; 4]).await;
     latched.map_err(|error| {
         Cause::Datagram(error)
-            .with_device(&reference.at)
+            .with_device(reference)
             .with_action(STEP)
     })?;
-    let offset = read(wire, &reference.at, STEP, registers::DC_SYSTEM_TIME_OFFSET).await?;
-    let local = read(wire, &reference.at, STEP, registers::DC_RECEIVE_TIME_UNIT).await?;
-    // The system time at which the frame was at the reference clock.
-    let then = u64::from_le_bytes(local).wrapping_add(u64::from_le_bytes(offset));
-    let others = clocks().filter(|device| device.at != reference.at);
-    let offsets = others.map(async |device| {
-        let at = &device.at;
-        let local = read(wire, at, STEP, registers::DC_RECEIVE_TIME_UNIT).await?;
-        let there = then.wrapping_add(u64::from(delay(device)));
-        let offset = there.wrapping_sub(u64::from_le_bytes(local)).to_le_bytes();
-        write(wire, at, STEP, registers::DC_SYSTEM_TIME_OFFSET, &offset).await
-    });
-    try_join_all(offsets).await.map(|_| ())
+    let offset = read(wire, reference, STEP, registers::DC_SYSTEM_TIME_OFFSET).await?;
+    let local = read(wire, reference, STEP, registers::DC_RECEIVE_TIME_UNIT).await?;
+    Ok(u64::from_le_bytes(local).wrapping_add(u64::from_le_bytes(offset)))
+}
+
+/// Sets the clock of a device whose receive times were latched at `then`.
+pub(super) async fn set_offset(
+    wire: &DatagramClient,
+    at: &DeviceRef,
+    then: u64,
+    delay: u32,
+) -> Result<(), Error> {
+    let local = read(wire, at, STEP, registers::DC_RECEIVE_TIME_UNIT).await?;
+    let there = then.wrapping_add(u64::from(delay));
+    let offset = there.wrapping_sub(u64::from_le_bytes(local)).to_le_bytes();
+    write(wire, at, STEP, registers::DC_SYSTEM_TIME_OFFSET, &offset).await
 }
 
 /// Returns the reference clock: the first device with a system time.
@@ -318,7 +342,10 @@ async fn find_followers(
     Ok(())
 }
 
-async fn system_time(wire: &impl MailboxTransport, at: &DeviceRef) -> Result<u64, Error> {
+pub(super) async fn system_time(
+    wire: &impl MailboxTransport,
+    at: &DeviceRef,
+) -> Result<u64, Error> {
     let time = read(wire, at, STEP, registers::DC_SYSTEM_TIME).await?;
     Ok(u64::from_le_bytes(time))
 }
@@ -406,7 +433,7 @@ fn release_time(cycle: u64, frames: u64, devices: impl Iterator<Item = Pulses>) 
     }
 }
 
-fn greatest_common_divisor(a: u64, b: u64) -> u64 {
+pub(super) fn greatest_common_divisor(a: u64, b: u64) -> u64 {
     match a {
         0 => b,
         _ => greatest_common_divisor(b % a, a),

@@ -150,16 +150,49 @@ async fn reconfigure(
     device: &DeviceRef,
     esi: &EsiMailbox<'_>,
 ) -> Result<(), Error> {
-    /// 0x0500: the PDI has access to the EEPROM, which some devices need for PreOp.
-    const PDI: [u8; 1] = [1];
     let timeouts = StateTimeouts::new(&config.device.info);
     let one = std::slice::from_ref(device);
     al::change_state(wire, one, AlState::Init, timeouts.back_to_init).await?;
     esi.configure(wire, device).await?;
+    let done = request_pre_op(wire, config, device).await;
+    done.map_err(|error| error.with_action(STEP))
+}
+
+/// Takes a device that returns from Init to PreOp, with the mailboxes that it had before.
+pub(super) async fn restore(
+    wire: &impl MailboxTransport,
+    config: &DeviceConfig,
+    device: &DeviceRef,
+    before: Option<&MailboxLayout>,
+) -> Result<(), Error> {
+    if let Some(esi) = EsiMailbox::of(config) {
+        let (mut out, mut inp) = (esi.out.1.clone(), esi.inp.1.clone());
+        if let Some(before) = before {
+            (out.start_address, out.default_size) = (before.out_address, before.out_len);
+            (inp.start_address, inp.default_size) = (before.in_address, before.in_len);
+        }
+        let mailbox = EsiMailbox {
+            out: (esi.out.0, &out),
+            inp: (esi.inp.0, &inp),
+        };
+        mailbox.configure(wire, device).await?;
+    }
+    request_pre_op(wire, config, device).await
+}
+
+async fn request_pre_op(
+    wire: &impl MailboxTransport,
+    config: &DeviceConfig,
+    device: &DeviceRef,
+) -> Result<(), Error> {
+    /// 0x0500: the PDI has access to the EEPROM, which some devices need for PreOp.
+    const PDI: [u8; 1] = [1];
+    let timeouts = StateTimeouts::new(&config.device.info);
+    let one = std::slice::from_ref(device);
     write(wire, device, STEP, registers::EEPROM_CONFIGURATION, &PDI).await?;
     let done = al::change_state(wire, one, AlState::PreOp, timeouts.pre_op).await;
     write(wire, device, STEP, registers::EEPROM_CONFIGURATION, &[0]).await?;
-    done.map_err(|error| error.with_action(STEP))
+    done
 }
 
 /// Runs ethercrab's `scan`. Meanwhile, a device that refuses PreOp because of its mailbox gets that

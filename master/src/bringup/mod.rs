@@ -37,6 +37,7 @@ use crate::text::panic_text;
 pub mod align;
 pub(crate) mod clocks;
 mod device;
+pub(crate) mod device_return;
 pub mod drive_units;
 mod eeproms;
 mod identify;
@@ -78,6 +79,8 @@ pub struct BusDevice {
     pub adopted: Vec<(AxisIndex, AdoptedUnits)>,
     /// For a drive: its own limits that the machine file exceeds.
     pub limits: Vec<(AxisIndex, LimitConflict)>,
+    /// The serial number in its EEPROM.
+    pub serial: u32,
     /// Propagation delay from the reference clock in ns.
     pub propagation_delay: u32,
     /// DL status (0x0110) after the scan: which ports are in use.
@@ -243,6 +246,7 @@ async fn describe(
         limits: Vec::new(),
         dc,
         follows: false,
+        serial: sub_device.identity().serial,
         propagation_delay,
         // Used only for a later comparison; 0 if unreadable.
         dl_status: enumerate::at(wire, position, "reading its ports", registers::DL_STATUS)
@@ -359,6 +363,19 @@ impl BusDevice {
         Transition {
             device: &self.at,
             timeout: self.timeouts.select(wanted, back),
+        }
+    }
+
+    /// Returns the device without its mailbox, as before its configuration.
+    pub(crate) fn without_mailbox(&self) -> Self {
+        Self {
+            at: self.at.clone(),
+            coe: None,
+            held: Vec::new(),
+            adopted: Vec::new(),
+            limits: Vec::new(),
+            op_only: self.op_only.clone(),
+            ..*self
         }
     }
 

@@ -35,6 +35,15 @@ impl CoeClient {
         }
     }
 
+    /// Returns a client for the same mailbox of a device that has restarted. Both share the queue of
+    /// emergencies.
+    pub fn restarted(&self) -> Self {
+        Self {
+            port: self.port.restarted(),
+            ..Self::new(self.port.layout)
+        }
+    }
+
     /// Creates a client for a mailbox that another program may have used since the device was in
     /// Init. The counter (ETG.1000.4) that the device saw last is then unknown. The device would
     /// drop a request with that counter as a repetition.

@@ -109,6 +109,16 @@ impl Port {
         }
     }
 
+    /// Returns the port of a device that has restarted.
+    pub(super) fn restarted(&self) -> Self {
+        Self {
+            timeouts: self.timeouts,
+            emergencies: self.emergencies.clone(),
+            forgotten: self.forgotten,
+            ..Self::new(self.layout)
+        }
+    }
+
     pub(super) fn check(&self) -> Result<(), TransportError> {
         let fits = |len| (MIN_LENGTH..=MAX_DATA).contains(&len);
         if fits(self.layout.out_len) && fits(self.layout.in_len) {

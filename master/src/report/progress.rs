@@ -8,7 +8,7 @@ use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use serde::Serialize;
 
 use super::bring_up::{Step, StepTime};
-use super::{EmergencyReport, Error};
+use super::{DeviceRef, EmergencyReport, Error};
 use crate::clock::Nanos;
 use crate::config::{Machine, TorqueUnit};
 use crate::link::NicWarning;
@@ -81,6 +81,14 @@ pub enum Progress {
     /// A stopped group has been reset and can be enabled again.
     GroupReleased {
         group: String,
+    },
+    /// A lost device is in Op again. Its axes have no power.
+    DeviceReturned {
+        device: DeviceRef,
+        /// The time in ns since it was found lost.
+        after_ns: Nanos,
+        /// It had no power: the position of an incremental encoder is lost.
+        restarted: bool,
     },
     /// The status of the machine, five times a second of machine time.
     Status(Status),

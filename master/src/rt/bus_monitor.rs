@@ -11,6 +11,9 @@ pub const OP: u8 = AlState::Op.code();
 /// fault.
 const AL_CYCLES: u32 = 2;
 
+/// The longest search, in cycles, for the device that left Op.
+const MAX_SEARCH: u32 = 200;
+
 /// The cause of a stop.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum StopCause {
@@ -77,6 +80,14 @@ pub struct BusMonitor {
     /// Cycles in which fewer SubDevices answered than the working counters explain.
     absent: u32,
     al_status: u8,
+    /// The group of each device.
+    group_of: IndexVec<DeviceIndex, GroupIndex>,
+    /// True if AL status of the bus says nothing, because devices may be outside Op: those of a
+    /// stopped group, or devices that are not in the machine file. Each device is then judged by
+    /// its own status. Also true while it is not known whose group is concerned.
+    judges_each: bool,
+    /// Cycles until an AL status that no device is found for stops the machine.
+    al_cycles: u32,
 }
 
 #[derive(Debug, Clone, Copy, Default)]
@@ -109,15 +120,51 @@ impl BusMonitor {
             al: 0,
             absent: 0,
             al_status: OP,
+            group_of: groups.to_vec().into(),
+            judges_each: false,
+            al_cycles: match count {
+                1 => AL_CYCLES,
+                // Each device is asked once, one per cycle; answers take two cycles at most.
+                _ => {
+                    let devices = u32::try_from(groups.len()).unwrap_or(u32::MAX);
+                    AL_CYCLES + devices.saturating_add(2).min(MAX_SEARCH)
+                }
+            },
         }
     }
 
-    /// Evaluates one cycle. RT: O(groups + devices).
+    /// Returns true if AL status of the bus does not show which device left Op.
+    #[must_use]
+    pub fn judges_each(&self) -> bool {
+        self.judges_each && self.al_status != OP
+    }
+
+    /// Evaluates each device's own AL status (`None`: unknown), unless its group has stopped. RT:
+    /// O(devices).
+    pub fn update_each(
+        &mut self,
+        stopped: impl Fn(GroupIndex) -> bool,
+        al_status: impl Iterator<Item = Option<u8>>,
+    ) {
+        for (&group, status) in self.group_of.iter().zip(al_status) {
+            if let (Some(status), Some(watch)) = (status, self.groups.get_mut(group))
+                && status != OP
+                && !stopped(group)
+            {
+                self.al_status = status;
+                watch.al = AL_CYCLES;
+            }
+        }
+    }
+
+    /// Evaluates one cycle. `any_stopped`: the machine continues without a group. RT: O(groups +
+    /// devices).
     pub fn update(
         &mut self,
         answer: &CycleResult,
         groups: &[GroupResult],
         devices: &[DeviceAnswer],
+        any_stopped: bool,
     ) {
         for (watch, result) in self.groups.iter_mut().zip(groups) {
             watch.last = *result;
@@ -147,7 +194,8 @@ impl BusMonitor {
         let bad = devices(&mut self.groups.iter().filter(|g| g.bad > 0));
         let accounted = answering >= expected.saturating_sub(bad);
         let known = bad > 0 && accounted;
-        let left_op = status != OP;
+        let excused = any_stopped || answering > expected;
+        let left_op = status != OP && !excused;
         for watch in &mut self.groups {
             let guilty = left_op && known && watch.bad > 0;
             watch.al = if guilty {
@@ -156,6 +204,7 @@ impl BusMonitor {
                 0
             };
         }
+        self.judges_each = excused || (self.groups.len() > 1 && left_op && !known);
         self.al = if left_op && !known {
             self.al.saturating_add(1)
         } else {
@@ -169,13 +218,19 @@ impl BusMonitor {
         };
     }
 
-    /// Returns the cause to stop the whole machine: SubDevices left Op or do not answer, and no
-    /// working counter identifies them.
+    /// Returns the cause to stop the whole machine: SubDevices left Op or do not answer, and neither a
+    /// working counter nor its own AL status identifies them.
     #[must_use]
     pub fn left_op(&self) -> Option<StopCause> {
         let al_status = self.al_status;
-        let left = self.al >= AL_CYCLES || self.absent >= self.lost_frames;
+        let left = self.al >= self.al_cycles || self.absent >= self.lost_frames;
         left.then_some(StopCause::LeftOp { al_status })
+    }
+
+    /// Returns the devices of a group.
+    pub fn devices_of(&self, group: GroupIndex) -> impl Iterator<Item = DeviceIndex> + '_ {
+        let devices = self.group_of.enumerate();
+        devices.filter_map(move |(device, of)| (*of == group).then_some(device))
     }
 
     /// Returns the cause to stop a group.
@@ -227,13 +282,13 @@ mod tests {
         for _ in 0..10 {
             for result in [GONE, GONE, GOOD] {
                 let back = result.answered.then_some((OP, 2));
-                guard.update(&answer(back), &[result], &[]);
+                guard.update(&answer(back), &[result], &[], false);
                 assert_eq!((guard.lost(GroupIndex(0)), guard.left_op()), (None, None));
             }
         }
-        guard.update(&answer(None), &[GONE], &[]);
-        guard.update(&answer(None), &[GONE], &[]);
-        guard.update(&answer(None), &[GONE], &[]);
+        guard.update(&answer(None), &[GONE], &[], false);
+        guard.update(&answer(None), &[GONE], &[], false);
+        guard.update(&answer(None), &[GONE], &[], false);
         let lost = StopCause::BusLost {
             cycles: 3,
             last_wkc: (0, 3),
@@ -252,13 +307,13 @@ mod tests {
         for (al, cycles) in [((0x1c, 2), AL_CYCLES), ((OP, 1), 5)] {
             let mut guard = BusMonitor::new(5, &[GroupIndex(0); 2]);
             for _ in 1..cycles {
-                guard.update(&answer(Some(al)), &[GOOD], &[]);
+                guard.update(&answer(Some(al)), &[GOOD], &[], false);
                 assert_eq!(guard.left_op(), None);
             }
-            guard.update(&answer(Some(al)), &[GOOD], &[]);
+            guard.update(&answer(Some(al)), &[GOOD], &[], false);
             let left = Some(StopCause::LeftOp { al_status: al.0 });
             assert_eq!((guard.lost(GroupIndex(0)), guard.left_op()), (None, left));
-            guard.update(&good(), &[GOOD], &[]);
+            guard.update(&good(), &[GOOD], &[], false);
             assert_eq!(guard.left_op(), None);
         }
     }
@@ -271,11 +326,12 @@ mod tests {
                 &good(),
                 &[BAD],
                 &[unknown, DeviceAnswer::Missing, DeviceAnswer::Fresh],
+                false,
             );
         }
         let lost = [0, 1, 2].map(|device| guard.device_lost(DeviceIndex(device)));
         assert_eq!(lost, [false, true, false]);
-        guard.update(&good(), &[GOOD], &[DeviceAnswer::Fresh; 3]);
+        guard.update(&good(), &[GOOD], &[DeviceAnswer::Fresh; 3], false);
         assert!(!guard.device_lost(DeviceIndex(1)));
     }
 
@@ -294,11 +350,40 @@ mod tests {
             ((OP, 3), [GOOD, BAD, GOOD], [None, None, None], None),
         ] {
             let mut guard = BusMonitor::new(10, &[0, 1, 2].map(GroupIndex));
-            for _ in 0..AL_CYCLES {
-                guard.update(&answer(Some(al)), &results, &[]);
+            // Three devices are asked in three cycles.
+            for _ in 0..AL_CYCLES + 5 {
+                guard.update(&answer(Some(al)), &results, &[], false);
             }
             let found = [0, 1, 2].map(|group| guard.lost(GroupIndex(group)));
             assert_eq!((found, guard.left_op()), (groups, machine), "{al:?}");
+        }
+    }
+
+    /// A stopped group and a device that is not in the file need not be in Op. Another device that
+    /// leaves Op stops its own group.
+    #[test]
+    fn devices_are_judged_one_by_one_if_some_may_be_outside_op() {
+        for (any_stopped, answering) in [(true, 3), (false, 4)] {
+            let mut guard = BusMonitor::new(10, &[0, 1, 2].map(GroupIndex));
+            let lost = |guard: &BusMonitor| [0, 1, 2].map(|group| guard.lost(GroupIndex(group)));
+            let stopped = |group| any_stopped && group == GroupIndex(1);
+            let own = if any_stopped { 2 } else { OP };
+            for _ in 0..5 {
+                let seen = answer(Some((0x0a, answering)));
+                guard.update(&seen, &[GOOD; 3], &[], any_stopped);
+                assert!(guard.judges_each());
+                guard.update_each(stopped, [Some(OP), Some(own), None].into_iter());
+                assert_eq!((lost(&guard), guard.left_op()), ([None; 3], None));
+            }
+            let seen = answer(Some((0x1e, answering)));
+            guard.update(&seen, &[GOOD; 3], &[], any_stopped);
+            guard.update_each(stopped, [Some(0x14), Some(own), Some(OP)].into_iter());
+            let left = Some(StopCause::LeftOp { al_status: 0x14 });
+            assert_eq!((lost(&guard), guard.left_op()), ([left, None, None], None));
+            for _ in 0..AL_CYCLES + 5 {
+                guard.update(&answer(Some((0x0a, 3))), &[GOOD; 3], &[], false);
+            }
+            assert!(guard.left_op().is_some(), "all should be in Op again");
         }
     }
 
@@ -306,7 +391,7 @@ mod tests {
     fn a_group_without_its_process_data_is_lost_alone() {
         let mut guard = BusMonitor::new(2, &[GroupIndex(1)]);
         for _ in 0..2 {
-            guard.update(&answer(Some((OP, 1))), &[GOOD, BAD], &[]);
+            guard.update(&answer(Some((OP, 1))), &[GOOD, BAD], &[], false);
         }
         assert_eq!(guard.lost(GroupIndex(0)), None);
         assert!(matches!(

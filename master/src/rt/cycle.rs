@@ -277,7 +277,20 @@ impl Engine {
             self.exchange.group_results(),
             self.exchange.device_answers(),
         );
-        self.guard.update(&self.answer, groups, devices);
+        let stopped = |group: &ReactionGroup| group.stop().is_some();
+        let any_stopped = self.stopping().is_none() && self.groups.iter().any(stopped);
+        self.guard
+            .update(&self.answer, groups, devices, any_stopped);
+        let each = self.guard.judges_each();
+        if each {
+            let groups = &self.groups;
+            self.guard.update_each(
+                |group| groups.get(group).is_some_and(stopped),
+                (self.exchange.diagnoses().iter())
+                    .map(|found| found.answers.then_some(found.al_status)),
+            );
+        }
+        self.exchange.poll_al_status_only(each);
         for group in self.groups.indices() {
             if let Some(cause) = self.guard.lost(group) {
                 self.stop(Some(group), cause);

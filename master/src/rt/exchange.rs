@@ -36,6 +36,7 @@ mod result;
 mod slots;
 
 pub use bus_status::{BusStatus, MailboxStatus};
+pub(crate) use diagnostics::sign_magnitude;
 pub use diagnostics::{DiagnosticRegister, ErrorCounters, SubDeviceDiagnostics, Window};
 use frame::{
     DATAGRAM_HEADER, DatagramSlot, FIRST_DATAGRAM, MAC_TAIL, WKC, clear_wkc, frame_number,
@@ -205,6 +206,12 @@ impl Exchange {
     /// them until all answer.
     pub fn expect_op(&mut self, expected: bool) {
         self.op_expected = expected;
+    }
+
+    /// Sets whether the diagnostic slot reads AL status only, so that it visits each device more
+    /// often.
+    pub fn poll_al_status_only(&mut self, only: bool) {
+        self.schedule.al_status_only = only;
     }
 
     /// Returns the results of the diagnostic slot, in the order of the members.

@@ -172,6 +172,7 @@ impl RunBuilder<'_> {
                     last_status: clock::now(),
                     witnessed: None,
                     clock_tree: None,
+                    returns: None,
                 };
                 Ok(Prepared { parts, supervisor })
             }

@@ -2,8 +2,7 @@
 //! (ETG.1500, feature 1102). A frame reaches the devices after a branch earlier once that branch is
 //! gone, and their clocks would run ahead by its round-trip delay.
 
-use std::convert::Infallible;
-use std::future::{Future, pending};
+use std::future::Future;
 use std::time::Duration;
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
@@ -14,6 +13,7 @@ use super::Supervisor;
 use crate::acyclic::delays::{self, MeasuredDevice};
 use crate::acyclic::enumerate;
 use crate::acyclic::topology::open_ports;
+use crate::bringup::BusDevice;
 use crate::clock;
 use crate::datagram::DatagramClient;
 use crate::mailbox::MailboxTransport;
@@ -36,8 +36,9 @@ pub(crate) struct ClockTree {
 }
 
 impl Supervisor {
-    /// Returns a task that measures the delays whenever [`ClockTree`] changes. It never ends.
-    pub(super) fn keep_delays(&mut self) -> impl Future<Output = Infallible> + use<> {
+    /// Returns a task that measures the delays whenever [`ClockTree`] changes. It ends when
+    /// [`Supervisor::clock_tree`] is dropped.
+    pub(super) fn keep_delays(&mut self) -> impl Future<Output = ()> + use<> {
         let devices = self.bus.devices.iter();
         let tree = ClockTree {
             open: devices.map(|device| open_ports(device.dl_status)).collect(),
@@ -48,16 +49,12 @@ impl Supervisor {
             self.clock_tree = Some(sender);
             changes
         });
-        let clocks = self.bus.devices.iter();
-        let clocks: IndexVec<DeviceIndex, _> = clocks
-            .map(|device| (device.at.station, device.follows))
-            .collect();
+        let clocks = clocks(&self.bus.devices);
         let wire = self.wire;
         async move {
             if let Some(changes) = changes {
                 follow(&wire, &clocks, changes).await;
             }
-            pending().await
         }
     }
 
@@ -82,13 +79,18 @@ impl Supervisor {
     }
 }
 
-/// Measures the delays after each change, until the sender is dropped. `clocks`: the station address
-/// of each device, and whether its clock follows the reference clock.
-async fn follow(
-    wire: &DatagramClient,
-    clocks: &IndexVec<DeviceIndex, (u16, bool)>,
-    mut changes: watch::Receiver<ClockTree>,
-) {
+/// The station address of each device, and whether its clock follows the reference clock.
+type Clocks = IndexVec<DeviceIndex, (u16, bool)>;
+
+pub(super) fn clocks(devices: &IndexVec<DeviceIndex, BusDevice>) -> Clocks {
+    let devices = devices.iter();
+    devices
+        .map(|device| (device.at.station, device.follows))
+        .collect()
+}
+
+/// Measures the delays after each change, until the sender is dropped.
+async fn follow(wire: &DatagramClient, clocks: &Clocks, mut changes: watch::Receiver<ClockTree>) {
     while changes.changed().await.is_ok() {
         clock::delay(SETTLING_TIME).await;
         if changes.has_changed().unwrap_or(true) {
@@ -107,9 +109,9 @@ async fn follow(
 }
 
 /// Measures all delays and writes those that have changed.
-async fn update(
+pub(super) async fn update(
     wire: &DatagramClient,
-    clocks: &IndexVec<DeviceIndex, (u16, bool)>,
+    clocks: &Clocks,
     reference: u16,
     still_valid: impl Fn() -> bool,
 ) -> Result<(), Error> {

@@ -3,6 +3,7 @@
 //! only through `rt::channel`.
 
 use std::collections::VecDeque;
+use std::convert::Infallible;
 use std::future::poll_fn;
 use std::pin::pin;
 use std::sync::Arc;
@@ -31,6 +32,7 @@ use crate::rt::channel::{COMMANDS_PER_CYCLE, Event, HostEndpoint, RtCommand, Sna
 use crate::rt::exchange::{DiagnosticRegister, SubDeviceDiagnostics};
 use clock_tree::ClockTree;
 use groups::StoppedGroup;
+use returns::ReturnPort;
 
 mod clock_tree;
 mod coordinated;
@@ -39,6 +41,7 @@ mod explain;
 mod groups;
 pub mod operator;
 mod program;
+mod returns;
 mod shut_down;
 
 /// The period at which the supervisor reads the cycle's snapshot.
@@ -95,6 +98,8 @@ pub struct Supervisor {
     pub witnessed: Option<Witnessed>,
     /// What the delays depend on, for the task that measures them again.
     pub(crate) clock_tree: Option<watch::Sender<ClockTree>>,
+    /// The end of the task that brings devices back.
+    pub(crate) returns: Option<ReturnPort>,
 }
 
 /// The result of the machine's program.
@@ -119,11 +124,19 @@ impl Supervisor {
     pub async fn run(mut self) -> (ProgramOutcome, Result<(), Error>) {
         let workers = std::mem::take(&mut self.workers);
         let heartbeat = self.outer.heartbeat.clone();
-        let delays = self.keep_delays();
+        // The futures are large, and nothing needs them on the stack.
+        let (delays, returns) = (
+            Box::pin(self.keep_delays()),
+            Box::pin(self.return_devices()),
+        );
         let work = async {
+            let aside = async {
+                tokio::join!(delays, returns);
+                std::future::pending::<Infallible>().await
+            };
             tokio::select! {
-                done = self.run_inner() => done,
-                never = delays => match never {},
+                done = Box::pin(self.run_inner()) => done,
+                never = aside => match never {},
             }
         };
         let mut work = pin!(run_with_workers(workers, work));
@@ -386,6 +399,7 @@ impl Supervisor {
         self.pass_events_on();
         self.report_limits(&snapshot);
         self.follow_clock_tree(&snapshot);
+        self.attend_returns(&snapshot).await;
         if clock::now().saturating_sub(self.last_status) >= STATUS_PERIOD {
             self.last_status = clock::now();
             self.report(Progress::Status(Status::new(&self.machine, &snapshot)));

@@ -39,6 +39,7 @@ use crate::hints::Failure;
 use crate::render::fault_report::{self, ReportDestination};
 use crate::render::note;
 use crate::render::print;
+use crate::render::progress::device_returned;
 use crate::render::report;
 use crate::render::style;
 use draw::Screen;
@@ -387,6 +388,11 @@ impl Observer for Listener {
                 self.shared.show(group, true);
                 (hint.unwrap_or_else(|| "r resets it".to_owned()), false)
             }
+            Progress::DeviceReturned {
+                device,
+                after_ns,
+                restarted,
+            } => (device_returned(device, *after_ns, *restarted), false),
             Progress::GroupReleased { group } => {
                 let text = format!("the group `{group}` has been reset: e enables");
                 (text, false)

@@ -14,7 +14,7 @@ use std::sync::Arc;
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use tokio::sync::{mpsc, oneshot};
 
-use super::{Emergencies, SdoError};
+use super::{CoeClient, Emergencies, SdoError};
 
 mod task;
 
@@ -34,9 +34,16 @@ struct Request {
 }
 
 #[derive(Debug)]
-struct Job {
-    request: Request,
-    reply: oneshot::Sender<Result<Vec<u8>, SdoError>>,
+enum Job {
+    Transfer {
+        request: Request,
+        reply: oneshot::Sender<Result<Vec<u8>, SdoError>>,
+    },
+    /// Lends the mailbox until it comes back or the other end is dropped.
+    Loan {
+        to: oneshot::Sender<CoeClient>,
+        back: oneshot::Receiver<CoeClient>,
+    },
 }
 
 /// Why a request failed.
@@ -120,6 +127,18 @@ impl Mailboxes {
         })
     }
 
+    /// Borrows the mailbox of a device that has restarted, after the transfers in progress; further
+    /// ones wait for its return. `None` if the device has no mailbox.
+    pub(crate) async fn borrow(
+        &self,
+        device: DeviceIndex,
+    ) -> Option<(CoeClient, oneshot::Sender<CoeClient>)> {
+        let queues = self.devices.get(device)?.queues.as_ref()?;
+        let ((to, lent), (give_back, back)) = (oneshot::channel(), oneshot::channel());
+        queues.jobs.send(Job::Loan { to, back }).await.ok()?;
+        Some((lent.await.ok()?, give_back))
+    }
+
     /// Reads an object.
     ///
     /// # Errors
@@ -191,7 +210,7 @@ impl DeviceMailbox {
         let closed = || MailboxError::Closed {
             name: self.name.to_string(),
         };
-        let job = Job { request, reply };
+        let job = Job::Transfer { request, reply };
         self.lane.send(job).await.map_err(|_| closed())?;
         let answer = answer.await.map_err(|_| closed())?;
         answer.map_err(|source| MailboxError::Sdo {
@@ -206,7 +225,7 @@ impl DeviceMailbox {
 pub struct WorkerConfig<W> {
     pub name: String,
     /// `None` if the device has no mailbox.
-    pub mailbox: Option<(W, super::CoeClient)>,
+    pub mailbox: Option<(W, CoeClient)>,
 }
 
 /// Receives the emergencies of devices.

@@ -119,7 +119,16 @@ impl<W: MailboxTransport> MailboxWorker<W> {
     }
 
     async fn do_job(&mut self, job: Job) {
-        let Job { request, mut reply } = job;
+        let (request, mut reply) = match job {
+            Job::Transfer { request, reply } => (request, reply),
+            Job::Loan { to, back } => {
+                if to.send(self.coe.restarted()).is_ok() {
+                    let restarted = self.coe.restarted();
+                    self.coe = back.await.unwrap_or(restarted);
+                }
+                return;
+            }
+        };
         if reply.is_closed() {
             return;
         }

@@ -1,11 +1,11 @@
 //! Commands to the cycle, and stops.
 
 use ecaxis_axis::{Command, CommandError, StopMethod};
-use ecaxis_ecat::index::{AxisIndex, GroupIndex};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex};
 
 use super::Engine;
 use crate::rt::axis::RtAxis;
-use crate::rt::bus_monitor::StopCause;
+use crate::rt::bus_monitor::{OP, StopCause};
 use crate::rt::channel::{COMMANDS_PER_CYCLE, Event, RtCommand};
 use crate::rt::flight_recorder::Trigger;
 use crate::rt::reaction_group::{ActiveStop, ReactionGroup, check_permitted};
@@ -61,6 +61,11 @@ impl Engine {
                 self.guarding = false;
                 self.exchange.expect_op(false);
                 self.axes.iter_mut().for_each(RtAxis::disarm);
+            }
+            RtCommand::Restarted { device } => {
+                for slot in self.axes.iter_mut().filter(|slot| slot.device == device) {
+                    slot.axis.forget_home();
+                }
             }
             RtCommand::Stop => self.stop(None, StopCause::Requested),
             RtCommand::ErrorCode { axis, code } => {
@@ -203,7 +208,7 @@ impl Engine {
     }
 
     /// Releases groups that were reset. Their axes must be at rest without power, without a fault
-    /// or trip, and their process data must be fresh.
+    /// or trip, their process data must be fresh, and their devices in Op.
     pub(super) fn release(&mut self) {
         if self.stopping().is_some() {
             return;
@@ -215,6 +220,11 @@ impl Engine {
                 .get(index)
                 .is_some_and(|s| s.fresh)
                 && self.guard.lost(index).is_none();
+            let op = |device: &DeviceIndex| {
+                let found = self.exchange.diagnoses().get(*device);
+                found.is_some_and(|found| found.answers && found.al_status == OP)
+            };
+            let there = there && self.guard.devices_of(index).all(|device| op(&device));
             let idle = |slot: &RtAxis| {
                 let status = slot.axis.status();
                 let sound = status.fault.is_none() && status.trip.is_none();

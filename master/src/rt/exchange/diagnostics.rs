@@ -263,7 +263,7 @@ impl SubDeviceDiagnostics {
 
 /// Converts 0x092C, received minus own time. Bit 31 is the sign (own clock ahead), the rest the
 /// amount.
-fn sign_magnitude(raw: u32) -> i32 {
+pub(crate) fn sign_magnitude(raw: u32) -> i32 {
     let amount = i32::try_from(raw & 0x7fff_ffff).unwrap_or(i32::MAX);
     if raw & 0x8000_0000 == 0 {
         amount

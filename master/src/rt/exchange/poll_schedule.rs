@@ -46,6 +46,9 @@ pub(super) struct PollSchedule {
     /// The next diagnosis read and the next mailbox read.
     next: (usize, usize),
     mailbox_is_next: bool,
+    /// The number of members: the first diagnosis reads are those of AL status.
+    members: usize,
+    pub al_status_only: bool,
 }
 
 impl PollSchedule {
@@ -106,18 +109,26 @@ impl PollSchedule {
             mailbox_devices: mailbox_devices.into(),
             next: (0, 0),
             mailbox_is_next: false,
+            members: members.len(),
+            al_status_only: false,
         }
     }
 
     /// Returns the next read; `None` without members. RT.
     pub fn next(&mut self) -> Option<PollDatagram> {
-        let mailbox = self.mailbox_is_next && !self.mailboxes.is_empty();
+        let mailbox = self.mailbox_is_next && !self.mailboxes.is_empty() && !self.al_status_only;
         self.mailbox_is_next = !mailbox;
         let (polls, next) = if mailbox {
-            (&self.mailboxes, &mut self.next.1)
+            (&self.mailboxes[..], &mut self.next.1)
+        } else if self.al_status_only {
+            let al_status = self.diagnosis.get(..self.members);
+            (al_status.unwrap_or_default(), &mut self.next.0)
         } else {
-            (&self.diagnosis, &mut self.next.0)
+            (&self.diagnosis[..], &mut self.next.0)
         };
+        if *next >= polls.len() {
+            *next = 0;
+        }
         let poll = polls.get(*next).copied();
         *next = if *next + 1 < polls.len() {
             *next + 1
@@ -205,6 +216,30 @@ mod tests {
         ];
         assert_eq!(mailboxes, expected);
         assert_eq!(schedule.mailbox_devices[11], DeviceIndex(4));
+    }
+
+    #[test]
+    fn poll_schedule_visits_all_members_with_al_status_alone() {
+        let members = members(&[None; 3]);
+        let mut schedule = PollSchedule::new(&members, None);
+        let blocks = |schedule: &mut PollSchedule, count| -> Vec<_> {
+            let polls = std::iter::from_fn(|| schedule.next()).take(count);
+            let blocks = polls.map(|poll| match poll.target {
+                PollTarget::Registers { device, block } => (block, device.0),
+                PollTarget::Mailboxes { .. } => panic!("no mailboxes"),
+            });
+            blocks.collect()
+        };
+        blocks(&mut schedule, 8);
+        schedule.al_status_only = true;
+        let expected = [0, 1, 2, 0, 1].map(|device| (DiagnosticRegister::AlStatus, device));
+        assert_eq!(blocks(&mut schedule, 5), expected);
+        schedule.al_status_only = false;
+        let next = [
+            (DiagnosticRegister::AlStatus, 2),
+            (DiagnosticRegister::DlStatus, 0),
+        ];
+        assert_eq!(blocks(&mut schedule, 2), next);
     }
 
     #[test]
