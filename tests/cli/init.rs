@@ -78,6 +78,13 @@ fn scan_writes_the_schema_next_to_the_file() {
         "{text}"
     );
     assert!(at.join("ecaxis.schema.json").is_file());
+    // No path of a temporary file.
+    let unwritable = "cannot write no/two.toml: entity not found\n";
+    ran(
+        at,
+        "scan --sim one/machine.toml --esi one/esi --write no/two.toml",
+    )
+    .fails(2, &[unwritable]);
 }
 
 /// Builds the generated project against these sources, and runs its tests and its program.
@@ -106,6 +113,8 @@ fn init_rust_writes_a_project_that_builds_and_moves() {
         command.args(["--config", "profile.dev.debug='line-tables-only'"]);
         Ran::new(&mut command)
     };
+    let mut format = Command::new("cargo");
+    Ran::new(format.args(["fmt", "--check"]).current_dir(&project)).exits(0);
     let tested = cargo("test --offline").exits(0);
     assert_contains(
         &tested.out,

@@ -1,4 +1,4 @@
-//! The commands in docs/first-steps.md produce the output shown there.
+//! The commands in README.md and docs/first-steps.md produce the output shown there.
 
 use std::process::Stdio;
 use std::time::Duration;
@@ -25,9 +25,8 @@ struct Shown {
     output: String,
 }
 
-fn shown() -> Vec<Shown> {
-    let document = std::fs::read_to_string(root().join("docs/first-steps.md"));
-    let document = document.expect("the document");
+fn shown(document: &str) -> Vec<Shown> {
+    let document = std::fs::read_to_string(root().join(document)).expect("the document");
     let mut all: Vec<Shown> = Vec::new();
     for block in document.split("```console\n").skip(1) {
         let block = block.split("```").next().unwrap_or_default();
@@ -82,10 +81,11 @@ fn ellipsis_matches_any_text() {
     }
 }
 
-/// Runs every command of the document in order, in one folder. `as_here` converts a command for
+/// Runs every command of a document in order, in one folder. `as_here` converts a command for
 /// this environment. `as_there` converts its output to that of the document. `after` runs after
 /// each command.
 fn follow(
+    document: &str,
     bench: &Bench,
     as_here: impl Fn(&str) -> String,
     as_there: impl Fn(&str) -> String,
@@ -94,8 +94,8 @@ fn follow(
     let program = ecaxis();
     let folder = program.parent().expect("a folder");
     let path = std::env::var("PATH").unwrap_or_default();
-    let commands = shown();
-    assert!(commands.len() > 6, "the document shows the whole way");
+    let commands = shown(document);
+    assert!((6..=9).contains(&commands.len()), "{}", commands.len());
     for Shown { command, output } in commands {
         let here = as_here(&command);
         let ran = bench
@@ -120,6 +120,23 @@ fn bench() -> Bench {
     bench
 }
 
+/// From a clone to a first move. The installation is left out: cargo has built the program.
+#[test]
+fn readme_leads_to_a_first_move_in_at_most_seven_commands() {
+    let bench = Bench::new();
+    let as_here = |command: &str| match command.strip_prefix("cargo install ") {
+        Some(options) => {
+            assert_eq!(options, "--locked --path cli");
+            assert!(root().join("cli/Cargo.toml").is_file());
+            "true".to_owned()
+        }
+        None if command.starts_with("ecaxis run") => format!("{command} --virtual"),
+        None => command.replace("--lines", "--lines --virtual"),
+    };
+    assert!(shown("README.md").len() <= 7);
+    follow("README.md", &bench, as_here, str::to_owned, |_| {});
+}
+
 #[test]
 fn first_steps_on_the_simulated_bus() {
     let bench = bench();
@@ -141,7 +158,7 @@ fn first_steps_on_the_simulated_bus() {
             None => named,
         }
     };
-    follow(&bench, as_here, as_there, |_| {});
+    follow("docs/first-steps.md", &bench, as_here, as_there, |_| {});
 }
 
 /// Runs the simulated bus of a machine file in another process.
@@ -240,7 +257,7 @@ fn first_steps_over_a_real_interface() {
                 bench.write("machine.toml", &tolerant(&bench.read("machine.toml")));
             }
         };
-        follow(&bench, as_here, as_there, after);
+        follow("docs/first-steps.md", &bench, as_here, as_there, after);
     });
 }
 

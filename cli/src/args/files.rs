@@ -32,7 +32,12 @@ pub(crate) fn write_new(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
 
 /// Returns the failure for a file that cannot be written.
 pub(crate) fn unwritable(path: &Path, error: &io::Error) -> Failure {
-    let message = format!("cannot write {}: {error}", path.display());
+    // A temporary file adds its own path, which means nothing to the user.
+    let cause = match error.get_ref() {
+        Some(_) => error.kind().to_string(),
+        None => error.to_string(),
+    };
+    let message = format!("cannot write {}: {cause}", path.display());
     Failure::new(WRONG, message).hint(WRITABLE)
 }
 

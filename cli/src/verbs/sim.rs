@@ -117,7 +117,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             Ok(_) => {}
             Err(
                 e @ (OpenError::Down { .. } | OpenError::NoCarrier { .. } | OpenError::Mtu { .. }),
-            ) => note(&format!("warning: {e}")),
+            ) => {
+                let warning = hints::interface(Failure::new(hints::FAILED, e.to_string()), &e);
+                note(&format!("warning: {}", warning.message));
+                for hint in &warning.hints {
+                    note(&format!("  = help: {hint}"));
+                }
+            }
             Err(e) => {
                 return Err(hints::interface(
                     Failure::new(hints::FAILED, e.to_string()),

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config;
 use ecaxis_master::session::{self, Observer, Options, Progress, SignalReport};
+
 use @NAME@::Pendulum;
 
 struct Print;

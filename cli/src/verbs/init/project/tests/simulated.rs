@@ -5,12 +5,13 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use @NAME@::{AMPLITUDE, Pendulum};
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{self, AxisRef, Machine, Nic};
 use ecaxis_master::rt::controller::{Controller, CycleContext};
 use ecaxis_master::session::{self, Observer, Options, Outcome, Progress};
+
+use @NAME@::{AMPLITUDE, Pendulum};
 
 struct Quiet;
 
@@ -46,7 +47,8 @@ struct Watch {
 impl Controller for Watch {
     fn cycle(&mut self, machine: &mut CycleContext<'_>) {
         let way = machine.axis(self.x).position.abs();
-        self.farthest.fetch_max((way * 1000.0) as u64, Ordering::Relaxed);
+        let micrometres = (way * 1000.0) as u64;
+        self.farthest.fetch_max(micrometres, Ordering::Relaxed);
         if way >= self.cancel_at {
             self.stop.cancel();
         }
