@@ -9,6 +9,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use ecaxis_master::ros2::mcap::{McapError, McapFile};
+use ecaxis_master::sys::rights;
 use serde_json::json;
 
 use crate::diagnostics::diagnostics;
@@ -63,7 +64,10 @@ impl Recorder {
         };
         let builder = thread::Builder::new().name("ecaxis-record".to_owned());
         let thread = builder
-            .spawn(work)
+            .spawn(move || {
+                rights::drop_capabilities();
+                work()
+            })
             .map_err(|error| io_failed(&path, error))?;
         Ok(Self { end, thread })
     }

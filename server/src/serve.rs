@@ -15,6 +15,7 @@ use ecaxis_master::config::Machine;
 use ecaxis_master::samples::{SampleLayout, Samples};
 use ecaxis_master::session::Options;
 use ecaxis_master::supervise::operator::for_manual_mode;
+use ecaxis_master::sys::rights;
 use sd_notify::NotifyState;
 use serde_json::{Map, Value};
 
@@ -122,6 +123,7 @@ fn notify(state: NotifyState<'_>) {
 fn log_changes(log: ChangeLog) -> Result<SyncSender<Map<String, Value>>, ServeError> {
     let (sender, receiver) = sync_channel(CHANGES);
     let work = move || {
+        rights::drop_capabilities();
         for entry in receiver {
             if let Err(error) = log.append(entry) {
                 tracing::error!(%error, path = %log.path().display(), "the change log");
@@ -169,6 +171,7 @@ pub fn serve(
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(WORKERS)
         .thread_name("ecaxis-clients")
+        .on_thread_start(rights::drop_capabilities)
         .enable_all()
         .build()
         .map_err(ServeError::Thread)?;
@@ -185,6 +188,8 @@ pub fn serve(
         let thread = thread::Builder::new().name("ecaxis-machine".to_owned());
         thread.spawn(work).map_err(ServeError::Thread)?
     };
+    // The keeper alone brings the bus up again.
+    rights::drop_capabilities();
     let sampler = {
         let hub = Arc::clone(&hub);
         let work = move || {

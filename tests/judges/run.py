@@ -23,7 +23,7 @@ import rig
 from report import Report, Stop
 from watch import Watch
 
-SECTIONS = ["bringup", "overlap", "mailbox", "parameters", "operation", "oddities", "faults", "ring", "gateway", "ethercrab", "eeproms", "recordings", "page", "monitoring", "service", "viewers"]
+SECTIONS = ["bringup", "overlap", "mailbox", "parameters", "operation", "oddities", "faults", "ring", "gateway", "ethercrab", "eeproms", "recordings", "page", "monitoring", "service", "rights", "viewers"]
 
 TRIES = 3
 # The maximum stalled share of a section's time. If every try exceeds it, the section has no result.

@@ -3,4 +3,5 @@
 pub(crate) mod bus;
 pub(crate) mod change_log;
 pub(crate) mod device;
+pub(crate) mod rights;
 pub(crate) mod signals;

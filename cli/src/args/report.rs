@@ -40,6 +40,15 @@ impl ReportArgs {
             .try_for_each(|path| check_output("--fault-report", path, force, inputs))
     }
 
+    /// Returns the files that may be written.
+    pub fn files(&self, nic: &Nic) -> Vec<PathBuf> {
+        match self.destination(nic) {
+            ReportDestination::No => Vec::new(),
+            ReportDestination::File(path) => vec![path.with_extension("json"), path],
+            ReportDestination::Folder(folder) => vec![folder.join("report")],
+        }
+    }
+
     pub fn destination(&self, nic: &Nic) -> ReportDestination {
         match (&self.fault_report, nic) {
             _ if self.no_fault_report => ReportDestination::No,

@@ -9,7 +9,7 @@ use ecaxis_master::config::{Machine, Nic, duration};
 use ecaxis_master::session::{self, Options, Outcome, Summary};
 use serde_json::{Value, json};
 
-use crate::access::signals;
+use crate::access::{rights, signals};
 use crate::args::bus::BusArgs;
 use crate::args::files::{Inputs, check_output};
 use crate::args::record;
@@ -107,6 +107,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             "note: the file says `enable = false`: the axes get no power; `--enable` gives it to them",
         );
     }
+    let needed = rights::of_machine(&machine);
+    let outputs = args.report.files(&machine.bus.nic);
+    let mut needed = rights::with_outputs(needed, args.record.iter().chain(&outputs));
+    needed.read.extend(args.replay.clone());
+    rights::limit(&needed).inspect_err(|f| print_failure(args, &f.message, &f.hints, json!([])))?;
     let (nic, devices) = (machine.bus.nic.clone(), machine.devices.len());
     let stop = Arc::<CancelToken>::default();
     signals::stop_on_interrupt(&stop);

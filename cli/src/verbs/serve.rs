@@ -13,7 +13,7 @@ use ecaxis_master::session::Options;
 use ecaxis_server::http::HttpOptions;
 use ecaxis_server::serve::{ServeError, ServerOptions, new_token, serve};
 
-use crate::access::signals;
+use crate::access::{rights, signals};
 use crate::args::Verbosity;
 use crate::args::bus::BusArgs;
 use crate::args::files::{Inputs, check_output};
@@ -115,6 +115,15 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         change_log: ChangeLog::of_environment(),
         record: args.record.clone(),
     };
+    let needed = rights::of_machine(&machine);
+    let sockets = options.socket.iter().map(|(path, _)| path);
+    let mut needed = rights::with_outputs(needed, sockets.chain(&args.record));
+    needed.read.extend(args.recordings.clone());
+    needed.one_bring_up = false;
+    needed.low_port = args
+        .http
+        .is_some_and(|address| (1..1024).contains(&address.port()));
+    rights::limit(&needed)?;
     let defaults = Options::default();
     let run_options = Options {
         clock: match args.virtual_time {

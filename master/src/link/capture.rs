@@ -21,6 +21,7 @@ use rtrb::{Consumer, Producer, RingBuffer};
 use super::{Link, LinkError, LinkStats, MAX_FRAME, Nanos};
 use crate::clock;
 use crate::recording::Direction;
+use crate::sys::rights;
 
 mod file;
 
@@ -85,7 +86,10 @@ impl Recorder {
                 touch(&mut ring, &mut reader);
                 let writer = thread::Builder::new()
                     .name("record".into())
-                    .spawn(move || write_all(reader, file))?;
+                    .spawn(move || {
+                        rights::drop_capabilities();
+                        write_all(reader, file)
+                    })?;
                 Sink::Background { ring, writer }
             }
         };

@@ -13,6 +13,7 @@ use crate::rt::cycle::{Engine, EngineConfig, EngineReport};
 use crate::supervise::{ProgramOutcome, Supervisor};
 use crate::sys::executor;
 use crate::sys::process::ThreadUsage;
+use crate::sys::rights;
 use crate::sys::rt_thread::{self, CpuWakeGuard, RtSetupError, RtThrottlingRisk};
 
 /// Result of a run: the engine and the link after the last cycle.
@@ -59,8 +60,13 @@ pub(super) fn in_real_time(
     // parent.
     let during = thread::Builder::new()
         .name("ecaxis-services".to_owned())
-        .spawn(move || executor::block_on(supervisor.run()))
+        .spawn(move || {
+            rights::drop_capabilities();
+            executor::block_on(supervisor.run())
+        })
         .map_err(|error| Cause::Thread(error.to_string()))?;
+    // The thread reads no files once its rights are limited.
+    let limit = rt_thread::rt_limit();
     let (_held, mut denied) = CpuWakeGuard::take(config.cpu.filter(|_| config.awake));
     denied.extend(rt_thread::become_realtime(config.priority, config.cpu));
     let fifo = !denied
@@ -71,6 +77,9 @@ pub(super) fn in_real_time(
     }
     // Locking the memory takes milliseconds, so this happens before the first cycle is scheduled.
     let mut engine = Engine::new(parts);
+    if let Err(error) = rights::limit_cycle() {
+        let _ = reported.send(Progress::Warning(error.to_string()));
+    }
     let (before, began) = (ThreadUsage::now(), clock::now());
     while !engine.halted() {
         engine.cycle();
@@ -82,7 +91,7 @@ pub(super) fn in_real_time(
     };
     if let Some((used, wall_ns)) = used
         && fifo
-        && let Some(overload) = RtThrottlingRisk::of(&used, wall_ns)
+        && let Some(overload) = RtThrottlingRisk::of(&used, wall_ns, limit)
     {
         let _ = reported.send(Progress::Overload(overload));
     }

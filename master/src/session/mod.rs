@@ -39,6 +39,7 @@ pub use crate::report::{
     EmergencyLine, EmergencyLog, EmergencyReport, Error, EventLine, GroupStop, Observer,
     ProbeCapture, Progress, Status, StepRef, Summary, ThreadSummary,
 };
+use crate::sys::rights;
 use crate::text::panic_text;
 pub use bus::{run_on_link, with_bus};
 use cycle_thread::CycleRun;
@@ -215,6 +216,7 @@ pub fn run_attached(
         Ok(owner) => owner,
         Err(error) => return Error::from(Cause::Thread(error.to_string())).into(),
     };
+    rights::drop_capabilities_after_start();
     let observed = catch_unwind(AssertUnwindSafe(|| {
         for progress in reported {
             observer.progress(&progress);

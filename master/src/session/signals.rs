@@ -10,6 +10,7 @@ use tokio::runtime::Builder;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use crate::cancel::CancelToken;
+use crate::sys::rights;
 use crate::sys::signal as disposition;
 
 /// Signals that would end or suspend the process by default, ignored while the axes move.
@@ -98,7 +99,10 @@ pub fn stop_on_signals(
     };
     thread::Builder::new()
         .name("signals".into())
-        .spawn(move || runtime.block_on(serve))?;
+        .spawn(move || {
+            rights::drop_capabilities();
+            runtime.block_on(serve);
+        })?;
     Ok(())
 }
 

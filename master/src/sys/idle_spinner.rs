@@ -10,6 +10,7 @@ use thread_priority::{
     set_thread_priority_and_policy, thread_native_id,
 };
 
+use super::rights;
 use super::rt_thread::{RtSetupError, pin};
 
 /// The time to wait for the thread's first time slice; a busy CPU may delay it.
@@ -88,6 +89,7 @@ fn spin(cpu: usize, turning: &AtomicBool, stop: &AtomicBool) -> Result<(), RtSet
         cpu,
         reason: error.to_string(),
     })?;
+    rights::drop_capabilities();
     turning.store(true, Ordering::Relaxed);
     while !stop.load(Ordering::Relaxed) {
         std::hint::spin_loop();

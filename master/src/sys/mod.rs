@@ -12,6 +12,7 @@
 //!
 //! - [`rt_thread`]: scheduling class, affinity and memory of the thread of the cycle;
 //! - [`idle_spinner`]: keeps a CPU from its idle states;
+//! - [`rights`]: gives up rights of the process and of threads;
 //! - [`executor`]: runs a future on its thread, with an eventfd as the waker.
 
 #![allow(unsafe_code, reason = "all unsafe code is in this module")]
@@ -23,6 +24,8 @@ pub mod executor;
 pub mod idle_spinner;
 pub mod packet;
 pub mod process;
+#[deny(unsafe_code)]
+pub mod rights;
 pub mod ring;
 #[deny(unsafe_code)]
 pub mod rt_thread;

@@ -114,10 +114,10 @@ impl RtThrottlingRisk {
         (load > limit - NEAR_LIMIT).then_some(Self { load, limit })
     }
 
-    /// Returns `None` if the load is far enough below the limit, or without a limit.
+    /// Returns `None` if the load is far enough below the limit ([`rt_limit`]), or without a limit.
     #[must_use]
-    pub fn of(used: &ThreadUsage, wall_ns: u64) -> Option<Self> {
-        Self::at(used.load_percent(wall_ns), rt_limit()?)
+    pub fn of(used: &ThreadUsage, wall_ns: u64, limit: Option<f64>) -> Option<Self> {
+        Self::at(used.load_percent(wall_ns), limit?)
     }
 }
 

@@ -14,6 +14,7 @@ use ecaxis_master::session::{self, Observer, Options, Progress};
 use ecaxis_master::supervise::operator::{
     MAX_MANUAL_SPEED, Operator, OperatorInput, Presence, Request, RequestEvent, View,
 };
+use ecaxis_master::sys::rights::drop_capabilities;
 use serde_json::json;
 
 use super::panel::{AxisPanel, Panel, number};
@@ -73,6 +74,7 @@ pub(super) fn run(
     thread::Builder::new()
         .name("lines".to_owned())
         .spawn(move || {
+            drop_capabilities();
             let mut input = io::stdin().lock();
             while let Some(line) = next_line(&mut input) {
                 if lines.send(line).is_err() {
@@ -85,6 +87,7 @@ pub(super) fn run(
     let printer = thread::Builder::new()
         .name("answers".to_owned())
         .spawn(move || {
+            drop_capabilities();
             let mut out = io::stdout().lock();
             for text in said {
                 // A closed stdout does not stop the machine.

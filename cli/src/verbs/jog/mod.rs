@@ -29,8 +29,9 @@ use ecaxis_master::session::{self, Cause, Error, Observer, Options, Outcome, Pro
 use ecaxis_master::supervise::operator::{
     HOLD_TO_RUN_TIMEOUT, Operator, OperatorInput, Presence, Request, RequestEvent, View,
 };
+use ecaxis_master::sys::rights::drop_capabilities;
 
-use crate::access::signals;
+use crate::access::{rights, signals};
 use crate::args::bus::BusArgs;
 use crate::args::files::{Inputs, check_output};
 use crate::args::report::ReportArgs;
@@ -115,6 +116,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::new(hints::WRONG, message).hint("add a [device.axis]"));
     }
     let options = options(args, &machine)?;
+    let needed = rights::of_machine(&machine);
+    let outputs = args.report.files(&machine.bus.nic);
+    rights::limit(&rights::with_outputs(
+        needed,
+        args.record.iter().chain(&outputs),
+    ))?;
     let nic = machine.bus.nic.clone();
     let stop = Arc::<CancelToken>::default();
     if args.lines {
@@ -242,7 +249,10 @@ fn on(
         };
         let terminal = thread::Builder::new()
             .name("terminal".to_owned())
-            .spawn_scoped(scope, move || terminal.serve());
+            .spawn_scoped(scope, move || {
+                drop_capabilities();
+                terminal.serve();
+            });
         if let Err(error) = terminal {
             return Error::from(Cause::Thread(error.to_string())).into();
         }
