@@ -15,6 +15,7 @@ import time
 import rig
 
 FILTER = rig.ROOT / "master/src/sys/rights/filter.rs"
+UNIT = rig.ROOT / "packaging/ecaxis@.service"
 # At 1 ms; under strace, cycles are left out.
 CYCLES, SECONDS = 10_000, 25
 FAULT = '[[fault]]\nkind = "power-off"\ndevice = 0\nat = "0s"\n'
@@ -71,12 +72,33 @@ def traced(bench, machine, folder, nic):
     report.check(f"{nic}: at least {CYCLES} cycles", max(calls["clock_nanosleep"], calls["sendto"]) >= CYCLES, calls)
     report.equal(f"{nic}: the thread of the cycle makes only permitted calls", sorted(set(calls) - permitted()), [])
     report.equal(f"{nic}: no call of any thread is refused", refused, [])
+    if shutil.which("systemd-analyze"):
+        made = {name for file in trace.glob("t.*") for name in re.findall(r"^(\w+)\(", file.read_text(), re.M)}
+        report.equal(f"{nic}: the unit permits all calls", sorted(made - permitted_by_unit() - {"execve"}), [])
 
 
 def permitted():
     """Returns the names of the calls that the filter permits to the thread of the cycle."""
     text = FILTER.read_text().split("const CYCLE", 1)[1].split("];", 1)[0]
     return {*re.findall(r"SYS_(\w+)", text), "mmap", "mprotect"}
+
+
+def permitted_by_unit():
+    """Returns the calls that the unit permits, by the sets of the installed systemd."""
+    done = subprocess.run(["systemd-analyze", "syscall-filter"], capture_output=True, text=True, check=True)
+    sets, members = {}, None
+    for line in done.stdout.splitlines():
+        if line.startswith("@"):
+            members = sets.setdefault(line, [])
+        elif members is not None and (name := line.strip()) and name[0] != "#":
+            members.append(name)
+    expand = lambda name: set().union(*map(expand, sets[name])) if name[0] == "@" else {name}  # noqa: E731
+    # The manager itself needs these.
+    calls = expand("@default")
+    for line in re.findall(r"^SystemCallFilter=(.*)", UNIT.read_text(), re.M):
+        names = set().union(*map(expand, line.removeprefix("~").split()))
+        calls = calls - names if line[0] == "~" else calls | names
+    return calls
 
 
 def cycle_calls(trace):
