@@ -39,7 +39,9 @@ Examples:
 
 Exit code: 0 done, 1 the machine or the bus failed, 2 the file or the command
 line is wrong, 130 interrupted.
-NO_COLOR=1 switches colours off, CLICOLOR_FORCE=1 on.";
+NO_COLOR=1 switches colours off, CLICOLOR_FORCE=1 on. ECAXIS_POLICY names the
+policy for signed files, ECAXIS_CHANGE_LOG the change log. ECAXIS_RIGHTS=strict
+insists that `run`, `serve` and `jog` give up the rights that they do not need.";
 
 /// An EtherCAT master for CiA 402 drives in the cyclic synchronous modes.
 #[derive(Debug, Parser)]
