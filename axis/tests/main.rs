@@ -18,6 +18,7 @@ mod properties;
 mod reactions;
 mod shortest_time;
 mod skipped_cycles;
+mod stop_room;
 mod stops;
 mod supervision;
 mod sweep;

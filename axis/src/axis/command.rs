@@ -92,6 +92,8 @@ pub enum Command {
 
 /// Tolerance: differences of f64 positions within a limit may exceed it by rounding.
 const SET_POINT_ROUNDING: f64 = 1.0 + 1e-6;
+/// The part of the room to stop that a jerk-limited stop may need in excess.
+const STOP_RESERVE: f64 = 0.005;
 
 impl Axis {
     pub(super) fn take(&mut self, command: Command) -> Result<(), CommandError> {
@@ -420,7 +422,14 @@ impl Axis {
             } else {
                 high - position
             };
-            if braking > room * SET_POINT_ROUNDING + f64::EPSILON * position.abs() * 8.0 {
+            let next = before.then(position, velocity, self.dt_s);
+            // A profile that uses the whole jerk limit leaves less room than the stop, which is
+            // planned with a reserve and from mean velocities.
+            let slack = step.abs() + room * STOP_RESERVE;
+            let jerky = self
+                .jerk_limited_reach(next)
+                .is_some_and(|reach| reach[0] < low - slack || reach[1] > high + slack);
+            if jerky || braking > room * SET_POINT_ROUNDING + f64::EPSILON * position.abs() * 8.0 {
                 return Err(CommandError::NoRoomToStop {
                     velocity,
                     position,

@@ -285,24 +285,36 @@ impl Axis {
     }
 
     fn jerk_limited_stop(&self) -> Option<JerkLimited> {
-        let limits = self.config.limits.motion();
         let motion = self.motion;
+        let range = self.config.limits.position;
+        let range = range.map(|[low, high]| [low.min(motion.position), high.max(motion.position)]);
         let order = MoveRequest {
-            goal: Goal::Velocity(0.0),
-            limits,
-            ceiling: limits,
-            range: self
-                .config
-                .limits
-                .position
-                .map(|[low, high]| [low.min(motion.position), high.max(motion.position)]),
+            range,
+            ..self.stop_request()
         };
         let adds = motion.acceleration * motion.velocity >= 0.0;
         if let (Plan::Jerk(source), false) = (&self.plan, adds) {
             return source.redirect(order, motion, self.dt_s).ok();
         }
+        self.stop_from(order, motion)
+    }
+
+    /// Returns how far a jerk-limited stop from an external set-point goes: lowest and highest
+    /// position. `None` without jerk limit. RT: O(1).
+    pub(super) fn jerk_limited_reach(&self, motion: Motion) -> Option<[f64; 2]> {
+        let limited = self.config.jerk_limited;
+        let plan = limited.then(|| self.stop_from(self.stop_request(), motion));
+        plan.flatten().map(|plan| plan.span())
+    }
+
+    /// Returns the request to come to rest, within any range.
+    fn stop_request(&self) -> MoveRequest {
+        MoveRequest::within(Goal::Velocity(0.0), self.config.limits.motion())
+    }
+
+    fn stop_from(&self, order: MoveRequest, motion: Motion) -> Option<JerkLimited> {
         let start = Motion {
-            acceleration: taken_over(motion, limits),
+            acceleration: taken_over(motion, order.ceiling),
             ..motion
         };
         JerkLimited::new(order, start, self.dt_s).ok()
