@@ -47,17 +47,17 @@ fn a_wrong_file_is_rejected_and_the_right_one_accepted_afterwards() {
                 let FirmwareError::Failed { cause, left, .. } = &error else {
                     panic!("{what}: {error}")
                 };
-                let state = match (via, &**cause) {
+                match (via, &**cause) {
                     (UpdateMethod::Foe, UpdateCause::Foe(error)) => {
                         assert_eq!(error.code(), Some(foe), "{what}: {error}");
-                        AlState::Init
                     }
                     (UpdateMethod::Program, UpdateCause::Sdo(error)) => {
                         assert_eq!(error.abort_code(), Some(sdo), "{what}: {error}");
-                        AlState::PreOp
                     }
                     _ => panic!("{what}: {error}"),
-                };
+                }
+                // As it was found.
+                let state = AlState::Init;
                 assert_eq!(*left, FinalDeviceState::In { state, code: 0 }, "{what}");
                 let stopped = bench.device().is_stopped();
                 assert_eq!(stopped, via == UpdateMethod::Program, "{what}");

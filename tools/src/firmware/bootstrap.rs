@@ -49,11 +49,6 @@ pub(super) async fn send(
     let (name, file) = (&order.name, &order.file);
     let sent = foe.write(wire, name, order.password, file, &mut progress);
     let sent = sent.await;
-    if matches!(&sent, Err(error) if matches!(error.cause, FoeCause::Refused { .. })) {
-        // A boot loader that took nothing starts its present program on the way to Init. The state
-        // in which the device stays is read afterwards.
-        let _ = al::change_state(wire, devices, AlState::Init, al::BACK_TIMEOUT).await;
-    }
     sent.map_err(|error| UpdateStep::Send.failed(error))?;
     let took = since(wire, begin);
 

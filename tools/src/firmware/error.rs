@@ -7,7 +7,7 @@ use super::{RunningProgram, UpdateMethod};
 use ecaxis_master::acyclic::al::AlState;
 use ecaxis_master::acyclic::enumerate::{EnumeratedDevice, read_device};
 use ecaxis_master::acyclic::{DatagramClient, DeviceRef};
-use ecaxis_master::mailbox::{FoeError, SdoError};
+use ecaxis_master::mailbox::{FoeCause, FoeError, SdoError};
 use ecaxis_master::report::Error;
 
 /// A step of an update.
@@ -212,6 +212,15 @@ impl UpdateStep {
 }
 
 impl StepFailure {
+    /// True if the device refused the file.
+    pub(super) fn is_refusal(&self) -> bool {
+        match &self.cause {
+            UpdateCause::Foe(error) => matches!(error.cause, FoeCause::Refused { .. }),
+            UpdateCause::Sdo(error) => error.abort_code().is_some(),
+            _ => false,
+        }
+    }
+
     /// Adds the final state of the device, whose address may have changed.
     pub(super) async fn at(self, wire: &DatagramClient, device: &DeviceRef) -> FirmwareError {
         let left = match read_device(wire, device.position).await {

@@ -20,6 +20,7 @@ use ecaxis_master::acyclic::AlState;
 use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::acyclic::al;
 use ecaxis_master::acyclic::device::locate;
+use ecaxis_master::acyclic::{Registers, mailbox};
 use ecaxis_master::config::Locator;
 use ecaxis_master::mailbox::{MailboxTransport, foe};
 use error::StepFailure;
@@ -235,7 +236,12 @@ pub async fn update(
         };
         match done {
             Ok(done) => Ok(done),
-            Err(failed) => Err(failed.at(wire, &before.device).await),
+            Err(failed) => {
+                if failed.is_refusal() {
+                    restore_state(wire, before).await;
+                }
+                Err(failed.at(wire, &before.device).await)
+            }
         }
     };
     let (after, read_back, took) = wire.stop().shield(whole).await?;
@@ -247,6 +253,38 @@ pub async fn update(
         read_back,
         took,
     })
+}
+
+/// Takes a device that refused the file back to the state in which it was found. The state in which
+/// it stays is read afterwards.
+async fn restore_state(wire: &DatagramClient, before: &DeviceIdentity) {
+    let devices = std::slice::from_ref(&before.device);
+    let back = async |state, timeout| al::change_state(wire, devices, state, timeout).await;
+    let way: &[AlState] = match before.state {
+        AlState::PreOp => &[AlState::PreOp],
+        AlState::SafeOp => &[AlState::PreOp, AlState::SafeOp],
+        _ => &[],
+    };
+    if back(AlState::Init, al::BACK_TIMEOUT).await.is_err() || way.is_empty() {
+        return;
+    }
+    let registers = Registers {
+        wire,
+        device: &before.device,
+        step: "setting up the mailboxes",
+    };
+    let areas = before.sii.mailbox;
+    if mailbox::configure(&registers, &before.sii, areas)
+        .await
+        .is_err()
+    {
+        return;
+    }
+    for state in way {
+        if back(*state, mailbox::PRE_OP_TIMEOUT).await.is_err() {
+            return;
+        }
+    }
 }
 
 /// Ends a transfer by returning to Init, where the device starts its present program.

@@ -77,8 +77,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     let names: Vec<&str> = files.iter().map(|(name, _)| *name).collect();
     let shown = folder.display();
+    let machine = match folder == Path::new(".") {
+        true => PathBuf::from("machine.toml"),
+        false => folder.join("machine.toml"),
+    };
+    let machine = machine.display();
     let next = match args.rust {
-        false => format!("`ecaxis run {shown}/machine.toml`, then change the file"),
+        false => format!("`ecaxis run {machine}`, then change the file"),
         true => format!("`cd {shown}`, `cargo test`, `cargo run --release`"),
     };
     result(&format!("{shown}: {}\nnext: {next}\n", names.join(", ")))
