@@ -63,16 +63,31 @@ fn main() -> ExitCode {
         };
     }
     let verb = Cli::parse().verb;
-    if let Some(verbosity) = verb.verbosity() {
-        render::output::start_logging(verbosity.log_filter());
-    }
-    match verb.run() {
+    match start_logging(&verb).and_then(|()| verb.run()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
             render::show_failure(&failure);
             ExitCode::from(failure.code)
         }
     }
+}
+
+/// Logs to stderr or to a file, as the options of the subcommand say.
+fn start_logging(verb: &Verb) -> Result<(), failure::Failure> {
+    let verbosity = verb.verbosity();
+    if let Some(log) = verb.log() {
+        render::output::set_quiet(log.quiet);
+        if let Some(path) = &log.log_file {
+            let verbose = verbosity.filter(|verbosity| verbosity.plain());
+            let filter = verbose.map_or(args::FILE_FILTER, args::Verbosity::log_filter);
+            let opened = render::output::start_log_file(path, filter);
+            return opened.map_err(|error| args::files::unwritable(path, &error));
+        }
+    }
+    if let Some(verbosity) = verbosity {
+        render::output::start_logging(verbosity.log_filter());
+    }
+    Ok(())
 }
 
 /// Returns what identifies this program.

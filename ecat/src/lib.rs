@@ -16,3 +16,4 @@ mod object_names;
 pub mod registers;
 pub mod sii;
 pub mod value;
+pub mod vendor;

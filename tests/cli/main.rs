@@ -12,5 +12,6 @@ mod identity;
 mod init;
 mod messages;
 mod mistakes;
+mod output;
 mod signatures;
 mod terminal;

@@ -1,6 +1,10 @@
 //! Controlword (0x6040) and Statusword (0x6041). `from_bits_retain` keeps unnamed bits.
 
+use core::fmt;
+
 use bitflags::bitflags;
+
+use super::state::State;
 
 bitflags! {
     /// The Statusword, 0x6041 (CiA 402-2 "statusword").
@@ -74,9 +78,102 @@ impl Controlword {
     pub const FAULT_RESET_COMMAND: Self = Self::FAULT_RESET;
 }
 
+/// Bits that a Statusword shows besides its state. The meaning of 12 and 13 depends on the mode.
+const STATUS_BITS: [(Statusword, &str); 8] = [
+    (Statusword::WARNING, "warning"),
+    (Statusword::from_bits_retain(1 << 8), "bit 8"),
+    (Statusword::TARGET_REACHED, "target reached"),
+    (Statusword::INTERNAL_LIMIT_ACTIVE, "internal limit active"),
+    (Statusword::FOLLOWS_COMMAND, "bit 12"),
+    (Statusword::FOLLOWING_ERROR, "bit 13"),
+    (Statusword::from_bits_retain(1 << 14), "bit 14"),
+    (Statusword::from_bits_retain(1 << 15), "bit 15"),
+];
+
+/// Formats the state, and the bits that do not belong to it.
+impl fmt::Display for Statusword {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match State::from_statusword(*self) {
+            State::Unknown(_) => f.write_str("unknown state")?,
+            state => write!(f, "{state}")?,
+        }
+        if !self.contains(Self::VOLTAGE_ENABLED) {
+            f.write_str(", no voltage")?;
+        }
+        if !self.contains(Self::REMOTE) {
+            f.write_str(", not remote")?;
+        }
+        let mut set = STATUS_BITS.iter().filter(|(bit, _)| self.contains(*bit));
+        set.try_for_each(|(_, name)| write!(f, ", {name}"))
+    }
+}
+
+/// Bits that a Controlword shows besides its command. The meaning of 4, 5, 6 and 9 depends on the
+/// mode.
+const CONTROL_BITS: [(u16, &str); 10] = [
+    (1 << 4, "bit 4"),
+    (1 << 5, "bit 5"),
+    (1 << 6, "bit 6"),
+    (1 << 8, "halt"),
+    (1 << 9, "bit 9"),
+    (1 << 11, "bit 11"),
+    (1 << 12, "bit 12"),
+    (1 << 13, "bit 13"),
+    (1 << 14, "bit 14"),
+    (1 << 15, "bit 15"),
+];
+
+/// Formats the command (CiA 402-2, "command coding"), and the bits that do not belong to it.
+impl fmt::Display for Controlword {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self.bits() & 0x8F {
+            bits if bits & 0x80 != 0 => "fault reset",
+            bits if bits & 0x02 == 0 => "disable voltage",
+            bits if bits & 0x04 == 0 => "quick stop",
+            bits if bits & 0x01 == 0 => "shutdown",
+            bits if bits & 0x08 == 0 => "switch on",
+            _ => "enable operation",
+        })?;
+        let mut set = CONTROL_BITS
+            .iter()
+            .filter(|(bit, _)| self.bits() & bit != 0);
+        set.try_for_each(|(_, name)| write!(f, ", {name}"))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn words_show_state_or_command_and_further_bits() {
+        for (bits, text) in [
+            (0x0237, "Operation enabled"),
+            (0x1637, "Operation enabled, target reached, bit 12"),
+            (0x0218, "Fault"),
+            (0x0240, "Switch on disabled, no voltage"),
+            (
+                0x88b1,
+                "Ready to switch on, not remote, warning, internal limit active, bit 15",
+            ),
+            (0x0002, "unknown state, no voltage, not remote"),
+        ] {
+            assert_eq!(Statusword::from_bits_retain(bits).to_string(), text);
+        }
+        for (bits, text) in [
+            (0x0000, "disable voltage"),
+            (0x0002, "quick stop"),
+            (0x0006, "shutdown"),
+            (0x0007, "switch on"),
+            (0x000f, "enable operation"),
+            (0x011f, "enable operation, bit 4, halt"),
+            (0x0080, "fault reset"),
+            (0x008f, "fault reset"),
+            (0x8007, "switch on, bit 15"),
+        ] {
+            assert_eq!(Controlword::from_bits_retain(bits).to_string(), text);
+        }
+    }
 
     #[test]
     fn command_words() {

@@ -3,6 +3,7 @@
 
 use std::path::PathBuf;
 
+use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_esi::sii::Sii;
 use ecaxis_esi::{DeviceHeader, Dictionary, Identity, SelectOptions, select};
 use ecaxis_master::acyclic::eeprom::EepromAccess;
@@ -57,7 +58,7 @@ pub(crate) struct Target {
 
 impl DeviceArgs {
     /// Returns the device and the remaining words. Without `--position`, `--alias` or `--id`, the
-    /// first two words are machine file and device name. `rest` describes the words after them.
+    /// first two words are machine file and the name or position of the device. `rest` describes the words after them.
     pub fn take<'w>(
         &self,
         words: &'w [String],
@@ -116,10 +117,18 @@ pub(crate) fn no_more(rest: &[String]) -> Result<(), Failure> {
     }
 }
 
-/// Returns the device of a machine with this name.
+/// Returns the device of a machine with this name, else the one at this position.
 pub(crate) fn named<'m>(machine: &'m Machine, name: &str) -> Result<&'m DeviceConfig, Failure> {
-    let found = machine.devices.iter().find(|device| device.name == name);
-    found.ok_or_else(|| {
+    selected(machine, name).map(|index| &machine.devices[index])
+}
+
+/// Returns the index of the device with this name, else of the one at this position.
+pub(crate) fn selected(machine: &Machine, name: &str) -> Result<DeviceIndex, Failure> {
+    let all = || machine.devices.enumerate();
+    let at = name.parse().ok().map(Locator::Position);
+    let found = all().find(|(_, device)| device.name == name);
+    let found = found.or_else(|| all().find(|(_, device)| Some(device.at) == at));
+    found.map(|(index, _)| index).ok_or_else(|| {
         let names = machine.devices.iter().map(|device| device.name.as_str());
         let message = format!("{}: no device is called `{name}`", machine.path.display());
         let all: Vec<&str> = names.clone().collect();

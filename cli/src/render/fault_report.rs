@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use ecaxis_axis::cia402::{State, Statusword};
+use ecaxis_axis::cia402::{Controlword, Statusword};
 use ecaxis_master::config::duration;
 use ecaxis_master::post_mortem::cause::about;
 use ecaxis_master::post_mortem::report::{CycleRecord, DeviceSection};
@@ -16,7 +16,7 @@ use ecaxis_tools::document::{Document, Table};
 use super::report;
 use crate::failure::{FAILED, Failure};
 use crate::hints::diagnosed;
-use crate::render::note;
+use crate::render::{note, print_always};
 
 /// The page width in columns.
 const WIDTH: usize = 80;
@@ -281,7 +281,7 @@ fn axis_cycles(fault_report: &FaultReport, out: &mut Document) {
         fault_report.stop.map(|stop| stop.cycle),
         fault_report.cycles.last().map(|c| c.cycle.number),
     ];
-    let mut table = Table::new("cycle|axis|Statusword|state|target|actual|error|% torque");
+    let mut table = Table::new("cycle|axis|Statusword|state|command|target|actual|error|% torque");
     let mut last = vec![None; fault_report.axes.len()];
     let mut rows = 0;
     for page in notable(fault_report, differs) {
@@ -292,7 +292,8 @@ fn axis_cycles(fault_report: &FaultReport, out: &mut Document) {
                 continue;
             }
             rows += 1;
-            let state = State::from_statusword(Statusword::from_bits_retain(axis.statusword));
+            let state = Statusword::from_bits_retain(axis.statusword);
+            let command = Controlword::from_bits_retain(axis.controlword);
             let stale = if axis.fresh { "" } else { " (old)" };
             let (target, actual) = match axis.mode {
                 VELOCITY | PROFILE_VELOCITY => (axis.target_velocity, axis.velocity),
@@ -303,6 +304,7 @@ fn axis_cycles(fault_report: &FaultReport, out: &mut Document) {
                 of.name,
                 hex16(axis.statusword),
                 format!("{state}{stale}"),
+                command,
                 format!("{target:.3}"),
                 format!("{actual:.3}"),
                 format!("{:.3}", axis.following_error),
@@ -334,7 +336,7 @@ pub(crate) fn print(
     }
     let short = short(fault_report);
     if !short.is_empty() {
-        note(short.trim_end());
+        print_always(short.trim_end());
     }
     let kept = keep(fault_report, hints, destination).unwrap_or_else(|trouble| {
         note(&format!("  warning: {}", trouble.message));

@@ -13,6 +13,7 @@ pub(crate) mod output;
 pub(crate) mod pdo_table;
 pub(crate) mod progress;
 pub(crate) mod report;
+pub(crate) mod selection;
 pub(crate) mod style;
 
 /// Prints a result on stdout.
@@ -23,7 +24,7 @@ pub(crate) fn result(text: &str) -> Result<(), Failure> {
 
 /// Prints prose on stdout. On a terminal, long lines are wrapped.
 pub(crate) fn page(text: &str) -> Result<(), Failure> {
-    result(&output::wrapped(text, output::stdout_width()))
+    shown(&output::wrapped(text, output::stdout_width()))
 }
 
 /// The width of pages with long lines, in columns.
@@ -31,18 +32,26 @@ const PAGE: usize = 80;
 
 /// Prints a document. On a terminal, it is wrapped.
 pub(crate) fn print(document: &Document) -> Result<(), Failure> {
-    result(&document.text(output::stdout_width()))
+    shown(&document.text(output::stdout_width()))
 }
 
 /// Prints a table alone, without indent.
 pub(crate) fn print_table(table: &Table) -> Result<(), Failure> {
-    result(&table.text(0, output::stdout_width()))
+    shown(&table.text(0, output::stdout_width()))
 }
 
 /// Prints a document with long lines, wrapped to 80 columns or a wider terminal.
 pub(crate) fn print_page(document: &Document) -> Result<(), Failure> {
     let width = output::stdout_width().unwrap_or(PAGE).max(PAGE);
-    result(&document.text(Some(width)))
+    shown(&document.text(Some(width)))
+}
+
+/// Prints text with colours for states and findings, on a terminal.
+pub(crate) fn shown(text: &str) -> Result<(), Failure> {
+    match style::on_stdout() {
+        true => result(&style::decorated(text)),
+        false => result(text),
+    }
 }
 
 /// Prints a result as JSON, its keys in order.
@@ -63,8 +72,26 @@ fn written(done: io::Result<()>) -> Result<(), Failure> {
     }
 }
 
-/// Prints a line on stderr.
+/// Splits a remark of a machine file into its lead, `note: ` or `warning: `, and its text.
+pub(crate) fn note_of(remark: &str) -> (&'static str, &str) {
+    match remark.strip_prefix("warning: ") {
+        Some(text) => ("warning: ", text),
+        None => ("note: ", remark),
+    }
+}
+
+/// Prints a line on stderr, unless only errors are wanted.
 pub(crate) fn note(text: &str) {
+    if output::is_quiet() && !text.starts_with("error:") {
+        output::log_message(text);
+        return;
+    }
+    print_always(text);
+}
+
+/// Prints a line of a failure on stderr.
+pub(crate) fn print_always(text: &str) {
+    output::log_message(text);
     let text = output::wrapped(text, output::stderr_width());
     let _ = output::print_line(|mut err| style::complaint(&mut err, &text));
 }
@@ -76,12 +103,12 @@ pub(crate) fn show_failure(failure: &Failure) {
     } else {
         "error: "
     };
-    note(&format!("{prefix}{}", failure.message));
+    print_always(&format!("{prefix}{}", failure.message));
     for hint in &failure.hints {
-        note(&format!("  = help: {hint}"));
+        print_always(&format!("  = help: {hint}"));
     }
     if let Some(after) = &failure.after {
-        note(after);
+        print_always(after);
     }
 }
 

@@ -3,13 +3,18 @@
 //! At most one status line is shown on stderr. All permanent lines are written through this module,
 //! which clears the status line first. Without a terminal, no line is wrapped or cleared.
 
+use std::fs::File;
 use std::io::{self, IsTerminal, Write};
-use std::sync::{Mutex, PoisonError};
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, OnceLock, PoisonError};
+use std::time::SystemTime;
 
 use indicatif::ProgressBar;
 use tracing_subscriber::EnvFilter;
 
 use crate::render::style;
+use ecaxis_tools::document::format::utc;
 
 /// The status line currently shown.
 enum StatusLine {
@@ -40,7 +45,7 @@ pub(crate) fn print_line<T>(write: impl FnOnce(&mut dyn Write) -> T) -> T {
 
 /// Replaces the status line, on a terminal only. Empty text clears it.
 pub(crate) fn set_status_line(text: &str) {
-    if !style::rewrites() {
+    if !style::rewrites() || is_quiet() {
         return;
     }
     let mut passing = PASSING.lock().unwrap_or_else(PoisonError::into_inner);
@@ -100,6 +105,80 @@ pub(crate) fn start_logging(level: &str) {
         .with_ansi(style::on_stderr())
         .with_timer(tracing_subscriber::fmt::time::uptime())
         .init();
+}
+
+/// True if only errors and the result are printed.
+static QUIET: AtomicBool = AtomicBool::new(false);
+
+pub(crate) fn set_quiet(quiet: bool) {
+    QUIET.store(quiet, Ordering::Relaxed);
+}
+
+pub(crate) fn is_quiet() -> bool {
+    QUIET.load(Ordering::Relaxed)
+}
+
+/// The file for log lines and messages.
+static LOG_FILE: OnceLock<Mutex<File>> = OnceLock::new();
+
+/// A writer to the log file. It ignores write errors, as [`Log`] does.
+struct FileLog;
+
+impl Write for FileLog {
+    fn write(&mut self, buf: &[u8]) -> io::Result<usize> {
+        if let Some(file) = LOG_FILE.get() {
+            let mut file = file.lock().unwrap_or_else(PoisonError::into_inner);
+            let _ = file.write_all(buf);
+        }
+        Ok(buf.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// The time of a line in the log file: UTC with milliseconds.
+struct Utc;
+
+impl Utc {
+    fn now() -> String {
+        let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+        let since = since.unwrap_or_default();
+        format!("{}.{:03}Z", utc(since.as_secs()), since.subsec_millis())
+    }
+}
+
+impl tracing_subscriber::fmt::time::FormatTime for Utc {
+    fn format_time(
+        &self,
+        out: &mut tracing_subscriber::fmt::format::Writer<'_>,
+    ) -> std::fmt::Result {
+        out.write_str(&Self::now())
+    }
+}
+
+/// Logs events and messages to a file, at its end. RUST_LOG overrides `level`.
+pub(crate) fn start_log_file(path: &Path, level: &str) -> io::Result<()> {
+    let file = File::options().create(true).append(true).open(path)?;
+    if LOG_FILE.set(Mutex::new(file)).is_err() {
+        return Ok(());
+    }
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(|| FileLog)
+        .with_ansi(false)
+        .with_timer(Utc)
+        .init();
+    Ok(())
+}
+
+/// Adds a message to the log file, if there is one.
+pub(crate) fn log_message(text: &str) {
+    if LOG_FILE.get().is_some() {
+        let _ = FileLog.write_all(format!("{}  NOTE {text}\n", Utc::now()).as_bytes());
+    }
 }
 
 /// The width of stderr, or `None` if it is not a terminal.

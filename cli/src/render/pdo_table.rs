@@ -5,6 +5,7 @@ use ecaxis_master::text::pluralize;
 use ecaxis_tools::cells;
 use ecaxis_tools::document::format::{hex_bytes, hex16};
 use ecaxis_tools::document::{Document, Table};
+use ecaxis_tools::parameters::meaning::meaning;
 
 /// Adds the SyncManagers and the offset of each object.
 pub(crate) fn process_data(device: &Device, layout: &Layout, out: &mut Document) {
@@ -89,7 +90,9 @@ pub(crate) fn startup(startup: &[StartupSdo], out: &mut Document) {
             true => format!("0x{:04x} CA", sdo.index),
             false => address(sdo.index, sdo.sub).to_string(),
         };
-        let (value, name) = (value(&sdo.data), short_name(&sdo.name));
+        let text = meaning(sdo.index, sdo.sub, &sdo.data).filter(|_| !sdo.complete_access);
+        let text = text.map_or(String::new(), |text| format!(" {text}"));
+        let (value, name) = (value(&sdo.data) + &text, short_name(&sdo.name));
         table.row(cells![sdo.transition, object, value, name, sdo.origin]);
     }
     out.line("start-up SDOs, in this order (PS: between PreOp and SafeOp)");

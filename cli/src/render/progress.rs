@@ -38,7 +38,7 @@ pub(crate) struct ProgressPrinter {
 impl ProgressPrinter {
     /// `plain`: print separate lines, because log lines are mixed in.
     pub fn new(clock: Clock, bus: &Bus, plain: bool) -> Self {
-        let bar = (style::rewrites() && !plain).then(|| {
+        let bar = (style::rewrites() && !plain && !output::is_quiet()).then(|| {
             let bar = ProgressBar::new_spinner();
             let style = ProgressStyle::with_template("{spinner} {msg}");
             let bar = bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_spinner()));

@@ -8,7 +8,7 @@ use ecaxis_tools::document::Document;
 use serde_json::json;
 
 use crate::hints::{self, Failure};
-use crate::render::{print, print_json, result};
+use crate::render::{note_of, print, print_json, shown};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -31,7 +31,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let loaded = config::load(&args.file);
     let written = match &loaded {
         _ if args.json => print_json(&as_json(&args.file, &loaded)),
-        Ok(machine) => print(&summary(machine)).and_then(|()| result("no problems\n")),
+        Ok(machine) => print(&summary(machine)).and_then(|()| shown("no problems\n")),
         Err(_) => Ok(()),
     };
     loaded.map_err(|e| hints::config(&args.file, &e))?;
@@ -120,7 +120,8 @@ fn summary(machine: &Machine) -> Document {
             device.name
         ));
         for note in &selection.notes {
-            out.item("  note: ", note);
+            let (lead, note) = note_of(note);
+            out.item(format!("  {lead}"), note);
         }
         for warning in &device.esi.warnings {
             let (file, at) = (device.esi_path.display(), warning.position);

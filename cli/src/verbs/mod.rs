@@ -4,7 +4,7 @@ use clap::Subcommand;
 use ecaxis_master::change_log::ChangeLog;
 
 use crate::access::change_log;
-use crate::args::Verbosity;
+use crate::args::{LogArgs, Verbosity};
 use crate::hints::Failure;
 
 mod analyze;
@@ -63,6 +63,16 @@ impl Verb {
             Self::Sim(args) => Some(&args.verbosity),
             Self::Bench(args) => Some(&args.verbosity),
             Self::Firmware(args) => Some(&args.verbosity),
+            _ => None,
+        }
+    }
+
+    /// Returns the options of a subcommand that keeps a machine up.
+    pub fn log(&self) -> Option<&LogArgs> {
+        match self {
+            Self::Run(args) => Some(&args.log),
+            Self::Serve(args) => Some(&args.log),
+            Self::Jog(args) => Some(&args.log),
             _ => None,
         }
     }

@@ -10,6 +10,7 @@ use ecaxis_master::session::{self, Options, Outcome, Summary};
 use serde_json::{Value, json};
 
 use crate::access::{rights, signals};
+use crate::args::LogArgs;
 use crate::args::bus::BusArgs;
 use crate::args::files::{Inputs, check_output};
 use crate::args::record;
@@ -81,6 +82,8 @@ pub(crate) struct Args {
     /// Overwrite existing output files
     #[arg(long)]
     force: bool,
+    #[command(flatten)]
+    pub log: LogArgs,
     #[command(flatten)]
     pub verbosity: crate::args::Verbosity,
 }

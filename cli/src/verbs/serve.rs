@@ -14,9 +14,9 @@ use ecaxis_server::http::HttpOptions;
 use ecaxis_server::serve::{ServeError, ServerOptions, new_token, serve};
 
 use crate::access::{rights, signals};
-use crate::args::Verbosity;
 use crate::args::bus::BusArgs;
 use crate::args::files::{Inputs, check_output};
+use crate::args::{LogArgs, Verbosity};
 use crate::hints::{self, Failure};
 use crate::render::note;
 
@@ -81,6 +81,8 @@ pub(crate) struct Args {
     /// Keep the samples of every cycle for this time
     #[arg(long, value_name = "DURATION", default_value = "60s", value_parser = duration::parse)]
     keep: u64,
+    #[command(flatten)]
+    pub log: LogArgs,
     #[command(flatten)]
     pub verbosity: Verbosity,
 }

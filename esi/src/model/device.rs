@@ -6,6 +6,8 @@ use super::{
     DcMode, Dictionary, Fmmu, FmmuUse, LocalName, Mailbox, Pdo, Position, Slots, SmMapping, SmUse,
     SyncManager, SyncUnit,
 };
+use ecaxis_ecat::vendor::VendorId;
+
 use crate::layout::SmLayout;
 
 /// Identity object 0x1018 without the serial number.
@@ -23,8 +25,10 @@ impl fmt::Display for Identity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             f,
-            "vendor 0x{:08x}, product 0x{:08x}, revision 0x{:08x}",
-            self.vendor, self.product, self.revision
+            "vendor {}, product 0x{:08x}, revision 0x{:08x}",
+            VendorId(self.vendor),
+            self.product,
+            self.revision
         )
     }
 }

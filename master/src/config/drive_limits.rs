@@ -3,7 +3,7 @@
 
 use std::fmt;
 
-use ecaxis_axis::units::{Counts, RawAcceleration};
+use ecaxis_axis::units::{Counts, RawAcceleration, RawVelocity};
 use ecaxis_axis::{Mode, VelocityUnit};
 use ecaxis_esi as esi;
 
@@ -16,6 +16,7 @@ use ecaxis_ecat::object::NamedObject;
 const POSITION_RANGE: u16 = 0x607b;
 const SOFTWARE_LIMIT: u16 = 0x607d;
 const MAX_MOTOR_SPEED: u16 = 0x6080;
+const MAX_PROFILE_VELOCITY: u16 = 0x607f;
 const FOLLOWING_WINDOW: u16 = 0x6065;
 const MAX_ACCELERATION: u16 = 0x60c5;
 const MAX_TORQUES: [u16; 3] = [0x6072, 0x60e0, 0x60e1];
@@ -48,6 +49,7 @@ impl AxisSetup {
             (POSITION_RANGE, 1),
             (POSITION_RANGE, 2),
             (MAX_MOTOR_SPEED, 0),
+            (MAX_PROFILE_VELOCITY, 0),
             (MAX_ACCELERATION, 0),
         ];
         let modes = self.config.modes;
@@ -86,6 +88,8 @@ impl AxisSetup {
         if let Some(speed) = set(MAX_MOTOR_SPEED) {
             found.extend(self.speed(speed, speed_unit));
         }
+        let velocity = set(MAX_PROFILE_VELOCITY).and_then(|n| i32::try_from(n).ok());
+        found.extend(velocity.and_then(|raw| self.profile_velocity(raw)));
         if let Some(raw) = set(MAX_ACCELERATION).and_then(|n| u32::try_from(n).ok()) {
             found.extend(self.acceleration(raw));
         }
@@ -157,6 +161,28 @@ impl AxisSetup {
             sub: 0,
             text: format!(
                 "= {raw} {shown} allows {} {name}/s, `limits.velocity` is {} {name}/s{doubt}",
+                rounded(most),
+                rounded(limit),
+            ),
+            certain,
+        })
+    }
+
+    /// Checks 0x607F. It limits profiles of the drive; some drives limit every velocity by it.
+    fn profile_velocity(&self, raw: i32) -> Option<LimitConflict> {
+        let scale = &self.config.scale;
+        let most = scale.velocity_to_user(RawVelocity(raw)).0.abs();
+        let limit = self.config.limits.velocity;
+        let modes = self.config.modes;
+        let profiles = [Mode::Pp, Mode::Pv, Mode::Hm];
+        let certain = self.velocity_unit_from != UnitSource::Nothing
+            && profiles.iter().any(|mode| modes.contains(*mode));
+        let (unit, name) = (scale.velocity_unit(), &self.unit);
+        exceeds(limit, most).then(|| LimitConflict {
+            index: MAX_PROFILE_VELOCITY,
+            sub: 0,
+            text: format!(
+                "= {raw} {unit} allows {} {name}/s, `limits.velocity` is {} {name}/s",
                 rounded(most),
                 rounded(limit),
             ),

@@ -224,7 +224,7 @@ fn diagnose_names_device_and_cause() {
             }
             .with_device(at(1)),
             with(overrun),
-            "`a1` (position 1, station 0x1001): drive fault (Statusword 0x0218), error code (0x603F) 0x3220: DC link undervoltage",
+            "`a1` (position 1, station 0x1001): drive fault (Statusword 0x0218: Fault), error code (0x603F) 0x3220: DC link undervoltage",
         ),
         (
             left_op(1, 0x001b),

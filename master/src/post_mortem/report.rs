@@ -1,7 +1,7 @@
 //! A fault report as data, for files, scripts and renderers.
 
-use ecaxis_axis::cia402::describe;
-use serde::Serialize;
+use ecaxis_axis::cia402::{Controlword, Statusword, describe};
+use serde::{Serialize, Serializer};
 
 use super::DiagnosedCause;
 use super::evidence::Evidence;
@@ -103,7 +103,25 @@ pub struct CycleRecord {
     #[serde(flatten)]
     pub cycle: Cycle,
     /// In the order of [`FaultReport::axes`].
+    #[serde(serialize_with = "with_texts")]
     pub axes: Vec<AxisCycle>,
+}
+
+/// An axis with the texts of its words.
+#[derive(Serialize)]
+struct DecodedAxis<'a> {
+    #[serde(flatten)]
+    axis: &'a AxisCycle,
+    statusword_text: String,
+    controlword_text: String,
+}
+
+fn with_texts<S: Serializer>(axes: &[AxisCycle], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(axes.iter().map(|axis| DecodedAxis {
+        axis,
+        statusword_text: Statusword::from_bits_retain(axis.statusword).to_string(),
+        controlword_text: Controlword::from_bits_retain(axis.controlword).to_string(),
+    }))
 }
 
 impl CycleRecord {

@@ -4,7 +4,7 @@ use std::borrow::Borrow;
 use std::fmt;
 use std::sync::Arc;
 
-use ecaxis_axis::{CommandError, Mode, State, Trip};
+use ecaxis_axis::{CommandError, Mode, State, Statusword, Trip};
 
 use crate::config::{LimitConflict, Step, UnitProblem};
 use crate::link::{LinkError, OpenError};
@@ -239,8 +239,8 @@ pub enum Cause {
     State(StateError),
     #[error(
         "does not reach Operation enabled within {timeout_ms} ms: stays in {state} \
-         (Statusword 0x{statusword:04x}){}{}",
-        mode_note(*mode_confirmed), code_note(*code)
+         (Statusword 0x{statusword:04x}: {}){}{}",
+        Statusword::from_bits_retain(*statusword), mode_note(*mode_confirmed), code_note(*code)
     )]
     NotEnabled {
         state: State,
@@ -254,7 +254,10 @@ pub enum Cause {
         Mode::from_code(*display), Mode::from_code(*expected)
     )]
     WrongMode { expected: i8, display: i8 },
-    #[error("drive fault (Statusword 0x{statusword:04x}){}{report}", code_note(*code))]
+    #[error(
+        "drive fault (Statusword 0x{statusword:04x}: {}){}{report}",
+        Statusword::from_bits_retain(*statusword), code_note(*code)
+    )]
     DriveFault {
         code: Option<u16>,
         statusword: u16,

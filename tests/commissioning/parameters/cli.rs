@@ -312,3 +312,36 @@ fn an_incomplete_file_is_removed() {
     assert!(err.contains("cannot write x.bin: "), "{err}");
     assert!(!folder.path().join("x.bin").exists());
 }
+
+#[test]
+fn sdo_read_watches_until_it_is_interrupted() {
+    use std::io::{BufRead, BufReader};
+    use std::process::Stdio;
+
+    let demo = demo();
+    let mut command = program::command();
+    command.args(["sdo", "read", &demo, "0", "0x6041", "0x1018:01", "--sim"]);
+    command
+        .args(["--watch", "20ms", "--json"])
+        .stdout(Stdio::piped());
+    let mut child = command.stderr(Stdio::null()).spawn().expect("it starts");
+    let lines = BufReader::new(child.stdout.take().expect("piped")).lines();
+    let objects: Vec<serde_json::Value> = lines
+        .take(2)
+        .map(|line| serde_json::from_str(&line.expect("a line")).expect("JSON"))
+        .collect();
+    let text = objects[0]["text"].as_str().expect("a text");
+    assert!(text.starts_with("Switch on disabled"), "{text}");
+    assert_eq!(objects[1]["index"], 0x1018);
+    assert!(
+        objects[1]["time"]
+            .as_str()
+            .is_some_and(|time| time.ends_with('Z'))
+    );
+    // Nothing changes afterwards.
+    std::thread::sleep(std::time::Duration::from_millis(300));
+    assert!(child.try_wait().expect("a state").is_none(), "it goes on");
+    let id = rustix::process::Pid::from_child(&child);
+    rustix::process::kill_process(id, rustix::process::Signal::INT).expect("it runs");
+    assert_eq!(child.wait().expect("it ends").code(), Some(130));
+}

@@ -103,6 +103,15 @@ impl Table {
         let head = Some(&self.head).filter(|head| !head.is_empty());
         let rows: Vec<_> = head.into_iter().chain(rows.map(|(_, row)| row)).collect();
         let widths = self.widths(&rows, indent, limit.unwrap_or(usize::MAX));
+        let limit = limit.unwrap_or(usize::MAX);
+        let gaps = indent + GAP * widths.len().saturating_sub(1);
+        if head.is_some() && widths.iter().sum::<usize>() + gaps > limit {
+            self.write_records(out, &rows, indent, limit);
+            if hidden > 0 {
+                more(out, indent, hidden);
+            }
+            return;
+        }
         for (n, row) in rows.iter().enumerate() {
             if hidden > 0 && n == first + self.head.len().min(1) {
                 more(out, indent, hidden);
@@ -120,6 +129,25 @@ impl Table {
         }
         if hidden > 0 && last == 0 {
             more(out, indent, hidden);
+        }
+    }
+
+    /// Formats each row as lines of heading and value, for a terminal that no row fits.
+    fn write_records(&self, out: &mut String, rows: &[&Vec<String>], indent: usize, limit: usize) {
+        let label = self.head.iter().map(|head| head.chars().count());
+        let label = label.max().unwrap_or(0);
+        let room = limit.saturating_sub(indent + label + GAP).max(NARROWEST);
+        for (n, row) in rows.iter().skip(1).enumerate() {
+            if n > 0 {
+                out.push('\n');
+            }
+            for (head, cell) in self.head.iter().zip(*row) {
+                for (n, part) in wrap(cell, room).iter().enumerate() {
+                    let head = if n == 0 { head } else { "" };
+                    let line = format!("{:indent$}{head:<label$}{:GAP$}{part}", "", "");
+                    let _ = writeln!(out, "{}", line.trim_end());
+                }
+            }
         }
     }
 
@@ -191,6 +219,30 @@ mod tests {
                 "{limit}: {text}"
             );
         }
+    }
+
+    #[test]
+    fn table_becomes_records_if_no_row_fits() {
+        let mut table = Table::new("axis|state|final position|largest following error");
+        for name in ["x", "y"] {
+            table.row(crate::cells![
+                name,
+                "Switch on disabled",
+                "0.0000 mm",
+                "0.3032 mm"
+            ]);
+        }
+        let record = |name: &str| {
+            format!(
+                "axis                     {name}\nstate                    Switch\n                         on\n                         disabl\n                         ed\nfinal position           0.0000\n                         mm\nlargest following error  0.3032\n                         mm\n"
+            )
+        };
+        let expected = format!("{}\n{}", record("x"), record("y"));
+        assert_eq!(table.text(0, Some(27)), expected);
+        assert_eq!(
+            table.text(0, Some(28)).lines().next(),
+            Some("axis  state   final   larges")
+        );
     }
 
     #[test]

@@ -13,6 +13,8 @@ pub struct Difference {
     pub name: String,
     pub left: Option<String>,
     pub right: Option<String>,
+    /// The texts of words and codes.
+    pub meanings: [Option<String>; 2],
 }
 
 /// Returns the differing settings by index and subindex; with `all` also actual values and
@@ -39,6 +41,7 @@ pub fn compare(left: &[Parameter], right: &[Parameter], all: bool) -> Vec<Differ
             name: some.name.clone(),
             left: left.map(Parameter::shown),
             right: right.map(Parameter::shown),
+            meanings: [left, right].map(|side| side?.meaning()),
         })
     });
     differ.collect()

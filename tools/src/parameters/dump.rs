@@ -121,8 +121,10 @@ impl Dump {
             quoted(name),
         );
         for parameter in &self.parameters {
+            let comment = parameter.meaning();
+            let comment = comment.map_or(String::new(), |text| format!(" # {text}"));
             text += &format!(
-                "\"{}\" = {{ name = {}, type = {}, access = \"{}\", value = {} }}\n",
+                "\"{}\" = {{ name = {}, type = {}, access = \"{}\", value = {} }}{comment}\n",
                 parameter.at.number(),
                 quoted(&parameter.name),
                 quoted(&parameter.data_type.to_string()),

@@ -8,6 +8,7 @@
 //! - [`dump`]: parameter files;
 //! - [`restore_order`]: selects and orders the writes of a restore;
 //! - [`compare`], [`restore`]: compares two sets of values, writes one to a device;
+//! - [`meaning`](mod@meaning): the text of a word or code;
 //! - [`command`]: "save" and "load" (0x1010, 0x1011).
 
 use ecaxis_esi::{Dictionary, Object, ObjectItem, Writable};
@@ -19,6 +20,7 @@ pub mod compare;
 pub mod dictionary;
 pub mod dump;
 pub mod lookup;
+pub mod meaning;
 pub mod restore;
 pub mod restore_order;
 #[cfg(test)]
@@ -43,6 +45,12 @@ impl Parameter {
     #[must_use]
     pub fn shown(&self) -> String {
         self.data_type.show(&self.value)
+    }
+
+    /// Returns the text of a word or code.
+    #[must_use]
+    pub fn meaning(&self) -> Option<String> {
+        meaning::meaning(self.at.index, self.at.sub, &self.value)
     }
 }
 

@@ -264,6 +264,7 @@ impl<W: MailboxTransport> Device<'_, W> {
                 name: parameter.name.clone(),
                 left: Some(parameter.shown()),
                 right,
+                meanings: [parameter.meaning(), None],
             });
         }
         Ok(restored)

@@ -17,17 +17,21 @@ use ecaxis_tools::cells;
 use ecaxis_tools::document::format::{hex32, times};
 use ecaxis_tools::document::{Document, Table};
 
+mod as_json;
 mod axis;
 mod stop;
 
+use crate::access::device::selected;
 use crate::hints::{self, Failure};
 use crate::render::pdo_table::{process_data, startup};
-use crate::render::print;
+use crate::render::{note_of, print, print_json};
 
 const EXAMPLES: &str = "\
 Examples:
   ecaxis explain machine.toml
-  ecaxis explain machine.toml | less";
+  ecaxis explain machine.toml | less
+  ecaxis explain machine.toml x          one device, by name or position
+  ecaxis explain machine.toml 0 --json   as JSON";
 
 /// Show the configuration derived from a machine file and its ESI files: PDOs, start-up SDOs,
 /// clocks, frames
@@ -37,15 +41,30 @@ pub(crate) struct Args {
     /// Machine file
     #[arg(value_name = "FILE")]
     file: PathBuf,
+    /// Show only this device: its name, or its position
+    #[arg(value_name = "DEVICE")]
+    device: Option<String>,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let machine = config::load(&args.file).map_err(|e| hints::config(&args.file, &e))?;
-    print(&explain(&machine))
+    let only = args.device.as_ref();
+    let only = only.map(|name| selected(&machine, name)).transpose()?;
+    match args.json {
+        true => print_json(&as_json::machine(&machine, only)),
+        false => print(&explain(&machine, only)),
+    }
 }
 
-fn explain(machine: &Machine) -> Document {
+fn explain(machine: &Machine, only: Option<DeviceIndex>) -> Document {
     let mut out = Document::new(machine.path.display().to_string());
+    if let Some(index) = only {
+        device(machine, index, &mut out);
+        return out;
+    }
     bus(machine, &mut out);
     for index in machine.devices.indices() {
         device(machine, index, &mut out);
@@ -190,7 +209,8 @@ fn device(machine: &Machine, index: DeviceIndex, out: &mut Document) {
         out.line(format!("PDO assignment {assignment:?}"));
     }
     for note in &selection.notes {
-        out.item("note: ", note);
+        let (lead, note) = note_of(note);
+        out.item(lead, note);
     }
     let (axes, several) = (machine.axes_of(index), machine.axes_of(index).count() > 1);
     for (_, axis) in axes {

@@ -43,7 +43,7 @@ fn explain_fits_a_terminal_and_shows_assumptions() {
     let demo = std::fs::read_to_string(configs.join("demo.toml")).unwrap();
     let explained = |text: &str| {
         let machine = config::parse(&configs.join("demo.toml"), text).unwrap();
-        let out = explain(&machine).text(None);
+        let out = explain(&machine, None).text(None);
         out.replace(&configs.display().to_string(), "configs")
     };
     let text = explained(&demo);
@@ -91,7 +91,7 @@ fn explain_shows_stops_and_groups() {
     let configs = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
     let explained = |file: &str| {
         let machine = config::load(&configs.join(file)).unwrap();
-        let out = explain(&machine).text(None);
+        let out = explain(&machine, None).text(None);
         let (_, stop) = out.split_once("\nstop\n").unwrap();
         let (stop, _) = stop.split_once("\nprogram").unwrap();
         (out.contains("2 LRW"), stop.to_owned())

@@ -1,5 +1,6 @@
 //! Formats a device and its software.
 
+use ecaxis_ecat::vendor::VendorId;
 use ecaxis_tools::cells;
 use ecaxis_tools::document::format::{hex32, or_dash};
 use ecaxis_tools::document::{Document, Table};
@@ -72,7 +73,7 @@ pub(super) fn info(examined: &DeviceIdentity) -> Document {
     if examined.in_use {
         row("EEPROM", "left to the device, which is using it");
     } else {
-        row("vendor (EEPROM)", &hex32(identity.vendor));
+        row("vendor (EEPROM)", &VendorId(identity.vendor).to_string());
         row("product (EEPROM)", &hex32(identity.product));
         row("serial number (EEPROM)", &examined.sii.serial.to_string());
     }

@@ -32,6 +32,7 @@ use ecaxis_master::supervise::operator::{
 use ecaxis_master::sys::rights::drop_capabilities;
 
 use crate::access::{rights, signals};
+use crate::args::LogArgs;
 use crate::args::bus::BusArgs;
 use crate::args::files::{Inputs, check_output};
 use crate::args::report::ReportArgs;
@@ -106,6 +107,8 @@ pub(crate) struct Args {
     /// Overwrite existing output files
     #[arg(long)]
     force: bool,
+    #[command(flatten)]
+    pub log: LogArgs,
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {

@@ -8,7 +8,7 @@ use ecaxis_tools::scan::{self, EsiMatch, MainDeviceEvidence, Scan, esi_match};
 
 use crate::access::bus::{self, Bus};
 use crate::hints::{self, Failure};
-use crate::render::{note, print_json, print_page, result};
+use crate::render::{note, print_json, print_page, shown};
 
 mod report;
 mod text;
@@ -94,7 +94,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if args.json {
         print_json(&report::json(&seen))
     } else if args.tree {
-        result(&text::tree(&seen))
+        shown(&text::tree(&seen))
     } else {
         print_page(&text::document(&seen))
     }

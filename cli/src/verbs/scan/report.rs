@@ -47,6 +47,7 @@ fn device(device: &Device, described: Option<&EsiMatch>) -> Value {
         "al_status_code": found.code,
         "al_status": ecaxis_ecat::al_status_code::al_status_text(found.code),
         "vendor": sii.map(|s| s.identity.vendor),
+        "vendor_name": sii.and_then(|s| super::text::vendor(described, s.identity.vendor)),
         "product": sii.map(|s| s.identity.product),
         "revision": sii.map(|s| s.identity.revision),
         "serial": sii.map(|s| s.serial),

@@ -2,6 +2,7 @@
 
 use ecaxis_axis::VelocityUnit;
 use ecaxis_ecat::al_status_code::al_status_text;
+use ecaxis_ecat::vendor::vendor_name;
 use ecaxis_esi as esi;
 use ecaxis_master::acyclic::topology;
 use ecaxis_master::text::pluralize;
@@ -72,12 +73,21 @@ fn identity(device: &Device, esi: Option<&EsiMatch>) -> [String; 7] {
     cells![
         device.position(),
         type_name(device, esi),
-        hex(identity.map(|i| i.vendor)),
+        or_dash(identity.map(|i| match vendor(esi, i.vendor) {
+            Some(name) => format!("{} {name}", hex32(i.vendor)),
+            None => hex32(i.vendor),
+        })),
         hex(identity.map(|i| i.product)),
         hex(identity.map(|i| i.revision)),
         or_dash(device.serial().filter(|serial| *serial != 0)),
         format!("{}{error}", device.found.state),
     ]
+}
+
+/// Returns the name of a vendor: from its ESI file, else from the table.
+pub(super) fn vendor(esi: Option<&EsiMatch>, id: u32) -> Option<&str> {
+    let from_file = esi.filter(|esi| esi.path.is_some() && !esi.file.vendor.name.is_empty());
+    from_file.map_or_else(|| vendor_name(id), |esi| Some(&*esi.file.vendor.name))
 }
 
 fn place(device: &Device) -> [String; 9] {

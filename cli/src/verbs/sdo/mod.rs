@@ -17,7 +17,7 @@ use serde_json::{Value, json};
 use crate::access::device::{DeviceArgs, Target, address};
 use crate::args::Verbosity;
 use crate::hints::{self, Failure};
-use crate::render::{print_table, result};
+use crate::render::{print_table, shown};
 
 mod command;
 mod compare;
@@ -151,40 +151,47 @@ struct Line {
     data_type: String,
     /// The value as text, and in hexadecimal if it is a number; or the abort code.
     value: Result<(String, Option<String>), u32>,
+    /// The text of a word or code.
+    meaning: Option<String>,
+}
+
+/// Formats a value with its object in one line.
+fn line_text(line: &Line) -> String {
+    let name = match line.name.as_str() {
+        "" => String::new(),
+        name => format!(" {name}"),
+    };
+    let value = match &line.value {
+        Ok((value, Some(hex))) => format!("{value} ({hex})"),
+        Ok((value, None)) => value.clone(),
+        Err(code) => refusal(*code),
+    };
+    let meaning = line.meaning.as_ref();
+    let meaning = meaning.map_or(String::new(), |text| format!(": {text}"));
+    format!(
+        "{}{name} ({}) = {value}{meaning}",
+        address(line.at),
+        line.data_type
+    )
 }
 
 fn print_lines(all: &[Line]) -> Result<(), Failure> {
     if let [line] = all {
-        let Line {
-            at,
-            name,
-            data_type,
-            value,
-        } = line;
-        let name = match name.as_str() {
-            "" => String::new(),
-            name => format!(" {name}"),
-        };
-        let value = match value {
-            Ok((value, Some(hex))) => format!("{value} ({hex})"),
-            Ok((value, None)) => value.clone(),
-            Err(code) => refusal(*code),
-        };
-        return result(&format!("{}{name} ({data_type}) = {value}\n", address(*at)));
+        return shown(&(line_text(line) + "\n"));
     }
-    let mut table = Table::new("object|type|value|hex|name");
+    let any = all.iter().any(|line| line.meaning.is_some());
+    let mut table = match any {
+        true => Table::new("object|type|value|hex|name|meaning"),
+        false => Table::new("object|type|value|hex|name"),
+    };
     for line in all {
         let (value, hex) = match &line.value {
             Ok((value, hex)) => (value.clone(), hex.clone().unwrap_or_default()),
             Err(code) => (refusal(*code), String::new()),
         };
-        table.row(cells![
-            address(line.at),
-            line.data_type,
-            value,
-            hex,
-            line.name
-        ]);
+        let row = cells![address(line.at), line.data_type, value, hex, line.name];
+        let meaning = any.then(|| line.meaning.clone().unwrap_or_default());
+        table.line(row.into_iter().chain(meaning).collect());
     }
     print_table(&table)
 }
@@ -203,7 +210,12 @@ fn print_differences(sides: [&str; 2], all: &[Difference]) -> Result<(), Failure
     let [left, right] = sides;
     table.row(cells!["object", left, right, "name"]);
     for d in all {
-        let (left, right) = (or_dash(d.left.as_ref()), or_dash(d.right.as_ref()));
+        let side = |value: &Option<String>, meaning: &Option<String>| match (value, meaning) {
+            (Some(value), Some(meaning)) => format!("{value}: {meaning}"),
+            (value, _) => or_dash(value.as_ref()),
+        };
+        let [of_left, of_right] = &d.meanings;
+        let (left, right) = (side(&d.left, of_left), side(&d.right, of_right));
         table.row(cells![address(d.at), left, right, d.name]);
     }
     print_table(&table)
@@ -214,6 +226,7 @@ fn as_json(all: &[Difference]) -> Value {
         json!({
             "index": difference.at.index, "sub": difference.at.sub, "name": difference.name,
             "left": difference.left, "right": difference.right,
+            "left_text": difference.meanings[0], "right_text": difference.meanings[1],
         })
     });
     each.collect()

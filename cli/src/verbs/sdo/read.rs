@@ -1,12 +1,15 @@
 //! `ecaxis sdo read`.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use ecaxis_esi::Object;
+use ecaxis_master::config::duration;
 use ecaxis_master::mailbox::{CoeCause, NamedObject, SdoError, Subject, object_name};
 use ecaxis_master::text::pluralize;
 use ecaxis_tools::document::format::hex_bytes;
 use ecaxis_tools::parameters::lookup::ObjectQuery;
+use ecaxis_tools::parameters::meaning::meaning;
 use ecaxis_tools::parameters::{DataType, dictionary, name_of, type_of};
 use serde_json::json;
 
@@ -15,12 +18,16 @@ use crate::access::device::{Open, address};
 use crate::hints::{self, Failure};
 use crate::render::{note, print_json};
 
+mod watch;
+
 const EXAMPLES: &str = "\
 Examples:
   ecaxis sdo read machine.toml x Statusword
   ecaxis sdo read machine.toml x 0x6064 0x1018:01 --json
   ecaxis sdo read --nic enp3s0 --position 0 0x1018
-  ecaxis sdo read machine.toml x 0x2100 --to large.bin";
+  ecaxis sdo read machine.toml x 0x2100 --to large.bin
+  ecaxis sdo read machine.toml x Statusword --watch        each change
+  ecaxis sdo read machine.toml x 0x6064 --watch 500ms --json";
 
 /// Read objects by number (0x6064, 0x1018:01) or by name
 ///
@@ -39,6 +46,11 @@ pub(super) struct Args {
     /// Read each object in one transfer (complete access)
     #[arg(long)]
     complete: bool,
+    /// Read again and again, each PERIOD [default: 100ms], and print each value that changes, until
+    /// Ctrl-C
+    #[arg(long, value_name = "PERIOD", num_args = 0..=1, default_missing_value = "100ms",
+        value_parser = duration::parse, conflicts_with_all = ["complete", "to"])]
+    watch: Option<u64>,
     /// Write the bytes of one object to this file, which must not exist yet
     #[arg(long, value_name = "FILE", conflicts_with_all = ["complete", "json"])]
     to: Option<PathBuf>,
@@ -55,6 +67,16 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
     let data_type = data_type(args.data_type.as_deref())?;
     let (objects, ask, complete) = (objects.to_vec(), args.common.ask, args.complete);
     let to_file = args.to.is_some();
+    if let Some(period) = args.watch {
+        let (period, json) = (Duration::from_nanos(period), args.common.json);
+        return target.open("reading objects", async move |open: &mut Open<'_>| {
+            let mut parts = Vec::new();
+            for (wanted, object) in describe(open, ask, &objects).await? {
+                parts.extend(self::parts(wanted, object.as_ref()));
+            }
+            watch::watch(open, parts, data_type, period, json).await
+        });
+    }
     let read = target.open("reading objects", async move |open: &mut Open<'_>| {
         let mut out = Vec::new();
         let mut refused = Vec::new();
@@ -98,15 +120,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
     }
     let lines: Vec<Line> = read.into_iter().map(line).collect();
     if args.common.json {
-        let each = lines.iter().map(|line| {
-            json!({
-                "index": line.at.index, "sub": line.at.sub, "name": line.name, "type": line.data_type,
-                "value": line.value.as_ref().ok().map(|(value, _)| value),
-                "hex": line.value.as_ref().ok().and_then(|(_, hex)| hex.as_ref()),
-                "abort": line.value.as_ref().err(),
-            })
-        });
-        let all: serde_json::Value = each.collect();
+        let all: serde_json::Value = lines.iter().map(as_json).collect();
         print_json(&all)?;
     } else {
         print_lines(&lines)?;
@@ -136,9 +150,21 @@ fn misfit(given: DataType, values: &[Read]) -> Option<Failure> {
     })
 }
 
+fn as_json(line: &Line) -> serde_json::Value {
+    json!({
+        "index": line.at.index, "sub": line.at.sub, "name": line.name, "type": line.data_type,
+        "value": line.value.as_ref().ok().map(|(value, _)| value),
+        "hex": line.value.as_ref().ok().and_then(|(_, hex)| hex.as_ref()),
+        "text": line.meaning,
+        "abort": line.value.as_ref().err(),
+    })
+}
+
 type Read = (NamedObject, String, Option<DataType>, Result<Vec<u8>, u32>);
 
 fn line((at, name, data_type, value): Read) -> Line {
+    let bytes = value.as_deref().unwrap_or_default();
+    let meaning = meaning(at.index, at.sub, bytes);
     let data_type = data_type.unwrap_or(DataType::BYTES);
     Line {
         at,
@@ -148,6 +174,7 @@ fn line((at, name, data_type, value): Read) -> Line {
             known => known.to_string(),
         },
         value: value.map(|bytes| (data_type.show(&bytes), hex(data_type, &bytes))),
+        meaning,
     }
 }
 

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use ecaxis_master::file;
 use ecaxis_master::mailbox::MailboxTransport;
+use ecaxis_tools::parameters::meaning::meaning;
 use ecaxis_tools::parameters::{DataType, ValueError};
 use serde_json::json;
 
@@ -131,6 +132,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
             true => (format!("{} bytes", value.len()), None),
             false => (shown(&value), hex(data_type, &value)),
         }),
+        meaning: meaning(at.index, at.sub, &value),
     };
     print_lines(&[line])
 }

@@ -105,7 +105,8 @@ fn setup(
     }
     if let Some(selection) = selection {
         let notes = drive_limits::check(&setup, &sdos, &selection.of_axis(number), p);
-        selection.notes.extend(notes);
+        let warnings = notes.iter().map(|note| format!("warning: {note}"));
+        selection.notes.extend(warnings);
     }
     Some(setup)
 }

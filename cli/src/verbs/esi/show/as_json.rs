@@ -1,13 +1,12 @@
 //! The output of `show` as JSON.
 
 use ecaxis_esi::{
-    Device, EsiFile, Field, Mode, Pdo, SelectError, SelectOptions, Selection, SmLayout, StartupSdo,
-    offered_modes,
+    Device, EsiFile, Mode, Pdo, SelectError, SelectOptions, Selection, offered_modes,
 };
-use ecaxis_tools::document::format::hex_bytes;
 use serde_json::{Value, json};
 
 use super::{head, offers};
+use crate::render::selection::{configuration, field};
 
 /// Returns a summary of the devices in a file.
 pub(super) fn devices(file: &EsiFile) -> Value {
@@ -104,47 +103,5 @@ fn pdo(pdo: &Pdo) -> Value {
         "index": pdo.index, "name": pdo.name, "direction": format!("{:?}", pdo.direction).to_lowercase(),
         "sm": pdo.sm, "bits": pdo.bit_len(), "fixed": pdo.fixed, "mandatory": pdo.mandatory,
         "entries": entries.collect::<Vec<_>>(),
-    })
-}
-
-fn configuration(selection: &Selection, cycle_ns: u64) -> Value {
-    let layout = &selection.layout;
-    let sync_manager = |sm: &SmLayout| {
-        json!({
-            "sm": sm.sm, "address": sm.start_address, "bytes": sm.len, "control": sm.control_byte,
-        })
-    };
-    let clock = selection
-        .dc
-        .as_ref()
-        .map(|dc| json!({ "name": dc.name, "assign_activate": dc.assign_activate }));
-    json!({
-        "mode": selection.mode.map(Mode::name),
-        "modules": selection.modules.iter().map(|m| &*m.type_name).collect::<Vec<_>>(),
-        "cycle_ns": cycle_ns,
-        "clock": clock,
-        "output_sync_managers": layout.outputs.iter().map(sync_manager).collect::<Vec<_>>(),
-        "input_sync_managers": layout.inputs.iter().map(sync_manager).collect::<Vec<_>>(),
-        "outputs": layout.rx.iter().map(field).collect::<Vec<_>>(),
-        "inputs": layout.tx.iter().map(field).collect::<Vec<_>>(),
-        "output_bytes": layout.rx_bytes(),
-        "input_bytes": layout.tx_bytes(),
-        "startup": selection.startup.iter().map(sdo).collect::<Vec<_>>(),
-        "notes": selection.notes,
-    })
-}
-
-fn field(field: &Field) -> Value {
-    json!({
-        "pdo": field.pdo, "index": field.index, "sub": field.sub, "bit_offset": field.bit_offset,
-        "bits": field.bit_len, "type": field.data_type, "name": field.name,
-    })
-}
-
-fn sdo(sdo: &StartupSdo) -> Value {
-    json!({
-        "transition": sdo.transition, "index": sdo.index, "sub": sdo.sub,
-        "complete_access": sdo.complete_access, "data": hex_bytes(&*sdo.data, ""), "name": sdo.name,
-        "from": sdo.origin,
     })
 }
