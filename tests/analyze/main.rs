@@ -148,7 +148,7 @@ fn analyze_reports_bring_up_cycle_and_motion_of_an_own_run() {
         );
         assert_eq!(
             axis.plots.iter().map(|plot| plot.title).collect::<Vec<_>>(),
-            ["Position", "Velocity", "Torque"]
+            ["Position", "Following error", "Velocity", "Torque"]
         );
     }
     assert_eq!(report.axes.len(), 2);
@@ -176,8 +176,8 @@ fn analyze_reports_bring_up_cycle_and_motion_of_an_own_run() {
     let (charts, _) = assert_well_formed(&html);
     assert_eq!(
         charts,
-        2 * 4,
-        "state, position, velocity and torque of each"
+        2 * 5,
+        "state, position, following error, velocity and torque of each"
     );
 }
 

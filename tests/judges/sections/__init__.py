@@ -23,12 +23,13 @@ from .operation import operation
 from .page import page
 from .parameters import parameters
 from .recordings import judge, recordings
+from .reports import reports
 from .rights import rights
 from .ring import ring
 from .service import service
 from .viewers import viewers
 
-__all__ = ["Bench", "bringup", "eeproms", "ethercrab", "faults", "gateway", "mailbox", "monitoring", "oddities", "operation", "overlap", "page", "parameters", "recordings", "rights", "ring", "service", "viewers"]
+__all__ = ["Bench", "bringup", "eeproms", "ethercrab", "faults", "gateway", "mailbox", "monitoring", "oddities", "operation", "overlap", "page", "parameters", "recordings", "reports", "rights", "ring", "service", "viewers"]
 
 MAXON = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml"
 OWN = rig.ROOT / "configs/esi"

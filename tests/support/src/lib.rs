@@ -122,7 +122,7 @@ pub fn assert_well_formed(page: &str) -> (usize, usize) {
         match event {
             Event::Start(e) => {
                 open += 1;
-                charts += usize::from(e.name().as_ref() == "svg");
+                charts += usize::from(e.name().as_ref() == "figure");
                 e.attributes().for_each(|a| drop(a.expect("an attribute")));
             }
             Event::Empty(e) => paths += usize::from(e.name().as_ref() == "path"),

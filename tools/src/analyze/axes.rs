@@ -1,6 +1,6 @@
 //! CiA 402 axes in process data: the location of their objects, and their motion.
 
-use ecaxis_axis::{Mode, State, Statusword};
+use ecaxis_axis::{Controlword, Mode, State, Statusword};
 use ecaxis_esi::Layout;
 
 use super::events::EventKind;
@@ -112,12 +112,17 @@ pub struct Axis {
     /// The modes and their start times, from 0x6061, or from 0x6060 if 0x6061 is not mapped.
     pub modes: Vec<(u64, Mode)>,
     pub error: Option<u16>,
+    /// True if a Controlword enabled the operation.
+    pub commanded: bool,
+    /// Target and actual value. The target is that of a mode that uses it, in Operation enabled.
     pub position: (Curve, Curve),
     pub velocity: (Curve, Curve),
     pub torque: (Curve, Curve),
     /// The largest difference between target and actual position in counts, in CSP while Operation
     /// enabled.
     pub largest_error: Option<i64>,
+    /// The same difference with its sign.
+    pub following_error: Curve,
     shows_mode: bool,
 }
 
@@ -252,7 +257,7 @@ impl Axes {
             if place.signal == Signal::ActualPosition
                 && let Some(Some(target)) = targets.get(place.axis)
             {
-                axis.follows(*target, value.1);
+                axis.follows(passed.at, *target, value.1);
             }
         }
     }
@@ -274,12 +279,16 @@ impl Axis {
         let (raw, signed) = value;
         let number = signed as f64;
         match signal {
-            Signal::Controlword => {}
+            Signal::Controlword => {
+                let enable = Controlword::ENABLE_OPERATION | Controlword::SWITCH_ON;
+                self.commanded |= Controlword::from_bits_retain(raw as u16).contains(enable);
+            }
             Signal::Statusword => {
                 self.cycles += 1;
                 let state = State::from_statusword(Statusword::from_bits_retain(raw as u16));
                 if self.state != Some(state) {
                     self.state = Some(state);
+                    self.commanded |= state == State::OperationEnabled;
                     if self.states.len() < CHANGES {
                         self.states.push((at, state));
                         report(EventKind::Axis {
@@ -307,6 +316,8 @@ impl Axis {
                 }
                 self.error = Some(code);
             }
+            Signal::TargetPosition | Signal::TargetVelocity | Signal::TargetTorque
+                if !self.uses(signal) => {}
             Signal::TargetPosition => self.position.0.add(at, number),
             Signal::ActualPosition => self.position.1.add(at, number),
             Signal::TargetVelocity => self.velocity.0.add(at, number),
@@ -316,11 +327,23 @@ impl Axis {
         }
     }
 
-    fn follows(&mut self, target: i64, actual: i64) {
+    /// True if the axis follows this target now. Without a known mode, it may.
+    fn uses(&self, target: Signal) -> bool {
+        let mode = self.modes.last().map(|(_, mode)| *mode);
+        let used = mode.is_none_or(|mode| match target {
+            Signal::TargetPosition => matches!(mode, Mode::Csp | Mode::Pp),
+            Signal::TargetVelocity => matches!(mode, Mode::Csv | Mode::Pv),
+            _ => matches!(mode, Mode::Cst),
+        });
+        used && self.state == Some(State::OperationEnabled)
+    }
+
+    fn follows(&mut self, at: u64, target: i64, actual: i64) {
         let csp = self.modes.last().is_none_or(|(_, mode)| *mode == Mode::Csp);
         if csp && self.state == Some(State::OperationEnabled) {
-            let error = target.saturating_sub(actual).saturating_abs();
-            self.largest_error = self.largest_error.max(Some(error));
+            let error = target.saturating_sub(actual);
+            self.largest_error = self.largest_error.max(Some(error.saturating_abs()));
+            self.following_error.add(at, error as f64);
         }
     }
 }

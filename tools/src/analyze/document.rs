@@ -2,10 +2,12 @@
 
 use ecaxis_esi::address;
 
-use super::report::{AxisReport, CycleReport, DeviceReport, Line, Report, called, highest};
+use super::report::{
+    AxisReport, CycleReport, DeviceReport, FOLLOWING_ERROR, Line, Report, called, highest,
+};
 use crate::cells;
 use crate::document::format::{hex16, hex32, or_dash, time, utc};
-use crate::document::{Axis, Chart, Document, Series, Shape, Table};
+use crate::document::{Axis, Chart, Document, Format, Marker, Series, Shape, Table};
 
 /// The number of first and last events on a page.
 const EVENTS: (usize, usize) = (24, 12);
@@ -22,6 +24,11 @@ pub fn document(name: &str, report: &Report, advice: &[String], all: bool) -> Do
     if report.file.ethercat_frames == 0 {
         return out;
     }
+    match (&report.cause, report.trouble.first()) {
+        (Some(cause), _) => out.lead(format!("First fault: {cause}"), true),
+        (None, Some(trouble)) => out.lead(trouble.clone(), true),
+        (None, None) => out.lead("No fault stands out.", false),
+    }
     out.heading("What stands out");
     if report.trouble.is_empty() {
         out.line("nothing");
@@ -32,12 +39,12 @@ pub fn document(name: &str, report: &Report, advice: &[String], all: bool) -> Do
     for advice in advice {
         out.item("help: ", advice);
     }
+    axes(report, all, &mut out);
     devices(report, all, &mut out);
     events(report, all, &mut out);
     transfers(report, all, &mut out);
     cycle(report, all, &mut out);
     clocks(report, &mut out);
-    axes(report, all, &mut out);
     out
 }
 
@@ -56,8 +63,7 @@ fn head(name: &str, report: &Report) -> Document {
         counts += &format!(", {} under way at the end", file.open);
     }
     out.line(counts);
-    // Virtual time has no date.
-    if file.began_ns > 86_400_000_000_000 {
+    if dated(report) {
         out.line(format!(
             "recorded {} UTC",
             utc(file.began_ns / 1_000_000_000)
@@ -123,6 +129,9 @@ fn devices(report: &Report, all: bool, out: &mut Document) {
         }
     }
     out.table(table);
+    let vendors = report.devices.iter();
+    let vendors = vendors.filter_map(|device| device.vendor.zip(device.vendor_name));
+    out.vendors(vendors);
     out.section("Configured", configured);
     out.section("Mailbox messages, not decoded", mailboxes);
     if all {
@@ -312,28 +321,61 @@ fn axes(report: &Report, all: bool, out: &mut Document) {
             out.line(format!("{at:>11.6} s  {}: mode {mode}", axis.name));
         }
     }
+    let (commanded, others): (Vec<_>, Vec<_>) = report.axes.iter().partition(|a| a.commanded);
+    if !others.is_empty() {
+        let names: Vec<&str> = others.iter().map(|axis| axis.name.as_str()).collect();
+        out.item("never enabled, not plotted: ", names.join(", "));
+    }
     // All charts share the same time axis.
-    let begins = report.axes.iter().filter_map(|axis| axis.states.first());
+    let begins = commanded.iter().filter_map(|axis| axis.states.first());
     let begins = begins.map(|(at, _)| *at);
     let time = Axis {
-        low: begins.fold(report.file.seconds, f64::min),
-        high: report.file.seconds,
-        logarithmic: false,
-        label: |at, step| format!("{} s", Axis::number(at, step)),
+        format: Format::Seconds,
+        origin_ns: dated(report).then_some(report.file.began_ns),
+        ..Axis::of_numbers(
+            begins.fold(report.file.seconds, f64::min),
+            report.file.seconds,
+            "s",
+        )
     };
-    for axis in &report.axes {
-        charts(axis, time, out);
+    let markers = markers(report, &time);
+    for axis in commanded {
+        charts(axis, &time, &markers, out);
     }
 }
 
-fn charts(axis: &AxisReport, x: Axis, out: &mut Document) {
+/// True if the time of the recording is a date; virtual time has none.
+fn dated(report: &Report) -> bool {
+    report.file.began_ns > 86_400_000_000_000
+}
+
+/// The maximum number of events that are marked in a plot.
+const MARKERS: usize = 60;
+
+/// Returns the faults within the plots.
+fn markers(report: &Report, time: &Axis) -> Vec<Marker> {
+    let absences = report.absences.iter().map(|absence| Marker {
+        at: absence.at,
+        text: format!("{} of {} SubDevices vanished", absence.absent, absence.of),
+    });
+    let lines = report.story.iter().filter(|line| line.trouble);
+    let lines = lines.map(|line| Marker {
+        at: line.at,
+        text: format!("{}: {}", names(line, &report.devices), line.text),
+    });
+    let shown = |marker: &Marker| marker.at >= time.low && marker.at <= time.high;
+    absences.chain(lines).filter(shown).take(MARKERS).collect()
+}
+
+fn charts(axis: &AxisReport, x: &Axis, markers: &[Marker], out: &mut Document) {
     let mut bands = |what: &str, states: &[(f64, String)]| {
-        let (name, shape) = (String::new(), Shape::Bands(states.to_vec()));
+        let (name, shape) = (what.to_owned(), Shape::Bands(states.to_vec()));
         out.chart(Chart {
             title: format!("{}: {what}", axis.name),
-            x,
+            x: x.clone(),
             y: None,
             series: vec![Series { name, shape }],
+            markers: markers.to_vec(),
         });
     };
     bands("state", &axis.states);
@@ -349,19 +391,19 @@ fn charts(axis: &AxisReport, x: Axis, out: &mut Document) {
             name: name.to_owned(),
             shape: Shape::Curve(points.to_vec()),
         };
+        let actual = match plot.title {
+            FOLLOWING_ERROR => "set-point − actual value",
+            _ => "actual value",
+        };
         out.chart(Chart {
-            title: format!("{}: {} ({})", axis.name, plot.title, plot.unit),
-            x,
-            y: Some(Axis {
-                low: low - room,
-                high: high + room,
-                logarithmic: false,
-                label: Axis::number,
-            }),
+            title: format!("{}: {}", axis.name, plot.title.to_lowercase()),
+            x: x.clone(),
+            y: Some(Axis::of_numbers(low - room, high + room, &plot.unit)),
             series: vec![
                 series("set-point", &plot.target),
-                series("actual value", &plot.actual),
+                series(actual, &plot.actual),
             ],
+            markers: markers.to_vec(),
         });
     }
 }

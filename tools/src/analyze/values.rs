@@ -1,6 +1,7 @@
 //! Formats object values.
 
 use super::mailbox::Transfer;
+use crate::parameters::meaning::meaning;
 
 /// The maximum number of bytes shown of a value that is neither a number nor a text.
 const SHOWN: usize = 16;
@@ -19,10 +20,14 @@ pub fn value(transfer: &Transfer) -> String {
         let width = 2 * data.len();
         let bits = 8 * u32::try_from(data.len()).unwrap_or(8);
         let signed = (raw as i64) << (64 - bits) >> (64 - bits);
-        return match (raw, signed) {
+        let number = match (raw, signed) {
             (0..=9, _) => format!("{raw}"),
             (_, -1_000_000..0) if bits >= 16 => format!("{signed} (0x{raw:0width$x})"),
             _ => format!("{raw} (0x{raw:0width$x})"),
+        };
+        return match meaning(transfer.index, transfer.sub, data) {
+            Some(text) => format!("{number}: {text}"),
+            None => number,
         };
     }
     let bytes = data.iter().take(SHOWN).map(|byte| format!("{byte:02x}"));

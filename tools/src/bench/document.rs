@@ -1,11 +1,11 @@
 //! The report as a document.
 
-use ecaxis_master::config::duration::show as duration;
+use ecaxis_master::text::pluralize;
 
 use super::report::{LatencySummary, Measure, Report, Variant, losses};
 use crate::cells;
 use crate::document::format::{or_dash, time};
-use crate::document::{Axis, Chart, Document, Series, Shape, Table};
+use crate::document::{Axis, Chart, Document, Format, Series, Shape, Table};
 use crate::host::Fact;
 use crate::host::counters::CpuTimeDelta;
 
@@ -13,6 +13,8 @@ use crate::host::counters::CpuTimeDelta;
 #[must_use]
 pub fn document(report: &Report) -> Document {
     let mut out = Document::new("Timing of an EtherCAT cycle");
+    let (text, bad) = result(report);
+    out.lead(text, bad);
     out.section("Measured", facts(&report.settings));
     out.section("Computer", facts(&report.facts));
     for (title, explanation, get) in MEASURES {
@@ -34,6 +36,35 @@ pub fn document(report: &Report) -> Document {
         out.item("- ", finding);
     }
     out
+}
+
+/// Returns the main result of the first variant, and whether frames were lost or cycles overrun.
+fn result(report: &Report) -> (String, bool) {
+    let Some(first) = report.variants.first() else {
+        return ("Nothing was measured.".to_owned(), true);
+    };
+    let mut parts = vec![format!("{}: {} cycles", first.name, first.cycles)];
+    for (what, times) in [
+        ("wake-up at most {} late", &first.wake_up_lateness),
+        (
+            "input at most {} after the release",
+            &first.release_to_input,
+        ),
+    ] {
+        let times = times.as_ref();
+        parts.extend(times.map(|times| what.replace("{}", &time(times.max_ns))));
+    }
+    let counters = first.counters;
+    let bad = counters.is_some_and(|c| c.lost_frames + c.late_frames + c.overruns > 0);
+    parts.extend(counters.map(|c| {
+        format!(
+            "{} lost, {} late, {}",
+            pluralize(c.lost_frames as usize, "frame"),
+            c.late_frames,
+            pluralize(c.overruns as usize, "overrun")
+        )
+    }));
+    (parts.join(", "), bad)
 }
 
 fn facts(facts: &[Fact]) -> Table {
@@ -135,24 +166,23 @@ fn chart(title: &str, variants: &[Variant], get: Get) -> Chart {
     let decade = |exponent: f64| 10_f64.powf(exponent);
     let first = least.clamp(1.0, most).log10().floor();
     Chart {
-        title: format!("{title} (share of cycles; marks: p50, p99, p99.9)"),
+        title: format!("{title} (marks on the axis: p50, p99, p99.9)"),
         x: Axis {
-            low: decade(first),
-            high: decade(most.log10().ceil().max(first + 1.0)),
             logarithmic: true,
-            label: |nanos, _| duration(nanos.round() as u64),
+            format: Format::Duration,
+            ..Axis::of_numbers(
+                decade(first),
+                decade(most.log10().ceil().max(first + 1.0)),
+                "ns",
+            )
         },
         y: Some(Axis {
-            low: decade(rarest.log10().floor()),
-            high: 1.0,
             logarithmic: true,
-            label: |share, _| match -share.log10() {
-                d if d <= 0.0 => "all".to_owned(),
-                d if d <= 3.0 => format!("1 in {:.0}", 10_f64.powf(d)),
-                d => format!("1 in 10^{d:.0}"),
-            },
+            format: Format::Share,
+            ..Axis::of_numbers(decade(rarest.log10().floor()), 1.0, "")
         }),
         series,
+        markers: Vec::new(),
     }
 }
 

@@ -3,6 +3,7 @@
 
 use std::io;
 use std::sync::Arc;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use super::bus::{Bus, InProcess, Options};
 use super::fixture::{self, RigError, Setup};
@@ -14,6 +15,7 @@ use super::report::{LatencySummary, Report, Variant, ratios};
 use super::veth::VethPair;
 use super::wakeup::Cyclictest;
 use super::{caveats, machine};
+use crate::document::format::utc;
 use crate::host::Fact;
 use crate::host::counters::CpuCounters;
 use ecaxis_master::cancel::CancelToken;
@@ -101,6 +103,7 @@ pub fn run(
     watcher: &mut dyn BenchObserver,
     check_host: impl FnOnce() -> HostCheck,
 ) -> Result<Option<Report>, BenchError> {
+    let began = SystemTime::now().duration_since(UNIX_EPOCH).ok();
     let (_held, denied) = CpuWakeGuard::take(plan.awake.then_some(plan.cpu));
     for denied in denied {
         watcher.warning(&denied.to_string());
@@ -141,7 +144,7 @@ pub fn run(
         version: env!("CARGO_PKG_VERSION"),
         facts: host::facts(check.facts),
         findings: check.findings,
-        settings: settings(plan),
+        settings: settings(plan, began),
         ratios: ratios(&variants, plan.fixed_hold()),
         variants,
         remarks,
@@ -385,8 +388,9 @@ fn variant(plan: &Plan, kept: &VariantResult) -> Variant {
     }
 }
 
-fn settings(plan: &Plan) -> Vec<Fact> {
+fn settings(plan: &Plan, began: Option<Duration>) -> Vec<Fact> {
     let fact = |name, value: String| Fact { name, value };
+    let date = began.map(|began| format!("{} UTC", utc(began.as_secs())));
     let mut settings = vec![
         fact("on", plan.target_name()),
         fact(
@@ -404,6 +408,7 @@ fn settings(plan: &Plan) -> Vec<Fact> {
             format!("{} in CSP, in motion, 12 bytes each way", plan.axes),
         ));
     }
+    settings.extend(date.map(|date| fact("begun", date)));
     settings.push(fact("exchange", exchange_name(plan.exchange).to_owned()));
     if matches!(plan.target, Target::Veth) {
         settings.push(fact("link", plan.link.name().to_owned()));

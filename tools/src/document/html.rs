@@ -1,17 +1,17 @@
 //! Documents as one self-contained XHTML file with inline style and drawings.
 
-use super::{Block, Document, Table};
+use super::{Block, Document, Lead, Table};
 
 /// The maximum number of table rows; further ones are counted.
 const ROWS: usize = 500;
 
-const STYLE: &str = "body{font:15px/1.5 system-ui,sans-serif;max-width:900px;margin:2em auto;padding:0 1em;color:#1a1a1a}\
-h1{font-size:1.5em}h2{font-size:1.15em;margin-top:2em}p{margin:.3em 0}\
-table{border-collapse:collapse;width:100%;margin:.5em 0;font-variant-numeric:tabular-nums}\
-th,td{text-align:right;padding:.25em .6em;border-bottom:1px solid #ddd}th:first-child,td:first-child{text-align:left}\
-th{font-weight:600}svg{width:100%;height:auto;margin:.5em 0}svg text{font-size:11px;fill:#444}\
-.grid{stroke:#e5e5e5}.key{display:inline-block;width:.8em;height:.8em;margin:0 .4em 0 1em}.facts td{text-align:left}\
-.facts td:first-child{width:11em;color:#555}footer{margin-top:2em;color:#777;font-size:.9em}";
+const STYLE: &str = include_str!("report.css");
+const SCRIPT: &str = include_str!("report.js");
+/// The buttons above the page of a report with plots.
+const TOOLS: &str = "<div class=\"tools\"><button type=\"button\" data-act=\"closer\" title=\"zoom in\">+</button>\
+<button type=\"button\" data-act=\"farther\" title=\"zoom out\">−</button>\
+<button type=\"button\" data-act=\"whole\">Whole</button>\
+<span>Drag over a plot to zoom; double-click shows the whole. Keys: + − 0 ← →.</span></div>\n";
 
 impl Document {
     /// Returns the complete page.
@@ -23,6 +23,17 @@ impl Document {
              <meta name=\"viewport\" content=\"width=device-width\"/><title>{title}</title>\
              <style>{STYLE}</style></head><body>\n<h1>{title}</h1>\n"
         );
+        if let Some(Lead { text, bad }) = &self.lead {
+            let class = if *bad { "lead bad" } else { "lead" };
+            out += &format!("<p class=\"{class}\">{}</p>\n", escape(text));
+        }
+        let charts = self
+            .blocks
+            .iter()
+            .any(|block| matches!(block, Block::Chart(_)));
+        if charts {
+            out += TOOLS;
+        }
         for block in &self.blocks {
             out += &match block {
                 Block::Heading(text) => format!("<h2>{}</h2>\n", escape(text)),
@@ -39,16 +50,30 @@ impl Document {
             };
         }
         let version = env!("CARGO_PKG_VERSION");
-        out + &format!("<footer>ecaxis {version}</footer></body></html>\n")
+        out += &format!("<footer>ecaxis {version}</footer>");
+        if charts {
+            // The comments hide the section of XML from scripts, and the script from XML.
+            out += &format!("<script>//<![CDATA[\n{SCRIPT}//]]></script>");
+        }
+        out + "</body></html>\n"
     }
 }
 
 impl Table {
     fn html(&self) -> String {
+        // Numbers are aligned to the right, except in the first column.
+        let columns = self.rows.iter().map(Vec::len).max().unwrap_or(0);
+        let is_number = |n: usize| {
+            let cells = self.rows.iter().filter_map(|row| row.get(n));
+            n > 0 && !self.head.is_empty() && cells.clone().all(|cell| is_number(cell))
+        };
+        let numbers: Vec<bool> = (0..columns).map(is_number).collect();
         let row = |cells: &[String], tag: &str| {
-            let cells = cells.iter();
-            let cells = cells.map(|cell| format!("<{tag}>{}</{tag}>", escape(cell)));
-            format!("<tr>{}</tr>\n", cells.collect::<String>())
+            let cells = cells.iter().zip(&numbers).map(|(cell, number)| {
+                let class = if *number { " class=\"n\"" } else { "" };
+                format!("<{tag}{class}>{}</{tag}>", escape(cell.trim()))
+            });
+            format!("<tr>{}</tr>", cells.collect::<String>())
         };
         let (class, head) = match self.head.is_empty() {
             true => (" class=\"facts\"", String::new()),
@@ -60,8 +85,17 @@ impl Table {
             0 => String::new(),
             more => format!("<p>… and {more} more.</p>\n"),
         };
-        format!("<table{class}>{head}<tbody>{rows}</tbody></table>\n{more}")
+        format!(
+            "<div class=\"scroll\"><table{class}>{head}<tbody>{rows}</tbody></table></div>\n{more}"
+        )
     }
+}
+
+/// True for `12`, `-0.5 mm`, `+3 ppm`, `-` and nothing, but not for `0x1000`.
+fn is_number(cell: &str) -> bool {
+    let digits = cell.trim().trim_start_matches(['-', '+']);
+    let first = digits.chars().next();
+    first.is_none_or(|c| c.is_ascii_digit()) && !digits.starts_with("0x")
 }
 
 /// Escapes `&`, `<`, `>` and quotes, and removes characters that XML does not allow.

@@ -3,21 +3,32 @@
 //! A subsystem builds one [`Document`]; [`Document::text`] and [`Document::html`] render it.
 //!
 //! - `text`: aligned columns, wrapped to a width; without charts;
-//! - `html`: one self-contained XHTML file; `chart`: its charts as SVG;
+//! - `html`: one self-contained XHTML file; `chart`, `svg`: its charts; `report.css`, `report.js`;
 //! - [`mod@format`]: figures, times and options as text.
+
+use std::collections::BTreeMap;
 
 mod chart;
 pub mod format;
 mod html;
+mod svg;
 mod text;
 
-pub use chart::{Axis, Chart, Series, Shape};
+pub use chart::{Axis, Chart, Format, Marker, Series, Shape};
 
 /// A report.
 #[derive(Debug, Clone, Default)]
 pub struct Document {
     title: String,
+    lead: Option<Lead>,
     blocks: Vec<Block>,
+}
+
+/// The main result.
+#[derive(Debug, Clone)]
+struct Lead {
+    text: String,
+    bad: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -35,8 +46,15 @@ impl Document {
     pub fn new(title: impl Into<String>) -> Self {
         Self {
             title: title.into(),
+            lead: None,
             blocks: Vec::new(),
         }
+    }
+
+    /// Sets the main result, which a page shows first. `bad`: it is a fault.
+    pub fn lead(&mut self, text: impl Into<String>, bad: bool) {
+        let text = text.into();
+        self.lead = Some(Lead { text, bad });
     }
 
     /// Adds a heading, after an empty line.
@@ -72,6 +90,18 @@ impl Document {
         if !table.rows.is_empty() {
             self.heading(heading);
             self.table(table);
+        }
+    }
+
+    /// Adds a line with the names of vendor ids, each once.
+    pub fn vendors<'n>(&mut self, named: impl IntoIterator<Item = (u32, &'n str)>) {
+        let named: BTreeMap<u32, &str> = named.into_iter().collect();
+        let named = named
+            .iter()
+            .map(|(id, name)| format!("{} {name}", format::hex32(*id)));
+        let named: Vec<String> = named.collect();
+        if !named.is_empty() {
+            self.item("vendors: ", named.join(", "));
         }
     }
 

@@ -54,7 +54,13 @@ pub(super) fn document(seen: &ScanResult) -> Document {
         }
     }
     out.gap();
-    for table in [identities, places, descriptions, answers] {
+    out.table(identities);
+    out.vendors(seen.devices().filter_map(|(device, esi)| {
+        let id = device.identity()?.vendor;
+        Some((id, vendor(esi, id)?))
+    }));
+    out.gap();
+    for table in [places, descriptions, answers] {
         out.table(table);
     }
     if !drives.is_empty() {
@@ -73,10 +79,7 @@ fn identity(device: &Device, esi: Option<&EsiMatch>) -> [String; 7] {
     cells![
         device.position(),
         type_name(device, esi),
-        or_dash(identity.map(|i| match vendor(esi, i.vendor) {
-            Some(name) => format!("{} {name}", hex32(i.vendor)),
-            None => hex32(i.vendor),
-        })),
+        hex(identity.map(|i| i.vendor)),
         hex(identity.map(|i| i.product)),
         hex(identity.map(|i| i.revision)),
         or_dash(device.serial().filter(|serial| *serial != 0)),

@@ -13,6 +13,7 @@ use crate::analyze::segment::{Device, RecordedSegment};
 use crate::analyze::values::value;
 use crate::analyze::{Context, PacketCounts};
 use ecaxis_ecat::registers;
+use ecaxis_ecat::vendor::vendor_name;
 use ecaxis_master::mailbox::object_name;
 use ecaxis_master::recording::frame::Encapsulation;
 
@@ -63,6 +64,7 @@ pub(in crate::analyze) fn report(
     );
     let mut report = Report {
         file: file(remarks, counted, &segment),
+        cause: None,
         trouble: Vec::new(),
         answering: segment.answering,
         absences: absences(&segment.events, &since),
@@ -77,6 +79,7 @@ pub(in crate::analyze) fn report(
         devices,
     };
     report.trouble = problems::of(&report);
+    report.cause = problems::cause(&report);
     report
 }
 
@@ -213,6 +216,7 @@ fn device_report<'e>(
             .or_else(|| eeprom.name())
             .or_else(|| device.objects.name()),
         vendor,
+        vendor_name: vendor.and_then(vendor_name),
         product,
         revision,
         serial: eeprom.serial().or(objects.3),

@@ -20,6 +20,8 @@ pub(super) use build::report;
 #[derive(Debug, Serialize)]
 pub struct Report {
     pub file: FileReport,
+    /// The first problem that has a time.
+    pub cause: Option<String>,
     /// The problems, worst first.
     pub trouble: Vec<String>,
     /// The maximum number of devices that answered a broadcast read.
@@ -39,6 +41,8 @@ pub struct Report {
     pub axes: Vec<AxisReport>,
 }
 
+/// The title of the plot of the following error.
+pub(super) const FOLLOWING_ERROR: &str = "Following error";
 /// The begin of the name of a port's counter.
 const LINKS_LOST: &str = "links lost at port ";
 
@@ -82,6 +86,7 @@ pub struct DeviceReport {
     /// The name from machine file, ESI, EEPROM or 0x1008, in this order.
     pub name: Option<String>,
     pub vendor: Option<u32>,
+    pub vendor_name: Option<&'static str>,
     pub product: Option<u32>,
     pub revision: Option<u32>,
     pub serial: Option<u32>,
@@ -214,6 +219,8 @@ pub struct AxisReport {
     pub device: usize,
     pub name: String,
     pub cycles: u64,
+    /// True if the operation was enabled. Other axes have no plots.
+    pub commanded: bool,
     /// The CiA 402 states and their start times.
     pub states: Vec<(f64, String)>,
     pub modes: Vec<(f64, String)>,

@@ -1,6 +1,6 @@
 //! The problems of a report, worst first.
 
-use super::{Absence, CycleReport, LINKS_LOST, Report, WkcRun, called};
+use super::{Absence, CycleReport, LINKS_LOST, Line, Report, WkcRun, called};
 use crate::document::format::time;
 use ecaxis_master::text::pluralize;
 
@@ -78,6 +78,53 @@ pub(super) fn of(report: &Report) -> Vec<String> {
     found
 }
 
+/// A code that is reported this long in s after a problem of a device explains it.
+const EXPLAINED: f64 = 0.1;
+
+/// Returns the first problem with a time: devices that vanish, a wrong working counter, or an
+/// event of a device with the code that explains it.
+pub(super) fn cause(report: &Report) -> Option<String> {
+    let absences = report.absences.iter().map(|absence| {
+        let (devices, of) = (usize::from(absence.absent), absence.of);
+        let text = format!("{} of {of} vanished", pluralize(devices, "SubDevice"));
+        (absence.at, text)
+    });
+    let counters = report.cycle.iter().filter_map(|cycle| {
+        let (name, address) = (cycle.command, cycle.logical_address);
+        let (count, at) = odd(cycle);
+        let text = format!("{name} 0x{address:08x}: another working counter than usual");
+        (count > 0).then_some((at, text))
+    });
+    let troubles: Vec<_> = report.story.iter().filter(|line| line.trouble).collect();
+    let events = troubles.iter().enumerate().map(|(n, line)| {
+        let later = troubles
+            .iter()
+            .skip(n)
+            .take_while(|next| next.at <= line.at + EXPLAINED);
+        let code = later.filter(|next| next.devices == line.devices && next.text.contains("0x"));
+        let mut text = format!("{}: {}", names(report, line), line.text);
+        if let Some(code) = code.map(|next| &next.text).find(|text| **text != line.text)
+            && !line.text.contains("0x")
+        {
+            text += &format!("; {code}");
+        }
+        (line.at, text)
+    });
+    let all = absences.chain(counters).chain(events);
+    let first = all.min_by(|a, b| a.0.total_cmp(&b.0));
+    first.map(|(at, text)| format!("{at:.6} s, {text}"))
+}
+
+fn names(report: &Report, line: &Line) -> String {
+    let names = line.devices.iter();
+    let names = names.filter_map(|n| Some(called(*n, report.devices.get(*n)?)));
+    let names: Vec<String> = names.take(LINES).collect();
+    match names.as_slice() {
+        [] => "bus".to_owned(),
+        names => names.join(", "),
+    }
+}
+
 /// Returns the number of cycles with an unusual working counter and the time of the first. Cycles
 /// before the first and after the last usual one are excluded: devices start up or shut down there.
 fn odd(cycle: &CycleReport) -> (u64, f64) {
@@ -129,17 +176,8 @@ fn absences(report: &Report, found: &mut Vec<String>) {
 fn story(report: &Report, found: &mut Vec<String>) {
     let troubles: Vec<_> = report.story.iter().filter(|line| line.trouble).collect();
     for line in troubles.iter().take(LINES) {
-        let names = line
-            .devices
-            .iter()
-            .filter_map(|n| Some(called(*n, report.devices.get(*n)?)));
-        let names: Vec<String> = names.take(LINES).collect();
-        found.push(format!(
-            "{:.6} s, {}: {}",
-            line.at,
-            names.join(", "),
-            line.text
-        ));
+        let names = names(report, line);
+        found.push(format!("{:.6} s, {names}: {}", line.at, line.text));
     }
     if let Some(more @ 1..) = troubles.len().checked_sub(LINES) {
         found.push(format!("{more} more such events"));

@@ -1,10 +1,12 @@
 //! The cyclic data of the report: working counters and intervals, clocks, axes.
 
+use ecaxis_axis::units::RawVelocity;
 use hdrhistogram::Histogram;
 
 use super::build::Since;
 use super::{
-    AxisReport, ClockReport, ClocksReport, CycleReport, DeviceReport, Plot, WkcRun, called,
+    AxisReport, ClockReport, ClocksReport, CycleReport, DeviceReport, FOLLOWING_ERROR, Plot,
+    WkcRun, called,
 };
 use crate::analyze::axes::Curve;
 use crate::analyze::clocks::{Clocks, Reference};
@@ -145,10 +147,22 @@ pub(super) fn axes(
                     actual: of(&pair.1),
                 }
             };
+            let distance =
+                |counts: f64| scale.map_or(counts, |scale| scale.units_of_counts(counts));
+            let velocity = |raw: f64| {
+                let velocity = RawVelocity(raw as i32);
+                scale.map_or(raw, |scale| scale.velocity_to_user(velocity).0)
+            };
+            let velocity_unit = match scale {
+                Some(_) => format!("{unit}/s"),
+                None => "drive units".to_owned(),
+            };
+            let error = (Curve::default(), axis.following_error.clone());
             let plots = [
                 plot("Position", &unit, &axis.position, &position),
-                plot("Velocity", "as on the wire", &axis.velocity, &raw),
-                plot("Torque", "per mille", &axis.torque, &raw),
+                plot(FOLLOWING_ERROR, &unit, &error, &distance),
+                plot("Velocity", &velocity_unit, &axis.velocity, &velocity),
+                plot("Torque", "‰ of rated torque", &axis.torque, &raw),
             ];
             let name = match axis.number {
                 0 => called(place, reported),
@@ -159,6 +173,7 @@ pub(super) fn axes(
                 device: place,
                 name,
                 cycles: axis.cycles,
+                commanded: axis.commanded,
                 states: axis
                     .states
                     .iter()
@@ -180,6 +195,7 @@ pub(super) fn axes(
                 plots: plots
                     .into_iter()
                     .filter(|plot| !plot.target.is_empty() || !plot.actual.is_empty())
+                    .filter(|_| axis.commanded)
                     .collect(),
             });
         }
