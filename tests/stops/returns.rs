@@ -1,9 +1,13 @@
 //! Devices that come back while the others stay in Op.
 
-use ecaxis_axis::State;
-use ecaxis_master::config::Machine;
-use ecaxis_master::session::Progress;
-use ecaxis_test_support::{Heard, faults, machine, run};
+use std::sync::{Arc, Mutex};
+
+use ecaxis_axis::{Command, State};
+use ecaxis_master::cancel::CancelToken;
+use ecaxis_master::config::{AxisRef, Machine};
+use ecaxis_master::rt::controller::{Controller, CycleContext};
+use ecaxis_master::session::{Options, Progress, run_with};
+use ecaxis_test_support::{Heard, faults, machine, run, virtual_time};
 
 /// Drives in a line, each in a group of its own that the others survive.
 fn line(count: usize, steps: &str) -> Machine {
@@ -81,4 +85,178 @@ fn lost_devices_return_and_move_by_command_only() {
             assert!(idle.contains(&axis.final_state), "{fault}: {axis:?}");
         }
     }
+}
+
+const DRIVES: usize = 16;
+/// The drives in front of those that come and go.
+const STEADY: usize = 8;
+
+/// What the cycles of a run have shown.
+#[derive(Debug, Default, Clone, PartialEq)]
+struct Seen {
+    /// For each cycle, what the steady drives receive, and how old their inputs are.
+    steady: Vec<u64>,
+    /// Drives that moved without power, or began at another target than their position.
+    wrong: Vec<String>,
+    /// Drives with power at the end.
+    ready: usize,
+}
+
+/// Moves the steady drives. Resets and enables the others whenever possible.
+struct Hall {
+    axes: Vec<AxisRef>,
+    cycles: usize,
+    /// For each drive that comes and goes, whether it was enabled in the last cycle.
+    enabled: Vec<bool>,
+    seen: Arc<Mutex<Seen>>,
+}
+
+impl Controller for Hall {
+    fn cycle(&mut self, machine: &mut CycleContext<'_>) {
+        let mut seen = self.seen.lock().expect("no panic while it is locked");
+        let ready = |machine: &CycleContext<'_>, axis: &AxisRef| machine.axis(*axis).ready;
+        let number = seen.steady.len();
+        if machine.stopping() || (number == 0 && !self.axes.iter().all(|a| ready(machine, a))) {
+            return;
+        }
+        let mut hash = 0xcbf2_9ce4_8422_2325_u64;
+        let mut add = |value: u64| hash = (hash ^ value).wrapping_mul(0x0000_0100_0000_01b3);
+        let at = number as f64 * 1e-3;
+        for (index, &axis) in self.axes.iter().enumerate() {
+            let status = machine.axis(axis);
+            if index < STEADY {
+                add(status.target_position.to_bits());
+                add(u64::from(status.controlword));
+                add(u64::from(status.stale_cycles));
+                let swing = 5.0 - 5.0 * (at * 0.5 * (index + 1) as f64).cos();
+                let _ = machine.set_point(axis, swing);
+                continue;
+            }
+            let enabled = std::mem::replace(&mut self.enabled[index - STEADY], status.enabled);
+            let off = (status.target_position - status.position).abs();
+            if status.enabled && !enabled && status.stale_cycles == 0 && off > 0.01 {
+                let text = format!("{number}: drive {index} begins {off} from its position");
+                seen.wrong.push(text);
+            }
+            if number % 100 != index {
+                continue;
+            }
+            if machine.stopped(axis).is_some() || status.fault.is_some() {
+                let _ = machine.command(axis, Command::ResetFault);
+            } else if !status.enabled {
+                let _ = machine.command(axis, Command::Enable);
+            } else if status.ready {
+                let to = if number % 1000 < 500 { 3.0 } else { -3.0 };
+                let _ = machine.command(
+                    axis,
+                    Command::MoveTo {
+                        position: to,
+                        speed: 0.2,
+                        ramp: 1.0,
+                    },
+                );
+            }
+        }
+        seen.steady.push(hash);
+        if number + 1 == self.cycles {
+            seen.ready = self.axes.iter().filter(|axis| ready(machine, axis)).count();
+            machine.finish();
+        }
+    }
+}
+
+fn hall(options: Options, seconds: usize) -> (Seen, Heard) {
+    let machine = line(DRIVES, "");
+    let axes = (0..DRIVES).map(|n| machine.axis(&format!("a{n}")).expect("an axis"));
+    let seen = Arc::<Mutex<Seen>>::default();
+    let controller = Hall {
+        axes: axes.collect(),
+        cycles: seconds * 1000,
+        enabled: vec![true; DRIVES - STEADY],
+        seen: Arc::clone(&seen),
+    };
+    let (mut heard, stop) = (Heard::default(), Arc::<CancelToken>::default());
+    let outcome = run_with(machine, options, stop, &mut heard, Box::new(controller));
+    let warnings = heard.warnings();
+    outcome
+        .result
+        .unwrap_or_else(|error| panic!("{error}; {warnings:?}"));
+    let seen = seen.lock().expect("no panic while it is locked").clone();
+    (seen, heard)
+}
+
+/// Losses of power, breaks, watchdogs and exchanged drives at random, each over before the next.
+fn script(seed: u64, seconds: usize) -> (String, usize) {
+    let mut state = seed | 1;
+    let mut random = |below: u64| {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        state % below
+    };
+    let (mut text, mut events, mut at) = (String::new(), 0, 3_000);
+    // The last one returns before the end.
+    while at + 9_000 < seconds as u64 * 1000 {
+        let device = STEADY as u64 + random((DRIVES - STEADY) as u64);
+        let outage = 20 + random(1500);
+        let keys = match random(4) {
+            0 => "kind = \"link-break\"\nport = 0".to_owned(),
+            1 => "kind = \"watchdog\"".to_owned(),
+            _ => "kind = \"power-off\"".to_owned(),
+        };
+        text += &format!(
+            "[[fault]]\n{keys}\ndevice = {device}\nat = \"{at}ms\"\nfor = \"{outage}ms\"\n"
+        );
+        events += 1;
+        at += outage + 3_000 + random(3_000);
+    }
+    (text, events)
+}
+
+/// The steady drives receive bit by bit what they receive in an undisturbed run.
+/// `ECAXIS_MACHINE_SECONDS` sets the machine time.
+#[test]
+fn drives_come_and_go_without_any_effect_on_the_others() {
+    let total = std::env::var("ECAXIS_MACHINE_SECONDS").ok();
+    let total = total.and_then(|seconds| seconds.parse().ok()).unwrap_or(60);
+    let seconds = total.min(600);
+    let calm = hall(virtual_time(), seconds).0;
+    assert_eq!((calm.steady.len(), calm.ready), (seconds * 1000, DRIVES));
+    let (mut events, mut returns, mut late) = (0, 0, 0);
+    for seed in 1..=(total / seconds) as u64 {
+        let (text, count) = script(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15), seconds);
+        let (seen, heard) = hall(
+            Options {
+                seed,
+                ..faults(&text)
+            },
+            seconds,
+        );
+        let first = seen
+            .steady
+            .iter()
+            .zip(&calm.steady)
+            .position(|(a, b)| a != b);
+        assert_eq!(first, None, "seed {seed}: {text}");
+        assert_eq!(seen.wrong, Vec::<String>::new(), "seed {seed}");
+        assert_eq!(seen.ready, DRIVES, "seed {seed}: {:?}", heard.warnings());
+        for (name, after, _) in returned(&heard) {
+            // Outages last 1.52 s at most; a second one may follow during the return.
+            assert!(
+                after < 9_000_000_000,
+                "seed {seed}: {name} after {after} ns: {:?}",
+                heard.warnings()
+            );
+            late += usize::from(after > 4_520_000_000);
+            returns += 1;
+        }
+        events += count;
+        let time = seed * seconds as u64;
+        println!("{time} s of machine time: {events} faults, {returns} returns, {late} late");
+    }
+    assert!(returns >= events / 2, "{returns} of {events}");
+    assert!(
+        late <= returns / 100,
+        "{late} of {returns} later than 3 s after their link"
+    );
 }

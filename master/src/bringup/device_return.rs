@@ -8,6 +8,7 @@ use std::time::Duration;
 use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_ecat::registers;
 use ecaxis_esi::select::DcSettings;
+use tokio::sync::Mutex;
 
 use super::clocks::{self, START_DELAY};
 use super::device::{self, StartupPhase, read, write};
@@ -41,6 +42,8 @@ pub(crate) struct RunningBus<'a> {
     /// The reference clock; `None` without distributed clocks, and if this device is the reference.
     pub reference: Option<&'a DeviceRef>,
     pub sync: Option<RunningSync<'a>>,
+    /// Held while the receive times of all devices belong to one frame.
+    pub latch: &'a Mutex<()>,
 }
 
 /// Takes a device from any state to SafeOp. It has its station address, its delay (0x0928) is
@@ -67,6 +70,7 @@ pub(crate) async fn bring_back(
     let before = device.coe.as_ref().map(|coe| *coe.layout());
     mailbox::restore(wire, config, &device.at, before.as_ref()).await?;
     if let (true, Some(reference)) = (device.dc, bus.reference) {
+        let _held = bus.latch.lock().await;
         join_clock(wire, &device.at, reference).await?;
     }
     let region = image.regions.get(index).copied().flatten();

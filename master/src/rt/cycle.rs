@@ -291,6 +291,9 @@ impl Engine {
             );
         }
         self.exchange.poll_al_status_only(each);
+        let groups = &self.groups;
+        self.exchange
+            .publish_presence(|group| groups.get(group).is_some_and(stopped));
         for group in self.groups.indices() {
             if let Some(cause) = self.guard.lost(group) {
                 self.stop(Some(group), cause);

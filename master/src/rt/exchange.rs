@@ -18,6 +18,7 @@ use std::sync::Arc;
 
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 
+use super::bus_monitor::OP;
 pub use super::config::ExchangeMode;
 use super::image::plan::frames as frames_of;
 use super::image::{Access, BitCopy, ImagePlan};
@@ -212,6 +213,15 @@ impl Exchange {
     /// often.
     pub fn poll_al_status_only(&mut self, only: bool) {
         self.schedule.al_status_only = only;
+    }
+
+    /// Publishes which members are in Op, for the other threads. RT: O(members).
+    pub fn publish_presence(&self, stopped: impl Fn(GroupIndex) -> bool) {
+        for ((member, found), group) in self.diagnoses.enumerate().zip(&self.groups) {
+            let in_op = found.answers && found.al_status == OP;
+            self.bus_status.set_presence(member, in_op, stopped(*group));
+        }
+        self.bus_status.set_reference(self.reference());
     }
 
     /// Returns the results of the diagnostic slot, in the order of the members.

@@ -121,7 +121,8 @@ impl RunBuilder<'_> {
                     Exchange::new(&bus.image, bus.dc.as_ref(), &members, config.exchange);
                 preset_outputs(machine, &bus, &mut exchange);
                 exchange.stage();
-                log.set_bus_status(exchange.bus_status());
+                let bus_status = exchange.bus_status();
+                log.set_bus_status(Arc::clone(&bus_status));
                 let (mailboxes, workers) =
                     mailbox_workers(&mut bus, wire, &exchange, machine.bus.cycle_ns, &log);
                 let _ = progress.send(Progress::Topology(bus.places()));
@@ -171,6 +172,7 @@ impl RunBuilder<'_> {
                     stopped: Vec::new(),
                     last_status: clock::now(),
                     witnessed: None,
+                    bus_status,
                     clock_tree: None,
                     returns: None,
                 };

@@ -3,11 +3,12 @@
 //! gone, and their clocks would run ahead by its round-trip delay.
 
 use std::future::Future;
+use std::sync::Arc;
 use std::time::Duration;
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
-use tokio::sync::watch;
+use tokio::sync::{Mutex, watch};
 
 use super::Supervisor;
 use crate::acyclic::delays::{self, MeasuredDevice};
@@ -38,7 +39,10 @@ pub(crate) struct ClockTree {
 impl Supervisor {
     /// Returns a task that measures the delays whenever [`ClockTree`] changes. It ends when
     /// [`Supervisor::clock_tree`] is dropped.
-    pub(super) fn keep_delays(&mut self) -> impl Future<Output = ()> + use<> {
+    pub(super) fn keep_delays(
+        &mut self,
+        latch: Arc<Mutex<()>>,
+    ) -> impl Future<Output = ()> + use<> {
         let devices = self.bus.devices.iter();
         let tree = ClockTree {
             open: devices.map(|device| open_ports(device.dl_status)).collect(),
@@ -53,7 +57,7 @@ impl Supervisor {
         let wire = self.wire;
         async move {
             if let Some(changes) = changes {
-                follow(&wire, &clocks, changes).await;
+                follow(&wire, &clocks, &latch, changes).await;
             }
         }
     }
@@ -90,7 +94,12 @@ pub(super) fn clocks(devices: &IndexVec<DeviceIndex, BusDevice>) -> Clocks {
 }
 
 /// Measures the delays after each change, until the sender is dropped.
-async fn follow(wire: &DatagramClient, clocks: &Clocks, mut changes: watch::Receiver<ClockTree>) {
+async fn follow(
+    wire: &DatagramClient,
+    clocks: &Clocks,
+    latch: &Mutex<()>,
+    mut changes: watch::Receiver<ClockTree>,
+) {
     while changes.changed().await.is_ok() {
         clock::delay(SETTLING_TIME).await;
         if changes.has_changed().unwrap_or(true) {
@@ -100,7 +109,7 @@ async fn follow(wire: &DatagramClient, clocks: &Clocks, mut changes: watch::Rece
         let reference = reference.and_then(|device| clocks.get(device)).copied();
         let still_valid = || !changes.has_changed().unwrap_or(true);
         if let Some((reference, _)) = reference
-            && let Err(error) = update(wire, clocks, reference, still_valid).await
+            && let Err(error) = update(wire, clocks, reference, latch, still_valid).await
         {
             // The next change starts another measurement.
             tracing::info!("{error}");
@@ -113,6 +122,7 @@ pub(super) async fn update(
     wire: &DatagramClient,
     clocks: &Clocks,
     reference: u16,
+    latch: &Mutex<()>,
     still_valid: impl Fn() -> bool,
 ) -> Result<(), Error> {
     let mut stations = Vec::new();
@@ -129,7 +139,10 @@ pub(super) async fn update(
             receive_times: delays::has_receive_times(word(registers::FEATURES).await?),
         });
     }
-    let measured = delays::measure(wire, &devices).await?;
+    let measured = {
+        let _held = latch.lock().await;
+        delays::measure(wire, &devices).await?
+    };
     let measured = || stations.iter().copied().zip(&measured);
     let find = |wanted| measured().find(|(station, _)| *station == wanted);
     let Some((_, Some(first))) = find(reference) else {

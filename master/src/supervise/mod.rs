@@ -13,7 +13,7 @@ use std::time::Duration;
 use ecaxis_axis::{Command, CommandError};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
-use tokio::sync::watch;
+use tokio::sync::{Mutex, watch};
 
 use crate::acyclic::{AlState, DeviceRef, Transition, al};
 use crate::bringup::{Bus, BusDevice, enable_op_only};
@@ -29,7 +29,7 @@ use crate::report::events::{clock_off, reference_replaced};
 use crate::report::{Cause, EmergencyLog, Error, GroupStop, ProbeCapture, Progress, Status};
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::{COMMANDS_PER_CYCLE, Event, HostEndpoint, RtCommand, Snapshot};
-use crate::rt::exchange::{DiagnosticRegister, SubDeviceDiagnostics};
+use crate::rt::exchange::{BusStatus, DiagnosticRegister, SubDeviceDiagnostics};
 use clock_tree::ClockTree;
 use groups::StoppedGroup;
 use returns::ReturnPort;
@@ -98,6 +98,8 @@ pub struct Supervisor {
     pub witnessed: Option<Witnessed>,
     /// What the delays depend on, for the task that measures them again.
     pub(crate) clock_tree: Option<watch::Sender<ClockTree>>,
+    /// What the cycle shows to other threads.
+    pub bus_status: Arc<BusStatus>,
     /// The end of the task that brings devices back.
     pub(crate) returns: Option<ReturnPort>,
 }
@@ -124,10 +126,11 @@ impl Supervisor {
     pub async fn run(mut self) -> (ProgramOutcome, Result<(), Error>) {
         let workers = std::mem::take(&mut self.workers);
         let heartbeat = self.outer.heartbeat.clone();
+        let latch = Arc::<Mutex<()>>::default();
         // The futures are large, and nothing needs them on the stack.
         let (delays, returns) = (
-            Box::pin(self.keep_delays()),
-            Box::pin(self.return_devices()),
+            Box::pin(self.keep_delays(Arc::clone(&latch))),
+            Box::pin(self.return_devices(latch)),
         );
         let work = async {
             let aside = async {
@@ -399,7 +402,7 @@ impl Supervisor {
         self.pass_events_on();
         self.report_limits(&snapshot);
         self.follow_clock_tree(&snapshot);
-        self.attend_returns(&snapshot).await;
+        self.attend_returns().await;
         if clock::now().saturating_sub(self.last_status) >= STATUS_PERIOD {
             self.last_status = clock::now();
             self.report(Progress::Status(Status::new(&self.machine, &snapshot)));

@@ -5,28 +5,31 @@
 //! station address is asked by it. A device without one is found behind the neighbour and the port at
 //! which it was, and must have the identity of the machine file.
 
+use std::convert::Infallible;
 use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
-use tokio::sync::{mpsc, oneshot, watch};
+use ecaxis_esi::Identity;
+use tokio::sync::{Mutex, mpsc};
 
 use super::Supervisor;
 use super::clock_tree;
-use crate::acyclic::device::read_sii;
-use crate::acyclic::eeprom::EepromAccess;
+use crate::acyclic::eeprom::{EepromAccess, with_eeprom};
 use crate::acyclic::topology::parents;
 use crate::acyclic::{AlState, DeviceRef, al, enumerate};
 use crate::bringup::device_return::{RunningBus, RunningSync, bring_back, reset};
 use crate::bringup::{BusDevice, Step, enable_op_only};
 use crate::clock::{self, Nanos};
+use crate::concurrent::try_join_all;
 use crate::config::{Locator, Machine};
 use crate::datagram::DatagramClient;
 use crate::mailbox::{MailboxTransport, Mailboxes};
 use crate::report::{Cause, DevicePlace, Error, Progress};
-use crate::rt::channel::{RtCommand, Snapshot};
+use crate::rt::channel::RtCommand;
+use crate::rt::exchange::BusStatus;
 use crate::rt::image::ImagePlan;
 
 const STEP: &str = "looking for devices that return";
@@ -37,33 +40,18 @@ const RETRY: Nanos = 1_000_000_000;
 /// The station address of a device until its identity is known. Devices of the machine have 0x1000
 /// and above.
 const TEMPORARY_STATION: u16 = 0x0fff;
-/// Cycles until a command has taken effect and the answers show it.
-const CYCLES_TO_SETTLE: u64 = 5;
 
-/// What the cycle shows.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct Presence {
-    /// True for devices of stopped groups that do not answer or are not in Op.
-    lost: IndexVec<DeviceIndex, bool>,
-    reference: Option<DeviceIndex>,
-}
-
-/// A command for the cycle, with an answer once it is on its way.
-type Order = (RtCommand, oneshot::Sender<()>);
-
-/// The supervisor's end.
-#[derive(Debug)]
-pub(crate) struct ReturnPort {
-    presence: watch::Sender<Presence>,
-    orders: mpsc::Receiver<Order>,
-}
+/// The supervisor's end: commands for the cycle. The task ends when it is dropped.
+pub(crate) type ReturnPort = mpsc::UnboundedReceiver<RtCommand>;
 
 impl Supervisor {
     /// Returns the task. It ends when [`Supervisor::returns`] is dropped.
-    pub(super) fn return_devices(&mut self) -> impl Future<Output = ()> + use<> {
-        let (presence, seen) = watch::channel(Presence::default());
-        let (order, orders) = mpsc::channel(1);
-        self.returns = Some(ReturnPort { presence, orders });
+    pub(super) fn return_devices(
+        &mut self,
+        latch: Arc<Mutex<()>>,
+    ) -> impl Future<Output = ()> + use<> {
+        let (orders, port) = mpsc::unbounded_channel();
+        self.returns = Some(port);
         let devices = self.bus.devices.iter();
         let task = Returner {
             wire: self.wire,
@@ -72,53 +60,25 @@ impl Supervisor {
             devices: devices.map(BusDevice::without_mailbox).collect(),
             places: self.bus.places(),
             mailboxes: self.mailboxes.clone(),
-            presence: seen.clone(),
-            order,
+            bus_status: Arc::clone(&self.bus_status),
+            orders: orders.clone(),
             progress: self.progress.clone(),
             searches: vec![Search::default(); self.bus.devices.len()].into(),
+            latch,
         };
-        let mut ended = seen;
         async move {
             tokio::select! {
                 biased;
-                () = async { while ended.changed().await.is_ok() {} } => {}
-                () = task.run() => {}
+                () = orders.closed() => {}
+                never = task.run() => match never {},
             }
         }
     }
 
-    /// Passes on what the cycle shows, and takes the task's commands.
-    pub(super) async fn attend_returns(&mut self, snapshot: &Snapshot) {
-        let groups = &self.bus.image.groups;
-        let lost = |(device, group)| {
-            let stopped = snapshot
-                .groups
-                .get(group)
-                .is_some_and(|g| g.stopped.is_some());
-            let op = AlState::Op.code();
-            let found = snapshot.diagnoses.get(device);
-            stopped && found.is_some_and(|found| !found.answers || found.al_status != op)
-        };
-        let Some(port) = &mut self.returns else {
-            return;
-        };
-        let now = Presence {
-            lost: groups.enumerate().map(|(d, g)| lost((d, *g))).collect(),
-            reference: snapshot.phase.and_then(|phase| phase.reference),
-        };
-        port.presence.send_if_modified(|last| {
-            let changed = *last != now;
-            *last = now;
-            changed
-        });
-        while let Some((command, sent)) = self
-            .returns
-            .as_mut()
-            .and_then(|port| port.orders.try_recv().ok())
-        {
+    /// Passes the task's commands to the cycle.
+    pub(super) async fn attend_returns(&mut self) {
+        while let Some(command) = self.returns.as_mut().and_then(|port| port.try_recv().ok()) {
             self.send(command).await;
-            // The task may have ended.
-            let _ = sent.send(());
         }
     }
 }
@@ -141,15 +101,17 @@ struct Returner {
     devices: IndexVec<DeviceIndex, BusDevice>,
     places: IndexVec<DeviceIndex, DevicePlace>,
     mailboxes: Mailboxes,
-    presence: watch::Receiver<Presence>,
-    order: mpsc::Sender<Order>,
+    bus_status: Arc<BusStatus>,
+    orders: mpsc::UnboundedSender<RtCommand>,
     progress: std::sync::mpsc::Sender<Progress>,
     searches: IndexVec<DeviceIndex, Search>,
+    latch: Arc<Mutex<()>>,
 }
 
 impl Returner {
-    async fn run(mut self) {
+    async fn run(mut self) -> Infallible {
         loop {
+            clock::delay(PERIOD).await;
             let lost = self.lost();
             for (device, search) in self.searches.enumerate_mut() {
                 if !lost.contains(&device) {
@@ -158,72 +120,102 @@ impl Returner {
                     search.since = Some(clock::now());
                 }
             }
-            if lost.is_empty() {
-                if self.presence.changed().await.is_err() {
-                    return;
-                }
-                continue;
-            }
-            clock::delay(PERIOD).await;
-            if let Err(error) = self.search(&lost).await {
+            if !lost.is_empty()
+                && let Err(error) = self.search(&lost).await
+            {
                 tracing::debug!("{error}");
             }
         }
     }
 
     /// Returns the lost devices in the order of the segment.
-    fn lost(&mut self) -> Vec<DeviceIndex> {
-        let presence = self.presence.borrow_and_update();
-        let lost = presence.lost.enumerate().filter(|(_, lost)| **lost);
-        let mut lost: Vec<_> = lost.map(|(device, _)| device).collect();
+    fn lost(&self) -> Vec<DeviceIndex> {
+        let mut lost: Vec<_> = self.bus_status.lost().collect();
         lost.sort_by_key(|device| self.places.get(*device).map(|place| place.position));
         lost
     }
 
-    /// Searches all lost devices once and brings back those that are there.
+    /// Searches all lost devices once and brings back those that are there, at the same time.
     async fn search(&mut self, lost: &[DeviceIndex]) -> Result<(), Error> {
+        let mut there = Vec::new();
         let mut without_address = Vec::new();
-        for &device in lost {
+        let due = |search: &Search| clock::now() >= search.not_before;
+        for &device in lost.iter().filter(|d| due(&self.searches[**d])) {
             let station = self.devices[device].at.station;
             let status = al::read_status(&self.wire, station).await;
             match status.map_err(failed)? {
                 // The last diagnosis is older.
                 Some((status, _)) if status == AlState::Op.code() => {}
-                Some(_) => self.attempt(device, false).await,
+                Some(_) => there.push((device, false)),
                 None => without_address.push(device),
             }
         }
-        if without_address.is_empty() {
-            return Ok(());
-        }
-        for (device, position) in self.find(&without_address).await? {
-            if clock::now() < self.searches[device].not_before {
-                continue;
+        if !without_address.is_empty() {
+            let found = self.find(&without_address, lost.len()).await?;
+            // Some have been connected since they were asked: the next search asks them again.
+            if found.iter().any(|(_, position)| position.is_none()) {
+                return Ok(());
             }
-            match self.identify(device, position).await {
-                Ok(()) => self.attempt(device, true).await,
+            for (device, position) in found.into_iter().filter_map(|(d, at)| Some((d, at?))) {
+                match self.identify(device, position).await {
+                    Ok(()) => there.push((device, true)),
+                    Err(error) => {
+                        // The next one gets the temporary address.
+                        let register = registers::STATION_ADDRESS;
+                        let _ = self.wire.write(TEMPORARY_STATION, register, &[0, 0]).await;
+                        self.refuse(device, &error);
+                    }
+                }
+            }
+        }
+        let reference = self.bus_status.reference();
+        let reference = reference.and_then(|reference| self.devices.get(reference));
+        if let (Some(reference), false) = (reference, there.is_empty()) {
+            let clocks = clock_tree::clocks(&self.devices);
+            let station = reference.at.station;
+            clock_tree::update(&self.wire, &clocks, station, &self.latch, || true).await?;
+        }
+        let attempts = there.into_iter().map(|(device, restarted)| {
+            let attempt = Box::pin(self.attempt(device, restarted));
+            async move { Ok::<_, Infallible>((device, attempt.await)) }
+        });
+        let Ok(ended) = try_join_all(attempts).await;
+        for (device, done) in ended {
+            match done {
+                // The next diagnosis shows it in Op.
+                Ok(()) => {
+                    self.searches[device] = Search {
+                        not_before: clock::now() + RETRY,
+                        ..Search::default()
+                    };
+                }
                 Err(error) => self.refuse(device, &error),
             }
         }
         Ok(())
     }
 
-    /// Returns the positions of devices without a known address that are at the place of a lost one.
-    async fn find(&self, lost: &[DeviceIndex]) -> Result<Vec<(DeviceIndex, u16)>, Error> {
+    /// Returns the lost devices that are there: those without a known address by the place of a lost
+    /// one, with their position, and those that have been connected since they were asked.
+    async fn find(
+        &self,
+        lost: &[DeviceIndex],
+        all_lost: usize,
+    ) -> Result<Vec<(DeviceIndex, Option<u16>)>, Error> {
         let count = enumerate::count(&self.wire).await?;
-        let present = self.devices.len().saturating_sub(lost.len());
+        let present = self.devices.len().saturating_sub(all_lost);
         if usize::from(count) <= present {
             return Ok(Vec::new());
         }
-        let (mut stations, mut status) = (Vec::new(), Vec::new());
-        for position in 0..count {
-            let word = async |register| {
+        let words = async |register| {
+            let word = async |position| {
                 let bytes = enumerate::at(&self.wire, position, STEP, register).await?;
                 Ok::<_, Error>(u16::from_le_bytes(bytes))
             };
-            stations.push(word(registers::STATION_ADDRESS).await?);
-            status.push(word(registers::DL_STATUS).await?);
-        }
+            try_join_all((0..count).map(word)).await
+        };
+        let stations = words(registers::STATION_ADDRESS).await?;
+        let status = words(registers::DL_STATUS).await?;
         let mut here: Vec<Option<DeviceIndex>> = Vec::new();
         let mut found = Vec::new();
         for ((position, station), parent) in (0..).zip(stations).zip(parents(status)) {
@@ -244,8 +236,8 @@ impl Returner {
                 None => lost.iter().find(at_place).copied(),
             };
             here.push(device);
-            if let (None, Some(device)) = (known, device) {
-                found.push((device, position));
+            if let Some(device) = device.filter(|device| lost.contains(device)) {
+                found.push((device, known.is_none().then_some(position)));
             }
         }
         Ok(found)
@@ -266,30 +258,43 @@ impl Returner {
             .wire
             .write_at(position, registers::STATION_ADDRESS, &address);
         written.await.map_err(failed)?;
-        let sii = read_sii(&self.wire, &temporary, EepromAccess::Force).await?;
+        // The station alias is word 4; vendor, product, revision and serial number begin at word 8.
+        let mut words = [0; 24];
+        let access = EepromAccess::Force;
+        with_eeprom(&self.wire, &temporary, STEP, access, async |eeprom| {
+            eeprom.read(4, &mut words).await
+        })
+        .await?;
+        let word =
+            |at: usize| u32::from_le_bytes(*words[2 * at - 8..].first_chunk().unwrap_or(&[0; 4]));
+        let identity = Identity {
+            vendor: word(8),
+            product: word(10),
+            revision: word(12),
+        };
+        let (serial, alias) = (word(14), u16::from_le_bytes([words[0], words[1]]));
         let expected = config.selection.identity;
-        let same =
-            (expected.vendor, expected.product) == (sii.identity.vendor, sii.identity.product);
+        let same = (expected.vendor, expected.product) == (identity.vendor, identity.product);
         if !same
             || !config
                 .identity
-                .accepts(expected.revision, sii.identity.revision)
+                .accepts(expected.revision, identity.revision)
         {
             return Err(Cause::Identity {
                 esi: config.esi_path.display().to_string(),
                 expected: format!("{} ({expected})", config.selection.device_name),
-                found: sii.identity.to_string(),
-                revisions: same.then_some((expected.revision, sii.identity.revision)),
+                found: identity.to_string(),
+                revisions: same.then_some((expected.revision, identity.revision)),
             }
             .with_device(&temporary));
         }
-        if let Some(expected) = config.serial.filter(|expected| *expected != sii.serial) {
-            let found = sii.serial;
+        if let Some(expected) = config.serial.filter(|expected| *expected != serial) {
+            let found = serial;
             return Err(Cause::Serial { expected, found }.with_device(&temporary));
         }
         let located = match config.at {
             Locator::Position(_) => true,
-            Locator::Alias(alias) => sii.alias == alias,
+            Locator::Alias(wanted) => alias == wanted,
             Locator::Id(id) => {
                 let timeout = al::IDENTIFICATION_TIMEOUT;
                 al::read_explicit_id(&self.wire, TEMPORARY_STATION, timeout).await == Ok(Some(id))
@@ -299,13 +304,13 @@ impl Returner {
             let locator = config.at.to_string();
             return Err(Cause::NotLocated { locator }.with_device(&temporary));
         }
-        if sii.serial != device.serial && config.serial.is_none() {
+        if serial != device.serial && config.serial.is_none() {
             let warning = format!(
                 "{}: the device has the serial number {}, before it was {}: it is another one of the same kind. \
                  Parameters and home are its own",
-                device.at, sii.serial, device.serial
+                device.at, serial, device.serial
             );
-            device.serial = sii.serial;
+            device.serial = serial;
             let _ = self.progress.send(Progress::Warning(warning));
         }
         let station = own.to_le_bytes();
@@ -315,40 +320,29 @@ impl Returner {
     }
 
     /// Brings a device back that answers at its station address. `restarted`: it had no power.
-    async fn attempt(&mut self, index: DeviceIndex, restarted: bool) {
-        if clock::now() < self.searches[index].not_before {
-            return;
-        }
+    async fn attempt(&self, index: DeviceIndex, restarted: bool) -> Result<(), Error> {
         let done = self.bring_to_op(index).await;
         if done.is_err() {
             self.leave_in_init(index).await;
-        } else if restarted {
-            self.command(RtCommand::Restarted { device: index }).await;
+            return done;
         }
-        match done {
-            Ok(()) => {
-                let since = self.searches[index].since.unwrap_or_else(clock::now);
-                let _ = self.progress.send(Progress::DeviceReturned {
-                    device: self.devices[index].at.clone(),
-                    after_ns: clock::now().saturating_sub(since),
-                    restarted,
-                });
-                // The next diagnosis shows it in Op.
-                self.searches[index].not_before = clock::now() + RETRY;
-            }
-            Err(error) => self.refuse(index, &error),
+        if restarted {
+            let _ = self.orders.send(RtCommand::Restarted { device: index });
         }
+        let since = self.searches[index].since.unwrap_or_else(clock::now);
+        let _ = self.progress.send(Progress::DeviceReturned {
+            device: self.devices[index].at.clone(),
+            after_ns: clock::now().saturating_sub(since),
+            restarted,
+        });
+        Ok(())
     }
 
-    async fn bring_to_op(&mut self, index: DeviceIndex) -> Result<(), Error> {
-        let reference = self.presence.borrow().reference.filter(|r| *r != index);
+    async fn bring_to_op(&self, index: DeviceIndex) -> Result<(), Error> {
+        let reference = self.bus_status.reference().filter(|r| *r != index);
         let reference = reference
             .and_then(|r| self.devices.get(r))
             .map(|d| d.at.clone());
-        if let Some(reference) = &reference {
-            let clocks = clock_tree::clocks(&self.devices);
-            clock_tree::update(&self.wire, &clocks, reference.station, || true).await?;
-        }
         let loan = self.mailboxes.borrow(index).await;
         let mut device = self.devices[index].without_mailbox();
         let (coe, give_back) = loan.unzip();
@@ -365,6 +359,7 @@ impl Returner {
             image: &self.image,
             reference: reference.as_ref(),
             sync: self.running_sync(index),
+            latch: &self.latch,
         };
         let returned = bring_back(bus, index, &mut device, &report).await;
         if let (Some(coe), Some(give_back)) = (device.coe.take(), give_back) {
@@ -378,13 +373,13 @@ impl Returner {
 
     /// Returns a device in Op with SYNC0; one with the same cycle if there is one.
     fn running_sync(&self, returns: DeviceIndex) -> Option<RunningSync<'_>> {
-        let presence = self.presence.borrow();
+        let lost = self.lost();
         let cycle = |device: DeviceIndex| {
             let dc = self.machine.devices.get(device)?.selection.dc.as_ref()?;
             Some((dc, dc.sync0_cycle_ns))
         };
         let own = cycle(returns).map(|(_, cycle)| cycle);
-        let runs = |device: &DeviceIndex| presence.lost.get(*device) == Some(&false);
+        let runs = |device: &DeviceIndex| !lost.contains(device);
         let others = self
             .devices
             .enumerate()
@@ -419,16 +414,6 @@ impl Returner {
             let _ = self.progress.send(Progress::Warning(text.clone()));
             search.warned = Some(text);
         }
-    }
-
-    /// Sends a command to the cycle and waits until it has taken effect.
-    async fn command(&self, command: RtCommand) {
-        let (sent, taken) = oneshot::channel();
-        if self.order.send((command, sent)).await.is_ok() {
-            let _ = taken.await;
-        }
-        let cycles = CYCLES_TO_SETTLE * self.machine.bus.cycle_ns;
-        clock::delay(Duration::from_nanos(cycles)).await;
     }
 }
 

@@ -1,7 +1,7 @@
 //! The status of mailboxes and the bus time as the cycle sees them, for other threads. Atomics keep
 //! the cost of reading them away from the cycle.
 
-use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicI64, AtomicU8, AtomicU64, AtomicUsize, Ordering};
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 
@@ -28,7 +28,16 @@ pub struct BusStatus {
     mailboxes: IndexVec<DeviceIndex, AtomicU64>,
     /// System time minus session clock.
     clock: AtomicI64,
+    /// For each member: [`STOPPED`] and [`OUT_OF_OP`].
+    presence: IndexVec<DeviceIndex, AtomicU8>,
+    /// The member that is the reference clock; `usize::MAX`: none.
+    reference: AtomicUsize,
 }
+
+/// The member belongs to a stopped group.
+const STOPPED: u8 = 1;
+/// The member did not answer its last read, or was not in Op.
+const OUT_OF_OP: u8 = 2;
 
 impl BusStatus {
     /// The fill byte of every diagnostic read. No SyncManager has this status, so it marks data
@@ -41,6 +50,8 @@ impl BusStatus {
         Self {
             mailboxes: (0..members).map(|_| AtomicU64::new(0)).collect(),
             clock: AtomicI64::new(NO_CLOCK),
+            presence: (0..members).map(|_| AtomicU8::new(0)).collect(),
+            reference: AtomicUsize::new(usize::MAX),
         }
     }
 
@@ -59,6 +70,34 @@ impl BusStatus {
     pub(super) fn set_clock(&self, at: Nanos, system_time: u64) {
         let offset = system_time.wrapping_sub(at) as i64;
         self.clock.store(offset, Ordering::Relaxed);
+    }
+
+    /// Stores whether a member is in Op and whether its group has stopped. RT: O(1).
+    pub(super) fn set_presence(&self, member: DeviceIndex, in_op: bool, stopped: bool) {
+        if let Some(seen) = self.presence.get(member) {
+            let bits = u8::from(stopped) * STOPPED | u8::from(!in_op) * OUT_OF_OP;
+            seen.store(bits, Ordering::Relaxed);
+        }
+    }
+
+    /// Stores the reference clock. RT: O(1).
+    pub(super) fn set_reference(&self, member: Option<DeviceIndex>) {
+        let index = member.map_or(usize::MAX, |member| member.0);
+        self.reference.store(index, Ordering::Relaxed);
+    }
+
+    /// Returns the members of stopped groups that do not answer or are not in Op.
+    pub fn lost(&self) -> impl Iterator<Item = DeviceIndex> + '_ {
+        let lost = |seen: &AtomicU8| seen.load(Ordering::Relaxed) == STOPPED | OUT_OF_OP;
+        let members = self.presence.enumerate();
+        members.filter_map(move |(member, seen)| lost(seen).then_some(member))
+    }
+
+    /// Returns the member that is the reference clock.
+    #[must_use]
+    pub fn reference(&self) -> Option<DeviceIndex> {
+        let index = self.reference.load(Ordering::Relaxed);
+        (index != usize::MAX).then_some(DeviceIndex(index))
     }
 
     /// Returns the last status of a member's mailbox.
@@ -118,5 +157,18 @@ mod tests {
         assert_eq!(bus_status.system_time(1_250), Some(700_000_250));
         bus_status.set_clock(9_000, 1_000);
         assert_eq!(bus_status.system_time(9_100), Some(1_100));
+    }
+
+    #[test]
+    fn lost_members_are_out_of_op_in_a_stopped_group() {
+        let bus_status = BusStatus::new(4);
+        for (member, in_op, stopped) in [(0, true, false), (1, true, true), (2, false, false)] {
+            bus_status.set_presence(DeviceIndex(member), in_op, stopped);
+        }
+        bus_status.set_presence(DeviceIndex(3), false, true);
+        assert_eq!(bus_status.lost().collect::<Vec<_>>(), [DeviceIndex(3)]);
+        assert_eq!(bus_status.reference(), None);
+        bus_status.set_reference(Some(DeviceIndex(2)));
+        assert_eq!(bus_status.reference(), Some(DeviceIndex(2)));
     }
 }
