@@ -1,5 +1,7 @@
 //! Stops of machines, groups and axes for every cause, in virtual time.
 
+#![allow(clippy::print_stdout, reason = "what was measured")]
+
 mod brake;
 mod bus_faults;
 mod causes;

@@ -18,7 +18,6 @@ use std::sync::Arc;
 
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 
-use super::bus_monitor::OP;
 pub use super::config::ExchangeMode;
 use super::image::plan::frames as frames_of;
 use super::image::{Access, BitCopy, ImagePlan};
@@ -209,8 +208,7 @@ impl Exchange {
         self.op_expected = expected;
     }
 
-    /// Sets whether the diagnostic slot reads AL status only, so that it visits each device more
-    /// often.
+    /// Sets whether the diagnostic slot reads AL status only: it then visits each device sooner.
     pub fn poll_al_status_only(&mut self, only: bool) {
         self.schedule.al_status_only = only;
     }
@@ -218,8 +216,8 @@ impl Exchange {
     /// Publishes which members are in Op, for the other threads. RT: O(members).
     pub fn publish_presence(&self, stopped: impl Fn(GroupIndex) -> bool) {
         for ((member, found), group) in self.diagnoses.enumerate().zip(&self.groups) {
-            let in_op = found.answers && found.al_status == OP;
-            self.bus_status.set_presence(member, in_op, stopped(*group));
+            self.bus_status
+                .set_presence(member, found.is_in_op(), stopped(*group));
         }
         self.bus_status.set_reference(self.reference());
     }

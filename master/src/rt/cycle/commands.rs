@@ -5,8 +5,9 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex};
 
 use super::Engine;
 use crate::rt::axis::RtAxis;
-use crate::rt::bus_monitor::{OP, StopCause};
+use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::{COMMANDS_PER_CYCLE, Event, RtCommand};
+use crate::rt::exchange::SubDeviceDiagnostics;
 use crate::rt::flight_recorder::Trigger;
 use crate::rt::reaction_group::{ActiveStop, ReactionGroup, check_permitted};
 use crate::rt::setpoint_generator::{self, GeneratorRequest};
@@ -222,7 +223,7 @@ impl Engine {
                 && self.guard.lost(index).is_none();
             let op = |device: &DeviceIndex| {
                 let found = self.exchange.diagnoses().get(*device);
-                found.is_some_and(|found| found.answers && found.al_status == OP)
+                found.is_some_and(SubDeviceDiagnostics::is_in_op)
             };
             let there = there && self.guard.devices_of(index).all(|device| op(&device));
             let idle = |slot: &RtAxis| {

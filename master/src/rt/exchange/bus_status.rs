@@ -75,7 +75,7 @@ impl BusStatus {
     /// Stores whether a member is in Op and whether its group has stopped. RT: O(1).
     pub(super) fn set_presence(&self, member: DeviceIndex, in_op: bool, stopped: bool) {
         if let Some(seen) = self.presence.get(member) {
-            let bits = u8::from(stopped) * STOPPED | u8::from(!in_op) * OUT_OF_OP;
+            let bits = (u8::from(stopped) * STOPPED) | (u8::from(!in_op) * OUT_OF_OP);
             seen.store(bits, Ordering::Relaxed);
         }
     }

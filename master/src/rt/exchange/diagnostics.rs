@@ -1,5 +1,6 @@
 //! The registers that the diagnostic slot reads, one register block of one SubDevice at a time.
 
+use ecaxis_ecat::al_state::AlState;
 use ecaxis_ecat::registers;
 use serde::Serialize;
 
@@ -188,6 +189,12 @@ impl Window {
 }
 
 impl SubDeviceDiagnostics {
+    /// Returns true if the device answers and was in Op.
+    #[must_use]
+    pub fn is_in_op(&self) -> bool {
+        self.answers && self.al_status == AlState::Op.code()
+    }
+
     /// Returns the increments of the error counters since the cycle began.
     #[must_use]
     pub fn grown(&self) -> ErrorCounters {
