@@ -86,7 +86,7 @@ fn a_velocity_unit_that_differs_from_the_drive_is_rejected() {
 
 #[test]
 fn a_written_velocity_unit_applies_to_the_drive_but_not_to_accelerations() {
-    let sdo = "mode = \"csp\"\nsdo = [{ index = 0x60A9, value = 0xFDB44700 }]";
+    let sdo = "mode = \"csp\"\nsdo = [{ index = 0x60A9, value = 0xFDB44700 }, { index = 0x607F, value = 50000000 }]";
     let text = format!("{HEAD}{AXIS}{MOVE}").replace("mode = \"csp\"", sdo);
     assert_eq!(messages(machine(&text)), (vec![], vec![]));
 }
