@@ -11,6 +11,10 @@ use ecaxis_test_support::{Heard, faults, machine, run, virtual_time};
 
 /// Drives in a line, each in a group of its own that the others survive.
 fn line(count: usize, steps: &str) -> Machine {
+    machine(&line_text(count, steps))
+}
+
+fn line_text(count: usize, steps: &str) -> String {
     let mut text = String::from("[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n");
     for position in 0..count {
         let limits = "limits = { position = [-100.0, 100.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 1.0 }";
@@ -20,7 +24,7 @@ fn line(count: usize, steps: &str) -> Machine {
              \n[[stop.group]]\nname = \"g{position}\"\naxes = [\"a{position}\"]\noutside = \"continue\"\n",
         );
     }
-    machine(&(text + steps))
+    text + steps
 }
 
 /// Returns name, time in ns and whether it had no power, of each device that returned.
@@ -85,6 +89,50 @@ fn lost_devices_return_and_move_by_command_only() {
             assert!(idle.contains(&axis.final_state), "{fault}: {axis:?}");
         }
     }
+}
+
+/// Another device at the place of a lost one: of another kind it is never driven, of the same kind it
+/// is taken with a warning, unless the file gives the serial number.
+#[test]
+fn exchanged_device_is_driven_only_if_it_is_of_the_same_kind() {
+    let exchange = |keys: &str, rest: &str| {
+        format!("[[fault]]\nkind = \"swap\"\ndevice = 2\nat = \"1.5s\"\n{keys}\n{rest}")
+    };
+    let warned = |heard: &Heard, text: &str| heard.warnings().iter().any(|w| w.contains(text));
+
+    // The old device is back after a second.
+    let other = exchange("product = 0x77", "for = \"1s\"\n");
+    let (outcome, heard) = run(line(3, STEPS), faults(&other));
+    outcome.result.expect("the old device returns");
+    assert!(
+        warned(&heard, "`a2` does not return"),
+        "{:?}",
+        heard.warnings()
+    );
+    assert_eq!(returned(&heard).len(), 1);
+
+    let other = exchange("product = 0x77", "");
+    let (outcome, heard) = run(line(3, STEPS), faults(&other));
+    assert!(outcome.result.is_err(), "a2 is never enabled again");
+    assert_eq!(returned(&heard), []);
+    assert!(warned(&heard, "the device is"), "{:?}", heard.warnings());
+
+    let same = exchange("serial = 4711", "");
+    let (outcome, heard) = run(line(3, STEPS), faults(&same));
+    outcome.result.expect("it is taken");
+    assert!(
+        warned(&heard, "serial number 4711"),
+        "{:?}",
+        heard.warnings()
+    );
+    assert_eq!(returned(&heard).len(), 1);
+
+    // The file names the serial number, which the simulated device then has.
+    let text = line_text(3, STEPS).replace("position = 2\n", "position = 2\nserial = 17\n");
+    let (outcome, heard) = run(machine(&text), faults(&same));
+    assert!(outcome.result.is_err(), "a2 is never enabled again");
+    assert_eq!(returned(&heard), []);
+    assert!(warned(&heard, "4711"), "{:?}", heard.warnings());
 }
 
 const DRIVES: usize = 16;
