@@ -349,6 +349,23 @@ fn skipped_cycles_allocate_nothing() {
     assert_eq!(counted, 0);
 }
 
+/// A device loses its power and returns, while another one moves.
+#[test]
+fn the_return_of_a_device_allocates_nothing_in_the_cycle() {
+    let bus = axes(2);
+    let (devices, _) = bus.split_once("\n[[step]]").expect("steps");
+    let text = format!(
+        "{devices}\n[[stop.group]]\nname = \"g\"\naxes = [\"a1\"]\noutside = \"continue\"\n\
+         [[step]]\nenable = true\n[[step]]\nmove = {{ a0 = 80.0 }}\n[[step]]\nmove = {{ a0 = 0.0 }}\n\
+         [[step]]\nreset = [\"a1\"]\n[[step]]\nenable = [\"a1\"]\n[[step]]\nmove = {{ a1 = 1.0 }}\n"
+    );
+    let off = "[[fault]]\nkind = \"power-off\"\ndevice = 1\nat = \"1s\"\nfor = \"500ms\"\n";
+    let (counted, remains, result) = metered(machine(&text), &faults(off), None, 20_000);
+    assert!(matches!(result, Some(Ok(()))), "{result:?}");
+    assert!(remains.stats.counters.wkc_errors > 500);
+    assert_eq!(counted, 0);
+}
+
 /// Stops of the machine do not allocate either: an emergency, a lost gear, a lost bus, and a group.
 #[test]
 fn stopping_allocates_nothing() {
