@@ -124,10 +124,11 @@ impl BusMonitor {
             judges_each: false,
             al_cycles: match count {
                 1 => AL_CYCLES,
-                // Each device is asked once, one per cycle; answers take two cycles at most.
+                // Each device is asked once, one every other cycle; answers take two cycles. With more
+                // devices than the longest search allows, the machine may stop before.
                 _ => {
                     let devices = u32::try_from(groups.len()).unwrap_or(u32::MAX);
-                    AL_CYCLES + devices.saturating_add(2).min(MAX_SEARCH)
+                    AL_CYCLES + devices.saturating_mul(2).saturating_add(2).min(MAX_SEARCH)
                 }
             },
         }
@@ -349,9 +350,9 @@ mod tests {
             ((OP, 1), [GOOD, BAD, BAD], [None, None, None], None),
             ((OP, 3), [GOOD, BAD, GOOD], [None, None, None], None),
         ] {
-            let mut guard = BusMonitor::new(10, &[0, 1, 2].map(GroupIndex));
-            // Three devices are asked in three cycles.
-            for _ in 0..AL_CYCLES + 5 {
+            let mut guard = BusMonitor::new(20, &[0, 1, 2].map(GroupIndex));
+            // Three devices are asked in six cycles.
+            for _ in 0..AL_CYCLES + 8 {
                 guard.update(&answer(Some(al)), &results, &[], false);
             }
             let found = [0, 1, 2].map(|group| guard.lost(GroupIndex(group)));
@@ -364,7 +365,7 @@ mod tests {
     #[test]
     fn devices_are_judged_one_by_one_if_some_may_be_outside_op() {
         for (any_stopped, answering) in [(true, 3), (false, 4)] {
-            let mut guard = BusMonitor::new(10, &[0, 1, 2].map(GroupIndex));
+            let mut guard = BusMonitor::new(20, &[0, 1, 2].map(GroupIndex));
             let lost = |guard: &BusMonitor| [0, 1, 2].map(|group| guard.lost(GroupIndex(group)));
             let stopped = |group| any_stopped && group == GroupIndex(1);
             let own = if any_stopped { 2 } else { OP };
@@ -380,7 +381,7 @@ mod tests {
             guard.update_each(stopped, [Some(0x14), Some(own), Some(OP)].into_iter());
             let left = Some(StopCause::LeftOp { al_status: 0x14 });
             assert_eq!((lost(&guard), guard.left_op()), ([left, None, None], None));
-            for _ in 0..AL_CYCLES + 5 {
+            for _ in 0..AL_CYCLES + 8 {
                 guard.update(&answer(Some((0x0a, 3))), &[GOOD; 3], &[], false);
             }
             assert!(guard.left_op().is_some(), "all should be in Op again");

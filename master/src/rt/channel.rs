@@ -45,10 +45,6 @@ pub enum RtCommand {
     /// Stops the bus monitor: the segment is about to leave Op, so wrong working counters are
     /// expected.
     StopBusMonitor,
-    /// The device has restarted: its axes have no home any more.
-    Restarted {
-        device: DeviceIndex,
-    },
     /// Brings every axis of the machine to rest within its limits, then disables it.
     Stop,
     /// Reports a drive's error code that was read outside the cycle.

@@ -277,8 +277,10 @@ impl Engine {
             self.exchange.group_results(),
             self.exchange.device_answers(),
         );
-        let stopped = |group: &ReactionGroup| group.stop().is_some();
-        let any_stopped = self.stopping().is_none() && self.groups.iter().any(stopped);
+        // A requested stop excuses no device.
+        let stopped =
+            |group: &ReactionGroup| group.stop().is_some_and(|stop| stop.cause.is_failure());
+        let any_stopped = self.groups.iter().any(stopped);
         self.guard
             .update(&self.answer, groups, devices, any_stopped);
         let each = self.guard.judges_each();
@@ -294,6 +296,9 @@ impl Engine {
         let groups = &self.groups;
         self.exchange
             .publish_presence(|group| groups.get(group).is_some_and(stopped));
+        if any_stopped {
+            self.forget_homes();
+        }
         for group in self.groups.indices() {
             if let Some(cause) = self.guard.lost(group) {
                 self.stop(Some(group), cause);
@@ -301,6 +306,17 @@ impl Engine {
         }
         if let Some(cause) = self.guard.left_op() {
             self.stop(None, cause);
+        }
+    }
+
+    /// Devices that have restarted have no home any more. Their groups have stopped. RT: O(devices ×
+    /// axes) while a device returns, else O(devices).
+    fn forget_homes(&mut self) {
+        for device in self.exchange.device_answers().indices() {
+            if self.exchange.take_restarted(device) {
+                let own = self.axes.iter_mut().filter(|slot| slot.device == device);
+                own.for_each(|slot| slot.axis.forget_home());
+            }
         }
     }
 

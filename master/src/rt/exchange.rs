@@ -213,6 +213,11 @@ impl Exchange {
         self.schedule.al_status_only = only;
     }
 
+    /// Returns true once after a member has restarted. RT: O(1).
+    pub fn take_restarted(&self, member: DeviceIndex) -> bool {
+        self.bus_status.take_restarted(member)
+    }
+
     /// Publishes which members are in Op, for the other threads. RT: O(members).
     pub fn publish_presence(&self, stopped: impl Fn(GroupIndex) -> bool) {
         for ((member, found), group) in self.diagnoses.enumerate().zip(&self.groups) {

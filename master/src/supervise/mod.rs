@@ -402,7 +402,6 @@ impl Supervisor {
         self.pass_events_on();
         self.report_limits(&snapshot);
         self.follow_clock_tree(&snapshot);
-        self.attend_returns().await;
         if clock::now().saturating_sub(self.last_status) >= STATUS_PERIOD {
             self.last_status = clock::now();
             self.report(Progress::Status(Status::new(&self.machine, &snapshot)));

@@ -13,13 +13,13 @@ use std::time::Duration;
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
 use ecaxis_esi::Identity;
-use tokio::sync::{Mutex, mpsc};
+use tokio::sync::{Mutex, oneshot};
 
 use super::Supervisor;
 use super::clock_tree;
 use crate::acyclic::eeprom::{EepromAccess, with_eeprom};
 use crate::acyclic::topology::parents;
-use crate::acyclic::{AlState, DeviceRef, al, enumerate};
+use crate::acyclic::{AlState, DeviceRef, StateError, al, enumerate};
 use crate::bringup::device_return::{RunningBus, RunningSync, bring_back, reset};
 use crate::bringup::{BusDevice, Step, enable_op_only};
 use crate::clock::{self, Nanos};
@@ -28,7 +28,6 @@ use crate::config::{Locator, Machine};
 use crate::datagram::DatagramClient;
 use crate::mailbox::{MailboxTransport, Mailboxes};
 use crate::report::{Cause, DevicePlace, Error, Progress};
-use crate::rt::channel::RtCommand;
 use crate::rt::exchange::BusStatus;
 use crate::rt::image::ImagePlan;
 
@@ -41,8 +40,8 @@ const RETRY: Nanos = 1_000_000_000;
 /// and above.
 const TEMPORARY_STATION: u16 = 0x0fff;
 
-/// The supervisor's end: commands for the cycle. The task ends when it is dropped.
-pub(crate) type ReturnPort = mpsc::UnboundedReceiver<RtCommand>;
+/// The supervisor's end. The task ends when it is dropped.
+pub(crate) type ReturnPort = oneshot::Receiver<Infallible>;
 
 impl Supervisor {
     /// Returns the task. It ends when [`Supervisor::returns`] is dropped.
@@ -50,7 +49,7 @@ impl Supervisor {
         &mut self,
         latch: Arc<Mutex<()>>,
     ) -> impl Future<Output = ()> + use<> {
-        let (orders, port) = mpsc::unbounded_channel();
+        let (mut end, port) = oneshot::channel();
         self.returns = Some(port);
         let devices = self.bus.devices.iter();
         let task = Returner {
@@ -61,7 +60,6 @@ impl Supervisor {
             places: self.bus.places(),
             mailboxes: self.mailboxes.clone(),
             bus_status: Arc::clone(&self.bus_status),
-            orders: orders.clone(),
             progress: self.progress.clone(),
             searches: vec![Search::default(); self.bus.devices.len()].into(),
             latch,
@@ -69,16 +67,9 @@ impl Supervisor {
         async move {
             tokio::select! {
                 biased;
-                () = orders.closed() => {}
+                () = end.closed() => {}
                 never = task.run() => match never {},
             }
-        }
-    }
-
-    /// Passes the task's commands to the cycle.
-    pub(super) async fn attend_returns(&mut self) {
-        while let Some(command) = self.returns.as_mut().and_then(|port| port.try_recv().ok()) {
-            self.send(command).await;
         }
     }
 }
@@ -92,6 +83,8 @@ struct Search {
     not_before: Nanos,
     /// The last warning about it.
     warned: Option<String>,
+    /// It had no power, and has not been in Op since.
+    restarted: bool,
 }
 
 struct Returner {
@@ -102,7 +95,6 @@ struct Returner {
     places: IndexVec<DeviceIndex, DevicePlace>,
     mailboxes: Mailboxes,
     bus_status: Arc<BusStatus>,
-    orders: mpsc::UnboundedSender<RtCommand>,
     progress: std::sync::mpsc::Sender<Progress>,
     searches: IndexVec<DeviceIndex, Search>,
     latch: Arc<Mutex<()>>,
@@ -115,7 +107,10 @@ impl Returner {
             let lost = self.lost();
             for (device, search) in self.searches.enumerate_mut() {
                 if !lost.contains(&device) {
-                    *search = Search::default();
+                    *search = Search {
+                        restarted: search.restarted,
+                        ..Search::default()
+                    };
                 } else if search.since.is_none() {
                     search.since = Some(clock::now());
                 }
@@ -140,13 +135,25 @@ impl Returner {
         let mut there = Vec::new();
         let mut without_address = Vec::new();
         let due = |search: &Search| clock::now() >= search.not_before;
-        for &device in lost.iter().filter(|d| due(&self.searches[**d])) {
+        let lost_now: Vec<_> = lost
+            .iter()
+            .copied()
+            .filter(|d| due(&self.searches[*d]))
+            .collect();
+        for device in lost_now {
             let station = self.devices[device].at.station;
             let status = al::read_status(&self.wire, station).await;
             match status.map_err(failed)? {
                 // The last diagnosis is older.
                 Some((status, _)) if status == AlState::Op.code() => {}
-                Some(_) => there.push((device, false)),
+                Some(_) if self.still_stops(device) => {}
+                Some(_) => {
+                    let at = self.devices[device].at.clone();
+                    match self.check_identity(device, &at, true).await {
+                        Ok(()) => there.push(device),
+                        Err(error) => self.refuse(device, &error),
+                    }
+                }
                 None => without_address.push(device),
             }
         }
@@ -158,13 +165,11 @@ impl Returner {
             }
             for (device, position) in found.into_iter().filter_map(|(d, at)| Some((d, at?))) {
                 match self.identify(device, position).await {
-                    Ok(()) => there.push((device, true)),
-                    Err(error) => {
-                        // The next one gets the temporary address.
-                        let register = registers::STATION_ADDRESS;
-                        let _ = self.wire.write(TEMPORARY_STATION, register, &[0, 0]).await;
-                        self.refuse(device, &error);
+                    Ok(()) => {
+                        self.searches[device].restarted = true;
+                        there.push(device);
                     }
+                    Err(error) => self.refuse(device, &error),
                 }
             }
         }
@@ -173,10 +178,14 @@ impl Returner {
         if let (Some(reference), false) = (reference, there.is_empty()) {
             let clocks = clock_tree::clocks(&self.devices);
             let station = reference.at.station;
-            clock_tree::update(&self.wire, &clocks, station, &self.latch, || true).await?;
+            let updated = clock_tree::update(&self.wire, &clocks, station, &self.latch, || true);
+            if let Err(error) = updated.await {
+                // The clock then settles later, or the attempt fails.
+                tracing::debug!("{error}");
+            }
         }
-        let attempts = there.into_iter().map(|(device, restarted)| {
-            let attempt = Box::pin(self.attempt(device, restarted));
+        let attempts = there.into_iter().map(|device| {
+            let attempt = Box::pin(self.attempt(device));
             async move { Ok::<_, Infallible>((device, attempt.await)) }
         });
         let Ok(ended) = try_join_all(attempts).await;
@@ -245,23 +254,87 @@ impl Returner {
 
     /// Gives a device its station address if its identity is that of the machine file.
     async fn identify(&mut self, index: DeviceIndex, position: u16) -> Result<(), Error> {
-        let config = &self.machine.devices[index];
-        let device = &mut self.devices[index];
+        let device = &self.devices[index];
         let own = device.at.station;
         let temporary = DeviceRef {
             position,
             station: TEMPORARY_STATION,
             ..device.at.clone()
         };
+        // A device that kept this address from an earlier attempt must not answer as well.
+        self.clear_temporary().await?;
+        self.check_is_new(position).await?;
         let address = TEMPORARY_STATION.to_le_bytes();
+        let register = registers::STATION_ADDRESS;
+        let written = self.wire.write_at(position, register, &address).await;
+        if written.map_err(failed)? != 1 {
+            return Err(gone(&temporary));
+        }
+        let checked = self.check_identity(index, &temporary, false).await;
+        if checked.is_err() {
+            self.clear_temporary().await?;
+            return checked;
+        }
         let written = self
             .wire
-            .write_at(position, registers::STATION_ADDRESS, &address);
-        written.await.map_err(failed)?;
+            .write(TEMPORARY_STATION, register, &own.to_le_bytes())
+            .await;
+        match written.map_err(failed)? {
+            1 => Ok(()),
+            _ => {
+                let _ = self.wire.write(own, register, &[0, 0]).await;
+                Err(gone(&temporary))
+            }
+        }
+    }
+
+    /// Fails unless the device at a position is in Init and has no address of the machine: devices may
+    /// have come since the search, and positions then name others.
+    async fn check_is_new(&self, position: u16) -> Result<(), Error> {
+        let found = enumerate::read_device(&self.wire, position).await?;
+        let known = self
+            .devices
+            .iter()
+            .any(|device| device.at.station == found.station);
+        if known || found.state != AlState::Init {
+            return Err(gone(&found.named(format!("device {position}"))));
+        }
+        Ok(())
+    }
+
+    /// Takes the temporary address from whichever device has it.
+    async fn clear_temporary(&self) -> Result<(), Error> {
+        let register = registers::STATION_ADDRESS;
+        let written = self.wire.write(TEMPORARY_STATION, register, &[0, 0]).await;
+        written.map_err(failed).map(drop)
+    }
+
+    /// Returns true while a drive that kept its power may still stop by its own reaction.
+    fn still_stops(&self, index: DeviceIndex) -> bool {
+        let times = self.machine.axes_of(index).map(|(_, setup)| {
+            let config = &setup.config;
+            config.stop_time_s(config.mode, config.limits.velocity)
+        });
+        // At most an hour; the cast saturates.
+        let longest = (times.fold(0.0, f64::max) * 1e9) as Nanos;
+        let since = self.searches[index].since.unwrap_or_else(clock::now);
+        clock::now() < since.saturating_add(longest)
+    }
+
+    /// Compares the EEPROM of a device with the machine file. `kept`: it answers at the address of the
+    /// lost device, and must be that device.
+    async fn check_identity(
+        &mut self,
+        index: DeviceIndex,
+        at: &DeviceRef,
+        kept: bool,
+    ) -> Result<(), Error> {
+        let config = &self.machine.devices[index];
+        let device = &mut self.devices[index];
         // The station alias is word 4; vendor, product, revision and serial number begin at word 8.
         let mut words = [0; 24];
         let access = EepromAccess::Force;
-        with_eeprom(&self.wire, &temporary, STEP, access, async |eeprom| {
+        with_eeprom(&self.wire, at, STEP, access, async |eeprom| {
             eeprom.read(4, &mut words).await
         })
         .await?;
@@ -286,23 +359,25 @@ impl Returner {
                 found: identity.to_string(),
                 revisions: same.then_some((expected.revision, identity.revision)),
             }
-            .with_device(&temporary));
+            .with_device(at));
         }
-        if let Some(expected) = config.serial.filter(|expected| *expected != serial) {
+        let wanted = config.serial.or(kept.then_some(device.serial));
+        if let Some(expected) = wanted.filter(|expected| *expected != serial) {
             let found = serial;
-            return Err(Cause::Serial { expected, found }.with_device(&temporary));
+            return Err(Cause::Serial { expected, found }.with_device(at));
         }
         let located = match config.at {
             Locator::Position(_) => true,
+            Locator::Id(_) if kept => true,
             Locator::Alias(wanted) => alias == wanted,
             Locator::Id(id) => {
                 let timeout = al::IDENTIFICATION_TIMEOUT;
-                al::read_explicit_id(&self.wire, TEMPORARY_STATION, timeout).await == Ok(Some(id))
+                al::read_explicit_id(&self.wire, at.station, timeout).await == Ok(Some(id))
             }
         };
         if !located {
             let locator = config.at.to_string();
-            return Err(Cause::NotLocated { locator }.with_device(&temporary));
+            return Err(Cause::NotLocated { locator }.with_device(at));
         }
         if serial != device.serial && config.serial.is_none() {
             let warning = format!(
@@ -313,32 +388,36 @@ impl Returner {
             device.serial = serial;
             let _ = self.progress.send(Progress::Warning(warning));
         }
-        let station = own.to_le_bytes();
-        let register = registers::STATION_ADDRESS;
-        let written = self.wire.write(TEMPORARY_STATION, register, &station).await;
-        written.map_err(failed).map(drop)
+        Ok(())
     }
 
-    /// Brings a device back that answers at its station address. `restarted`: it had no power.
-    async fn attempt(&self, index: DeviceIndex, restarted: bool) -> Result<(), Error> {
+    /// Brings a device back that answers at its station address.
+    async fn attempt(&self, index: DeviceIndex) -> Result<(), Error> {
         let done = self.bring_to_op(index).await;
         if done.is_err() {
             self.leave_in_init(index).await;
             return done;
         }
-        if restarted {
-            let _ = self.orders.send(RtCommand::Restarted { device: index });
-        }
         let since = self.searches[index].since.unwrap_or_else(clock::now);
         let _ = self.progress.send(Progress::DeviceReturned {
             device: self.devices[index].at.clone(),
             after_ns: clock::now().saturating_sub(since),
-            restarted,
+            restarted: self.searches[index].restarted,
         });
         Ok(())
     }
 
     async fn bring_to_op(&self, index: DeviceIndex) -> Result<(), Error> {
+        let machine = &self.machine;
+        if machine.outputs.iter().any(|signal| signal.device == index) {
+            let why = "its outputs would be switched on without a command; restart the bus";
+            return Err(Cause::Scan(why.to_owned()).with_device(&self.devices[index].at));
+        }
+        let synchronized = machine.devices[index].selection.dc.is_some();
+        if synchronized && self.running_sync(index).is_none() {
+            let why = "no other device has SYNC0, whose pulses it could join; restart the bus";
+            return Err(Cause::Scan(why.to_owned()).with_device(&self.devices[index].at));
+        }
         let reference = self.bus_status.reference().filter(|r| *r != index);
         let reference = reference
             .and_then(|r| self.devices.get(r))
@@ -366,9 +445,21 @@ impl Returner {
             let _ = give_back.send(coe);
         }
         returned?;
+        if self.searches[index].restarted {
+            // The axes need the positions of SafeOp, and their group is not released before Op.
+            self.settle().await;
+            self.bus_status.set_restarted(index);
+            self.settle().await;
+        }
         enable_op_only(&self.wire, &device, true).await?;
         let op = [device.transition(AlState::Op, false)];
         al::change_states(&self.wire, &op, AlState::Op).await
+    }
+
+    /// Waits for some cycles.
+    async fn settle(&self) {
+        const CYCLES: u64 = 5;
+        clock::delay(Duration::from_nanos(CYCLES * self.machine.bus.cycle_ns)).await;
     }
 
     /// Returns a device in Op with SYNC0; one with the same cycle if there is one.
@@ -415,6 +506,11 @@ impl Returner {
             search.warned = Some(text);
         }
     }
+}
+
+fn gone(device: &DeviceRef) -> Error {
+    let wanted = AlState::Init;
+    StateError::Gone { wanted }.with_device(device)
 }
 
 fn failed(error: crate::mailbox::DatagramError) -> Error {

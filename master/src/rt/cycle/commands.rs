@@ -63,11 +63,6 @@ impl Engine {
                 self.exchange.expect_op(false);
                 self.axes.iter_mut().for_each(RtAxis::disarm);
             }
-            RtCommand::Restarted { device } => {
-                for slot in self.axes.iter_mut().filter(|slot| slot.device == device) {
-                    slot.axis.forget_home();
-                }
-            }
             RtCommand::Stop => self.stop(None, StopCause::Requested),
             RtCommand::ErrorCode { axis, code } => {
                 if let Some(slot) = self.axes.get_mut(axis) {

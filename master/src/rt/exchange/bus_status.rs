@@ -1,7 +1,7 @@
 //! The status of mailboxes and the bus time as the cycle sees them, for other threads. Atomics keep
 //! the cost of reading them away from the cycle.
 
-use std::sync::atomic::{AtomicI64, AtomicU8, AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU8, AtomicU64, AtomicUsize, Ordering};
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 
@@ -30,6 +30,8 @@ pub struct BusStatus {
     clock: AtomicI64,
     /// For each member: [`STOPPED`] and [`OUT_OF_OP`].
     presence: IndexVec<DeviceIndex, AtomicU8>,
+    /// For each member, true if it has restarted and the cycle does not know it yet.
+    restarted: IndexVec<DeviceIndex, AtomicBool>,
     /// The member that is the reference clock; `usize::MAX`: none.
     reference: AtomicUsize,
 }
@@ -51,6 +53,7 @@ impl BusStatus {
             mailboxes: (0..members).map(|_| AtomicU64::new(0)).collect(),
             clock: AtomicI64::new(NO_CLOCK),
             presence: (0..members).map(|_| AtomicU8::new(0)).collect(),
+            restarted: (0..members).map(|_| AtomicBool::new(false)).collect(),
             reference: AtomicUsize::new(usize::MAX),
         }
     }
@@ -78,6 +81,20 @@ impl BusStatus {
             let bits = (u8::from(stopped) * STOPPED) | (u8::from(!in_op) * OUT_OF_OP);
             seen.store(bits, Ordering::Relaxed);
         }
+    }
+
+    /// Reports that a member has restarted: its axes have no home any more.
+    pub fn set_restarted(&self, member: DeviceIndex) {
+        if let Some(restarted) = self.restarted.get(member) {
+            restarted.store(true, Ordering::Relaxed);
+        }
+    }
+
+    /// Returns true once after [`BusStatus::set_restarted`]. RT: O(1).
+    pub(super) fn take_restarted(&self, member: DeviceIndex) -> bool {
+        let restarted = self.restarted.get(member);
+        restarted
+            .is_some_and(|seen| seen.load(Ordering::Relaxed) && seen.swap(false, Ordering::Relaxed))
     }
 
     /// Stores the reference clock. RT: O(1).

@@ -116,7 +116,7 @@ impl PollSchedule {
 
     /// Returns the next read; `None` without members. RT.
     pub fn next(&mut self) -> Option<PollDatagram> {
-        let mailbox = self.mailbox_is_next && !self.mailboxes.is_empty() && !self.al_status_only;
+        let mailbox = self.mailbox_is_next && !self.mailboxes.is_empty();
         self.mailbox_is_next = !mailbox;
         let (polls, next) = if mailbox {
             (&self.mailboxes[..], &mut self.next.1)
