@@ -68,7 +68,7 @@ def traced(bench, machine, folder, nic):
     entries = (trace / "changes.jsonl").read_text().splitlines()
     report.equal(f"{nic}: with both entries of the change log", len(entries), 2)
     calls, refused = cycle_calls(trace)
-    # The sleep until the next cycle; the last part of a wait is spun, so a late cycle has none. Traced beside other work,
+    # The sleep until the next cycle; the last part of a wait is spun, so a late cycle has none. On a loaded computer,
     # the bus may be lost before: this says how many cycles there were, the simulated bus has all of them.
     cycles = max(calls["clock_nanosleep"], calls["sendto"])
     report.check(f"{nic}: at least {CYCLES // 10} cycles", cycles >= CYCLES // 10, calls)
