@@ -210,16 +210,23 @@ def chromium():
             browser.close()
 
 
+def open_browser(bench, stack):
+    """Returns None without Chromium; on CI that is an error."""
+    try:
+        return stack.enter_context(chromium())
+    except (ImportError, FileNotFoundError) as error:
+        if bench.on_ci:
+            raise
+        bench.report.note(f"skipped: {error} is missing")
+        return None
+
+
 def page(bench):
     report = bench.report
     report.section("the page of `ecaxis serve` in Chromium")
     with contextlib.ExitStack() as stack:
-        try:
-            browser = stack.enter_context(chromium())
-        except (ImportError, FileNotFoundError) as error:
-            if bench.on_ci:
-                raise
-            report.note(f"skipped: {error} is missing")
+        browser = open_browser(bench, stack)
+        if browser is None:
             return
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ecaxis-page-")))
         token = folder / "token"

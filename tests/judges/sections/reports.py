@@ -5,7 +5,7 @@ import subprocess
 
 import rig
 
-from .page import chromium
+from .page import open_browser
 
 CONFIGS = rig.ROOT / "configs"
 # `y` faults while both axes move.
@@ -45,12 +45,8 @@ def reports(bench):
     report = bench.report
     report.section("the pages of `ecaxis analyze` and `ecaxis bench` in Chromium")
     with contextlib.ExitStack() as stack:
-        try:
-            browser = stack.enter_context(chromium())
-        except (ImportError, FileNotFoundError) as error:
-            if bench.on_ci:
-                raise
-            report.note(f"skipped: {error} is missing")
+        browser = open_browser(bench, stack)
+        if browser is None:
             return
         for name, page in {"fault": analyzed(bench, "demo.toml", FAULTS), "axes": analyzed(bench, "groups.toml"), "bench": measured(bench)}.items():
             for look, options in MEDIA.items():

@@ -17,7 +17,7 @@ import rig
 FILTER = rig.ROOT / "master/src/sys/rights/filter.rs"
 UNIT = rig.ROOT / "packaging/ecaxis@.service"
 # At 1 ms; under strace, cycles are left out.
-CYCLES, SECONDS = 10_000, 25
+CYCLES, SECONDS, TRIES = 10_000, 25, 3
 FAULT = '[[fault]]\nkind = "power-off"\ndevice = 0\nat = "0s"\n'
 NET_RAW, IPC_LOCK, DAC_OVERRIDE, SYS_NICE = 1 << 13, 1 << 14, 1 << 1, 1 << 23
 FILES = IPC_LOCK | DAC_OVERRIDE
@@ -42,8 +42,32 @@ def rights(bench):
 def traced(bench, machine, folder, nic):
     """A run that a fault ends. strace also sees the calls that the filters refuse."""
     report = bench.report
+    # On a loaded computer, the bus may be lost before.
+    for number in range(TRIES):
+        trace = folder / f"trace-{nic}-{number}"
+        code, errors = run_traced(bench, machine, folder, nic, trace)
+        calls, refused = cycle_calls(trace)
+        # The sleep until the next cycle; the last part of a wait is spun, so a late cycle has none.
+        cycles = max(calls["clock_nanosleep"], calls["sendto"])
+        if cycles >= CYCLES:
+            break
+        report.note(f"{nic}: {cycles} cycles in try {number + 1}")
+    report.equal(f"{nic}: the fault ends the run", code, 1)
+    report.check(f"{nic}: with a fault report", (trace / "f.json").exists(), errors)
+    report.check(f"{nic}: with a recording", (trace / "r.pcapng").stat().st_size > 100_000)
+    entries = (trace / "changes.jsonl").read_text().splitlines()
+    report.equal(f"{nic}: with both entries of the change log", len(entries), 2)
+    report.check(f"{nic}: at least {CYCLES} cycles", cycles >= CYCLES, calls)
+    report.equal(f"{nic}: the thread of the cycle makes only permitted calls", sorted(set(calls) - permitted()), [])
+    report.equal(f"{nic}: no call of any thread is refused", refused, [])
+    if shutil.which("systemd-analyze"):
+        made = {name for file in trace.glob("t.*") for name in re.findall(r"^(\w+)\(", file.read_text(), re.M)}
+        report.equal(f"{nic}: the unit permits all calls", sorted(made - permitted_by_unit() - {"execve"}), [])
+
+
+def run_traced(bench, machine, folder, nic, trace):
+    """Returns the exit code, and what the run prints to stderr."""
     file = machine.write(folder)
-    trace = folder / f"trace-{nic}"
     trace.mkdir()
     command = ["strace", "-ff", "-qq", "-o", str(trace / "t"), str(bench.program), "run", str(file), "--no-enable"]
     command += ["--nic", nic, "--record", str(trace / "r.pcapng"), "--fault-report", str(trace / "f.txt")]
@@ -62,22 +86,7 @@ def traced(bench, machine, folder, nic):
                 time.sleep(0.1)
             bus.strike()
             _, errors = child.communicate(timeout=3 * SECONDS)
-    report.equal(f"{nic}: the fault ends the run", child.returncode, 1)
-    report.check(f"{nic}: with a fault report", (trace / "f.json").exists(), errors)
-    report.check(f"{nic}: with a recording", (trace / "r.pcapng").stat().st_size > 100_000)
-    entries = (trace / "changes.jsonl").read_text().splitlines()
-    report.equal(f"{nic}: with both entries of the change log", len(entries), 2)
-    calls, refused = cycle_calls(trace)
-    # The sleep until the next cycle; the last part of a wait is spun, so a late cycle has none. On a loaded computer,
-    # the bus may be lost before: this says how many cycles there were, the simulated bus has all of them.
-    cycles = max(calls["clock_nanosleep"], calls["sendto"])
-    report.check(f"{nic}: at least {CYCLES // 10} cycles", cycles >= CYCLES // 10, calls)
-    report.note(f"{nic}: {cycles} cycles")
-    report.equal(f"{nic}: the thread of the cycle makes only permitted calls", sorted(set(calls) - permitted()), [])
-    report.equal(f"{nic}: no call of any thread is refused", refused, [])
-    if shutil.which("systemd-analyze"):
-        made = {name for file in trace.glob("t.*") for name in re.findall(r"^(\w+)\(", file.read_text(), re.M)}
-        report.equal(f"{nic}: the unit permits all calls", sorted(made - permitted_by_unit() - {"execve"}), [])
+    return child.returncode, errors
 
 
 def permitted():
