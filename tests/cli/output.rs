@@ -8,20 +8,17 @@ fn config(name: &str) -> String {
     format!("{}/configs/{name}", root().display())
 }
 
+/// A run of the demonstration in virtual time.
+fn demo(demo: &str) -> [&str; 6] {
+    ["run", demo, "--sim", "--virtual", "--repeat", "1"]
+}
+
 /// Before, only the result could be kept apart from messages, by their streams.
 #[test]
 fn quiet_prints_only_errors_and_the_result() {
-    let demo = config("demo.toml");
-    let line = [
-        "run",
-        &demo,
-        "--sim",
-        "--virtual",
-        "--repeat",
-        "1",
-        "--quiet",
-    ];
-    let ran = run(line).exits(0);
+    let file = config("demo.toml");
+    let line = [&demo(&file)[..], &["--quiet"]].concat();
+    let ran = run(line.clone()).exits(0);
     assert_eq!(ran.err, "");
     assert!(ran.out.contains("complete run"), "{}", ran.out);
 
@@ -38,24 +35,14 @@ fn quiet_prints_only_errors_and_the_result() {
 #[test]
 fn log_file_has_messages_and_log_lines() {
     let folder = tempfile::tempdir().expect("a folder");
-    let (demo, log) = (config("demo.toml"), folder.path().join("run.log"));
+    let (file, log) = (config("demo.toml"), folder.path().join("run.log"));
     let path = log.to_str().expect("UTF-8");
-    let line = [
-        "run",
-        &demo,
-        "--sim",
-        "--virtual",
-        "--repeat",
-        "1",
-        "-q",
-        "--log-file",
-        path,
-    ];
-    run(line).exits(0);
+    let line = [&demo(&file)[..], &["-q", "--log-file", path]].concat();
+    run(line.clone()).exits(0);
     let first = std::fs::read_to_string(&log).expect("the log");
     assert_contains(&first, &["Z  NOTE 2 axes in Operation enabled\n"]);
     // A second run appends.
-    run(line).exits(0);
+    run(line.clone()).exits(0);
     let both = std::fs::read_to_string(&log).expect("the log");
     assert!(both.starts_with(&first) && both.len() > first.len());
     let nowhere = [&line[..8], &["/nonexistent/x.log"]].concat();
