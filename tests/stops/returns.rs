@@ -135,6 +135,25 @@ fn exchanged_device_is_driven_only_if_it_is_of_the_same_kind() {
     assert!(warned(&heard, "4711"), "{:?}", heard.warnings());
 }
 
+/// An output terminal would switch its outputs on as soon as it is in Op.
+#[test]
+fn terminal_with_outputs_of_the_program_does_not_return_by_itself() {
+    let io = "\n[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 2\n";
+    let off = "[[fault]]\nkind = \"power-off\"\ndevice = 2\nat = \"1.5s\"\nfor = \"500ms\"\n";
+    let set = "\n[[step]]\nset = { io.\"Output 1\" = true }\n";
+    let on = "\n[[step]]\nenable = true\n\n[[step]]\nmove = { a0 = 80.0 }\n\n[[step]]\nmove = { a0 = -80.0 }\n";
+    for (steps, returns) in [(format!("{set}{on}"), 0), (on.to_owned(), 1)] {
+        let text = line_text(2, &format!("{io}{steps}"));
+        let text = text.replace("axes = [\"a1\"]\n", "axes = [\"a1\"]\ndevices = [\"io\"]\n");
+        let (outcome, heard) = run(machine(&text), faults(off));
+        outcome.result.expect("the drives run");
+        assert_eq!(returned(&heard).len(), returns, "{:?}", heard.warnings());
+        let warning = "would be switched on without a command";
+        let warned = heard.warnings().iter().any(|w| w.contains(warning));
+        assert_eq!(warned, returns == 0, "{:?}", heard.warnings());
+    }
+}
+
 const DRIVES: usize = 16;
 /// The drives in front of those that come and go.
 const STEADY: usize = 8;

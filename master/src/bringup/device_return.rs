@@ -1,7 +1,7 @@
 //! The way of one device back to SafeOp while the others stay in Op.
 //!
 //! The steps are those of the bring-up. Nothing here writes to another device, except the latch of
-//! the receive times, which has no other effect.
+//! the receive times. The caller measures the delays first, which may change those of others.
 
 use std::time::Duration;
 
@@ -41,6 +41,7 @@ pub(crate) struct RunningBus<'a> {
     pub image: &'a ImagePlan,
     /// The reference clock; `None` without distributed clocks, and if this device is the reference.
     pub reference: Option<&'a DeviceRef>,
+    /// A device in Op with SYNC0.
     pub sync: Option<RunningSync<'a>>,
     /// Held while the receive times of all devices belong to one frame.
     pub latch: &'a Mutex<()>,
@@ -79,7 +80,9 @@ pub(crate) async fn bring_back(
     let subject = (index, config, &mut *device);
     configure(wire, machine, subject, (region, status), progress, &times).await?;
     if let Some(dc) = &config.selection.dc {
-        join_pulses(bus, &device.at, dc).await?;
+        let running = bus.sync;
+        let running = running.ok_or_else(|| Cause::NoStart.with_device(&device.at))?;
+        join_pulses(bus, &device.at, dc, running).await?;
     }
     let safe_op = [device.transition(AlState::SafeOp, false)];
     let changed = al::change_states(wire, &safe_op, AlState::SafeOp).await;
@@ -126,7 +129,12 @@ pub(crate) async fn reset(wire: &DatagramClient, at: &DeviceRef) -> Result<(), E
 
 /// Starts the pulses of a device on the grid of the others: the first pulse is a whole number of
 /// periods after the next one of a device that runs (0x0990, ESC data sheet, section II).
-async fn join_pulses(bus: RunningBus<'_>, at: &DeviceRef, dc: &DcSettings) -> Result<(), Error> {
+async fn join_pulses(
+    bus: RunningBus<'_>,
+    at: &DeviceRef,
+    dc: &DcSettings,
+    running: RunningSync<'_>,
+) -> Result<(), Error> {
     let (wire, cycle) = (bus.wire, bus.machine.bus.cycle_ns);
     let own_cycle = u64::from(dc.sync0_cycle_ns);
     let common = clocks::greatest_common_divisor(own_cycle, cycle).max(1);
@@ -134,16 +142,9 @@ async fn join_pulses(bus: RunningBus<'_>, at: &DeviceRef, dc: &DcSettings) -> Re
     let mut ahead = START_DELAY;
     for _ in 0..clocks::MAX_ATTEMPTS {
         let now = clocks::system_time(wire, at).await?;
-        let grid = match bus.sync {
-            Some(running) => {
-                let next = read(wire, running.at, STEP, registers::DC_START_TIME).await?;
-                let shift = i64::from(running.dc.sync0_shift_ns);
-                u64::from_le_bytes(next).wrapping_add_signed(-shift)
-            }
-            // Nothing else has pulses: the frames follow those of this device.
-            None => now,
-        };
-        let grid = extend(grid.wrapping_add_signed(i64::from(dc.sync0_shift_ns)), now);
+        let next = read(wire, running.at, STEP, registers::DC_START_TIME).await?;
+        let shift = i64::from(dc.sync0_shift_ns) - i64::from(running.dc.sync0_shift_ns);
+        let grid = extend(u64::from_le_bytes(next).wrapping_add_signed(shift), now);
         let first = next_on_grid(grid, period, now.wrapping_add(ahead));
         clocks::start_pulses(wire, at, dc, first).await?;
         let reported = clocks::system_time(wire, at).await?;

@@ -311,35 +311,19 @@ pub(super) async fn assign(
             station,
         };
         let is_product = product(expected) == product(identity);
-        let rule = config.identity;
         if !is_product && belongs_elsewhere(machine, identity) {
             let missing = missing_devices(machine, &there);
             if !missing.is_empty() {
                 return Err(devices_missing(machine, found.len(), missing));
             }
         }
-        if !is_product || !rule.accepts(expected.revision, identity.revision) {
-            return Err(Cause::Identity {
-                esi: config.esi_path.display().to_string(),
-                expected: format!("{} ({expected})", config.selection.device_name),
-                found: known(machine, identity),
-                revisions: is_product.then_some((expected.revision, identity.revision)),
-            }
-            .with_device(device()));
-        }
+        compare(machine, config, (identity, serial), &device())?;
         if expected.revision != identity.revision {
-            let at = device();
+            let (at, rule) = (device(), config.identity);
             let (found, described) = (identity.revision, expected.revision);
             progress(Step::Warning(format!(
                 "{at}: revision 0x{found:08x} stands for 0x{described:08x} of its ESI (identity = \"{rule}\")"
             )));
-        }
-        if let Some(expected) = config.serial.filter(|expected| *expected != serial) {
-            return Err(Cause::Serial {
-                expected,
-                found: serial,
-            }
-            .with_device(device()));
         }
     }
     for (position, ScannedDevice { identity, .. }) in found.iter().enumerate() {
@@ -350,6 +334,40 @@ pub(super) async fn assign(
         }
     }
     Ok(order)
+}
+
+/// Compares identity and serial number of a device with the machine file.
+///
+/// # Errors
+/// [`Cause::Identity`], [`Cause::Serial`].
+pub(crate) fn compare(
+    machine: &Machine,
+    config: &DeviceConfig,
+    (identity, serial): (Identity, u32),
+    at: &DeviceRef,
+) -> Result<(), report::Error> {
+    let expected = config.selection.identity;
+    let is_product = product(expected) == product(identity);
+    let accepted = config
+        .identity
+        .accepts(expected.revision, identity.revision);
+    if !is_product || !accepted {
+        return Err(Cause::Identity {
+            esi: config.esi_path.display().to_string(),
+            expected: format!("{} ({expected})", config.selection.device_name),
+            found: known(machine, identity),
+            revisions: is_product.then_some((expected.revision, identity.revision)),
+        }
+        .with_device(at));
+    }
+    match config.serial.filter(|expected| *expected != serial) {
+        Some(expected) => Err(Cause::Serial {
+            expected,
+            found: serial,
+        }
+        .with_device(at)),
+        None => Ok(()),
+    }
 }
 
 /// Returns the time in which a device answers the request of its identification. It is long only if

@@ -46,7 +46,7 @@ mod mailbox;
 mod mapping;
 mod output_defaults;
 mod times;
-pub(crate) use identify::name_at;
+pub(crate) use identify::{compare as compare_identity, name_at};
 mod watchdog;
 
 pub use crate::report::bring_up::{Step, StepTime};

@@ -208,25 +208,6 @@ impl Exchange {
         self.op_expected = expected;
     }
 
-    /// Sets whether the diagnostic slot reads AL status only: it then visits each device sooner.
-    pub fn poll_al_status_only(&mut self, only: bool) {
-        self.schedule.al_status_only = only;
-    }
-
-    /// Returns true once after a member has restarted. RT: O(1).
-    pub fn take_restarted(&self, member: DeviceIndex) -> bool {
-        self.bus_status.take_restarted(member)
-    }
-
-    /// Publishes which members are in Op, for the other threads. RT: O(members).
-    pub fn publish_presence(&self, stopped: impl Fn(GroupIndex) -> bool) {
-        for ((member, found), group) in self.diagnoses.enumerate().zip(&self.groups) {
-            self.bus_status
-                .set_presence(member, found.is_in_op(), stopped(*group));
-        }
-        self.bus_status.set_reference(self.reference());
-    }
-
     /// Returns the results of the diagnostic slot, in the order of the members.
     #[must_use]
     pub fn diagnoses(&self) -> &IndexVec<DeviceIndex, SubDeviceDiagnostics> {

@@ -1,9 +1,9 @@
 //! Brings devices back that lost their power, were unplugged or left Op, while the others stay in
 //! Op. Their groups have stopped; an axis is enabled by command only.
 //!
-//! A task next to the supervisor looks for lost devices, some times a second. A device that kept its
-//! station address is asked by it. A device without one is found behind the neighbour and the port at
-//! which it was, and must have the identity of the machine file.
+//! A task next to the supervisor looks for lost devices every [`PERIOD`]. It asks a device that kept
+//! its station address at that address. It finds a device without an address by its parent and port.
+//! Both must have the identity of the machine file.
 
 use std::convert::Infallible;
 use std::future::Future;
@@ -21,7 +21,7 @@ use crate::acyclic::eeprom::{EepromAccess, with_eeprom};
 use crate::acyclic::topology::parents;
 use crate::acyclic::{AlState, DeviceRef, StateError, al, enumerate};
 use crate::bringup::device_return::{RunningBus, RunningSync, bring_back, reset};
-use crate::bringup::{BusDevice, Step, enable_op_only};
+use crate::bringup::{BusDevice, Step, compare_identity, enable_op_only};
 use crate::clock::{self, Nanos};
 use crate::concurrent::try_join_all;
 use crate::config::{Locator, Machine};
@@ -52,7 +52,7 @@ impl Supervisor {
         let (mut end, port) = oneshot::channel();
         self.returns = Some(port);
         let devices = self.bus.devices.iter();
-        let task = Returner {
+        let task = ReturnTask {
             wire: self.wire,
             machine: Arc::clone(&self.machine),
             image: self.bus.image.clone(),
@@ -87,7 +87,7 @@ struct Search {
     restarted: bool,
 }
 
-struct Returner {
+struct ReturnTask {
     wire: DatagramClient,
     machine: Arc<Machine>,
     image: ImagePlan,
@@ -100,7 +100,7 @@ struct Returner {
     latch: Arc<Mutex<()>>,
 }
 
-impl Returner {
+impl ReturnTask {
     async fn run(mut self) -> Infallible {
         loop {
             clock::delay(PERIOD).await;
@@ -132,7 +132,7 @@ impl Returner {
 
     /// Searches all lost devices once and brings back those that are there, at the same time.
     async fn search(&mut self, lost: &[DeviceIndex]) -> Result<(), Error> {
-        let mut there = Vec::new();
+        let mut present = Vec::new();
         let mut without_address = Vec::new();
         let due = |search: &Search| clock::now() >= search.not_before;
         let lost_now: Vec<_> = lost
@@ -141,6 +141,10 @@ impl Returner {
             .filter(|d| due(&self.searches[*d]))
             .collect();
         for device in lost_now {
+            if let Err(error) = self.check_permitted(device) {
+                self.refuse(device, &error);
+                continue;
+            }
             let station = self.devices[device].at.station;
             let status = al::read_status(&self.wire, station).await;
             match status.map_err(failed)? {
@@ -150,7 +154,7 @@ impl Returner {
                 Some(_) => {
                     let at = self.devices[device].at.clone();
                     match self.check_identity(device, &at, true).await {
-                        Ok(()) => there.push(device),
+                        Ok(()) => present.push(device),
                         Err(error) => self.refuse(device, &error),
                     }
                 }
@@ -167,7 +171,7 @@ impl Returner {
                 match self.identify(device, position).await {
                     Ok(()) => {
                         self.searches[device].restarted = true;
-                        there.push(device);
+                        present.push(device);
                     }
                     Err(error) => self.refuse(device, &error),
                 }
@@ -175,7 +179,7 @@ impl Returner {
         }
         let reference = self.bus_status.reference();
         let reference = reference.and_then(|reference| self.devices.get(reference));
-        if let (Some(reference), false) = (reference, there.is_empty()) {
+        if let (Some(reference), false) = (reference, present.is_empty()) {
             let clocks = clock_tree::clocks(&self.devices);
             let station = reference.at.station;
             let updated = clock_tree::update(&self.wire, &clocks, station, &self.latch, || true);
@@ -184,7 +188,7 @@ impl Returner {
                 tracing::debug!("{error}");
             }
         }
-        let attempts = there.into_iter().map(|device| {
+        let attempts = present.into_iter().map(|device| {
             let attempt = Box::pin(self.attempt(device));
             async move { Ok::<_, Infallible>((device, attempt.await)) }
         });
@@ -225,7 +229,7 @@ impl Returner {
         };
         let stations = words(registers::STATION_ADDRESS).await?;
         let status = words(registers::DL_STATUS).await?;
-        let mut here: Vec<Option<DeviceIndex>> = Vec::new();
+        let mut identified: Vec<Option<DeviceIndex>> = Vec::new();
         let mut found = Vec::new();
         for ((position, station), parent) in (0..).zip(stations).zip(parents(status)) {
             let known = self
@@ -233,7 +237,10 @@ impl Returner {
                 .enumerate()
                 .find(|(_, d)| d.at.station == station);
             let parent = parent.map(|parent| {
-                let device = here.get(usize::from(parent.device)).copied().flatten();
+                let device = identified
+                    .get(usize::from(parent.device))
+                    .copied()
+                    .flatten();
                 (device, parent.port)
             });
             let at_place = |device: &&DeviceIndex| {
@@ -244,7 +251,7 @@ impl Returner {
                 Some((device, _)) => Some(device),
                 None => lost.iter().find(at_place).copied(),
             };
-            here.push(device);
+            identified.push(device);
             if let Some(device) = device.filter(|device| lost.contains(device)) {
                 found.push((device, known.is_none().then_some(position)));
             }
@@ -309,6 +316,21 @@ impl Returner {
         written.map_err(failed).map(drop)
     }
 
+    /// Fails for devices that must not return by themselves. Nothing is written to them.
+    fn check_permitted(&self, index: DeviceIndex) -> Result<(), Error> {
+        let machine = &self.machine;
+        let why = if machine.outputs.iter().any(|signal| signal.device == index) {
+            "its outputs would be switched on without a command; restart the bus"
+        } else if machine.devices[index].selection.dc.is_some()
+            && self.running_sync(index).is_none()
+        {
+            "no other device in Op has SYNC0, whose pulses it could join; restart the bus"
+        } else {
+            return Ok(());
+        };
+        Err(Cause::Scan(why.to_owned()).with_device(&self.devices[index].at))
+    }
+
     /// Returns true while a drive that kept its power may still stop by its own reaction.
     fn still_stops(&self, index: DeviceIndex) -> bool {
         let times = self.machine.axes_of(index).map(|(_, setup)| {
@@ -346,24 +368,9 @@ impl Returner {
             revision: word(12),
         };
         let (serial, alias) = (word(14), u16::from_le_bytes([words[0], words[1]]));
-        let expected = config.selection.identity;
-        let same = (expected.vendor, expected.product) == (identity.vendor, identity.product);
-        if !same
-            || !config
-                .identity
-                .accepts(expected.revision, identity.revision)
-        {
-            return Err(Cause::Identity {
-                esi: config.esi_path.display().to_string(),
-                expected: format!("{} ({expected})", config.selection.device_name),
-                found: identity.to_string(),
-                revisions: same.then_some((expected.revision, identity.revision)),
-            }
-            .with_device(at));
-        }
-        let wanted = config.serial.or(kept.then_some(device.serial));
-        if let Some(expected) = wanted.filter(|expected| *expected != serial) {
-            let found = serial;
+        compare_identity(&self.machine, config, (identity, serial), at)?;
+        if kept && serial != device.serial {
+            let (expected, found) = (device.serial, serial);
             return Err(Cause::Serial { expected, found }.with_device(at));
         }
         let located = match config.at {
@@ -408,16 +415,6 @@ impl Returner {
     }
 
     async fn bring_to_op(&self, index: DeviceIndex) -> Result<(), Error> {
-        let machine = &self.machine;
-        if machine.outputs.iter().any(|signal| signal.device == index) {
-            let why = "its outputs would be switched on without a command; restart the bus";
-            return Err(Cause::Scan(why.to_owned()).with_device(&self.devices[index].at));
-        }
-        let synchronized = machine.devices[index].selection.dc.is_some();
-        if synchronized && self.running_sync(index).is_none() {
-            let why = "no other device has SYNC0, whose pulses it could join; restart the bus";
-            return Err(Cause::Scan(why.to_owned()).with_device(&self.devices[index].at));
-        }
         let reference = self.bus_status.reference().filter(|r| *r != index);
         let reference = reference
             .and_then(|r| self.devices.get(r))

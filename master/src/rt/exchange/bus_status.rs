@@ -3,8 +3,9 @@
 
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU8, AtomicU64, AtomicUsize, Ordering};
 
-use ecaxis_ecat::index::{DeviceIndex, IndexVec};
+use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 
+use super::Exchange;
 use crate::clock::Nanos;
 
 /// Bit 3 of a SyncManager's status.
@@ -133,6 +134,27 @@ impl BusStatus {
     pub fn system_time(&self, at: Nanos) -> Option<u64> {
         let offset = self.clock.load(Ordering::Relaxed);
         (offset != NO_CLOCK).then(|| at.wrapping_add_signed(offset))
+    }
+}
+
+impl Exchange {
+    /// Sets whether the diagnostic slot reads AL status only: it then visits each device sooner.
+    pub fn poll_al_status_only(&mut self, only: bool) {
+        self.schedule.al_status_only = only;
+    }
+
+    /// Returns true once after a member has restarted. RT: O(1).
+    pub fn take_restarted(&self, member: DeviceIndex) -> bool {
+        self.bus_status.take_restarted(member)
+    }
+
+    /// Publishes which members are in Op, for the other threads. RT: O(members).
+    pub fn publish_presence(&self, stopped: impl Fn(GroupIndex) -> bool) {
+        for ((member, found), group) in self.diagnoses.enumerate().zip(&self.groups) {
+            self.bus_status
+                .set_presence(member, found.is_in_op(), stopped(*group));
+        }
+        self.bus_status.set_reference(self.reference());
     }
 }
 
