@@ -11,16 +11,16 @@ use ethercrab::{Command, MainDevice, WrappedRead, WrappedWrite};
 
 use crate::cancel::CancelToken;
 use crate::clock::{self, Nanos};
-use crate::link::pdu_loop::MAX_DATAGRAMS;
+use crate::link::pdu_loop::{MAX_DATAGRAMS, MAX_JOINED};
 use crate::mailbox::{DatagramError, MailboxStatus, MailboxTransport};
 use crate::rt::exchange::BusStatus;
 use limiter::InFlightLimiter;
 
 mod limiter;
 
-/// The datagrams in flight during operation. Each cycle sends one frame with one datagram, and an
-/// answer takes at most two cycles: more datagrams would only wait.
-const MAX_IN_OPERATION: u64 = 3;
+/// The datagrams in flight during operation. Each cycle sends one frame, and an answer takes at most
+/// two cycles: more datagrams would only wait.
+const MAX_IN_OPERATION: u64 = 3 * MAX_JOINED;
 
 /// Sends datagrams to configured station addresses, in order of request.
 #[derive(Debug, Clone, Copy)]

@@ -1,6 +1,7 @@
 //! Connects ethercrab to a link. ethercrab builds its own frames with one datagram each. The owner
-//! of the link moves them: the pump during bring-up, the cycle afterwards. The pump joins the
-//! datagrams of all frames that wait into as few Ethernet frames as possible.
+//! of the link moves them: the pump during bring-up, the cycle afterwards. Both join the datagrams
+//! that wait: the pump all of them into as few Ethernet frames as possible, the cycle some of them
+//! into one.
 
 use std::future::Future;
 use std::pin::pin;
@@ -28,6 +29,8 @@ const FRAMES: usize = 64;
 /// The maximum of datagrams in flight of one [`crate::datagram::DatagramClient`] during bring-up.
 /// The remaining frames are ethercrab's own and those of clients before and after.
 pub(crate) const MAX_DATAGRAMS: u64 = 48;
+/// The maximum of datagrams in the frame of a cycle.
+pub(crate) const MAX_JOINED: u64 = 8;
 /// Bytes per frame: the maximum, so that the largest mailbox fits.
 const FRAME_BYTES: usize = PduStorage::element_size(MAX_DATA as usize);
 const _: () = assert!(FRAME_BYTES == MAX_FRAME);
@@ -95,19 +98,23 @@ pub fn main_device(cycle_ns: Nanos, pre_op: Duration) -> (&'static MainDevice<'s
 }
 
 impl PduLoop {
-    /// Sends one frame that ethercrab has ready, if there is one. RT.
+    /// Sends at most one frame, with up to [`MAX_JOINED`] of the datagrams that ethercrab has ready.
+    /// RT.
     pub fn send_one(&mut self, link: &mut dyn Link) -> Result<(), LinkError> {
-        let Some(frame) = self.tx.next_sendable_frame() else {
-            return Ok(());
-        };
-        let mut sent = Ok(());
-        // On an error, ethercrab keeps the frame for the next attempt.
-        let _ = frame.send_blocking(|bytes| {
-            sent = link.send(bytes);
-            sent.map(|()| bytes.len())
-                .map_err(|_| ethercrab::error::Error::SendFrame)
-        });
-        sent
+        for _ in 0..MAX_JOINED {
+            let Some(frame) = self.tx.next_sendable_frame() else {
+                break;
+            };
+            // ethercrab keeps a datagram that does not fit for the next cycle.
+            let fits = frame.send_blocking(|bytes| match self.joined.append(bytes) {
+                true => Ok(bytes.len()),
+                false => Err(ethercrab::error::Error::SendFrame),
+            });
+            if fits.is_err() {
+                break;
+            }
+        }
+        self.joined.flush(link)
     }
 
     /// Sends the datagrams of all frames that ethercrab has ready, in as few frames as possible,
@@ -200,5 +207,64 @@ pub fn drive_pdu_loop<F: Future>(
             Clock::Real if idle > 2_000 => std::thread::sleep(Duration::from_micros(50)),
             Clock::Real => std::hint::spin_loop(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::VecDeque;
+
+    use super::*;
+    use crate::datagram::DatagramClient;
+    use crate::mailbox::MailboxTransport;
+
+    /// A link that keeps what it sends.
+    #[derive(Debug, Default)]
+    struct Kept(VecDeque<Vec<u8>>);
+
+    impl Link for Kept {
+        fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
+            self.0.push_back(frame.to_vec());
+            Ok(())
+        }
+
+        fn recv(&mut self, _: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+            Ok(None)
+        }
+
+        fn next_arrival(&self) -> Option<Nanos> {
+            None
+        }
+    }
+
+    /// Returns the datagrams of each frame that leaves for reads of these lengths.
+    fn frames_of(lengths: &[usize]) -> Vec<usize> {
+        let (device, mut port) = main_device(1_000_000, Duration::from_secs(1));
+        let client = DatagramClient::new(device);
+        let mut buffers: Vec<_> = lengths.iter().map(|len| vec![0; *len]).collect();
+        let mut context = Context::from_waker(Waker::noop());
+        let reads = buffers.iter_mut().map(|buf| client.read(0x1000, 0, buf));
+        let mut reads: Vec<_> = reads.map(Box::pin).collect();
+        for read in &mut reads {
+            assert!(read.as_mut().poll(&mut context).is_pending());
+        }
+        let mut link = Kept::default();
+        let mut counts = Vec::new();
+        loop {
+            port.send_one(&mut link).expect("kept");
+            match link.0.pop_front() {
+                Some(frame) => counts.push(datagrams(&frame).count()),
+                None => return counts,
+            }
+            assert!(link.0.is_empty(), "one frame per cycle");
+        }
+    }
+
+    #[test]
+    fn one_frame_per_cycle_carries_the_datagrams_that_wait() {
+        assert_eq!(frames_of(&[]), [0; 0]);
+        assert_eq!(frames_of(&[2]), [1]);
+        assert_eq!(frames_of(&[8; 19]), [8, 8, 3]);
+        assert_eq!(frames_of(&[1486, 2, 1400, 61]), [1, 2, 1]);
     }
 }

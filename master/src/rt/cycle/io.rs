@@ -15,7 +15,7 @@ impl Engine {
     pub(super) fn send(&mut self, lateness: Nanos) {
         let sent = self.exchange.send(self.link.as_mut(), lateness);
         self.note(sent);
-        // Mailbox frames follow the cyclic ones, one per cycle.
+        // One frame with mailbox and other datagrams follows the cyclic ones.
         let sent = self.port.send_one(self.link.as_mut());
         self.note(sent);
     }
