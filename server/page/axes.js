@@ -1,6 +1,6 @@
 // The axes: state, values against their limits, and commands.
 
-import { decimals, figure, h, mark, set } from "./dom.js";
+import { decimals, figure, h, hex, mark, NONE, set } from "./dom.js";
 
 /** Percent of the velocity limit, as in manual operation in the terminal. */
 const JOG_SPEEDS = [1, 2, 5, 10, 15, 20, 25];
@@ -146,7 +146,8 @@ class Card {
         meter("following_error", "Following error", axis.unit, both(limits.following_error), digits.error)),
       h("dl", { class: "pairs" },
         h("div", {}, h("dt", { text: "Target" }), part("target", "dd", { "data-value": "target_position" })),
-        h("div", {}, h("dt", { text: "Largest following error" }), part("largest", "dd", {}))),
+        h("div", {}, h("dt", { text: "Largest following error" }), part("largest", "dd", {})),
+        ...["statusword", "controlword"].map((key) => h("div", { class: "word" }, h("dt", { text: key[0].toUpperCase() + key.slice(1) }), part(key, "dd", { "data-value": key })))),
       this.#commands(jogPercent));
     this.#part.digits = digits;
     // Until the first state is there.
@@ -226,6 +227,11 @@ class Card {
     this.#meters.following_error.update(state.following_error, null);
     set(part.target, `${figure(state.target_position, part.digits.position)} ${unit}`);
     set(part.largest, `${figure(state.max_following_error, part.digits.error)} ${unit}`);
+    for (const key of ["statusword", "controlword"]) {
+      const text = Number.isFinite(state[key]) ? `${hex(state[key])} ${state[`${key}_text`]}` : NONE;
+      set(part[key], text);
+      mark(part[key], "title", text);
+    }
     for (const button of this.#buttons) {
       const op = button.dataset.op;
       const needsPower = op === "move" || op === "home" || button.dataset.jog !== undefined;

@@ -1,6 +1,6 @@
 // The bus: topology, device states, ports, clocks, counters, inputs and outputs.
 
-import { count, duration, figure, h, mark, NONE, set, svg } from "./dom.js";
+import { count, duration, figure, h, hex, mark, NONE, set, svg } from "./dom.js";
 
 const BOX = { width: 172, height: 86, gapX: 30, gapY: 34, margin: 30 };
 
@@ -143,7 +143,7 @@ export class Bus {
 const alName = (state) => (state?.answers === false ? "no answer" : (state?.al_state ?? "no state"));
 const alLevel = (state) => (state?.al_code || state?.answers === false ? "bad" : ({ Op: "good", SafeOp: "busy", PreOp: "busy", Init: "idle" }[state?.al_state] ?? "unknown"));
 const portErrors = (port) => (port.invalid_frames ?? 0) + (port.rx_errors ?? 0) + (port.forwarded_errors ?? 0) + (port.lost_links ?? 0);
-const alText = (state) => (state?.al_code ? `0x${state.al_code.toString(16).padStart(4, "0")}${state.al_text ? ` ${state.al_text}` : ""}` : "");
+const alText = (state) => (state?.al_code ? `${hex(state.al_code)}${state.al_text ? ` ${state.al_text}` : ""}` : "");
 
 class Box {
   #part = {};

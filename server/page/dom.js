@@ -48,6 +48,9 @@ export function figure(value, decimals) {
   return value < 0 && Number(text) !== 0 ? `−${text}` : text;
 }
 
+/** Returns a word of 16 bits in hex. */
+export const hex = (value) => `0x${Math.round(value).toString(16).padStart(4, "0")}`;
+
 /** Returns the decimals with which a value of this size has `significant` digits. */
 export function decimals(size, significant = 5) {
   if (!(size > 0) || !Number.isFinite(size)) return 3;

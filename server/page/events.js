@@ -1,6 +1,6 @@
 // Events with a filter, and the recordings.
 
-import { count, h, mark, message, save, set } from "./dom.js";
+import { count, h, hex, mark, message, save, set } from "./dom.js";
 
 const KINDS = {
   client: "Clients",
@@ -24,7 +24,7 @@ function textOf(event) {
     case "group_released": return `group ${event.group} is released${why}`;
     case "fault": return event.why ?? "fault";
     case "fault_report": return event.headline ?? "";
-    case "emergency": return `${typeof event.code === "number" ? `0x${event.code.toString(16).padStart(4, "0")} ` : ""}${event.text ?? ""}`;
+    case "emergency": return `${typeof event.code === "number" ? `${hex(event.code)} ` : ""}${event.text ?? ""}`;
     case "captured": return `${event.input} captured ${event.position}`;
     case "stream": return `stream: ${event.state}${why}`;
     case "client": return `client ${event.client} ${event.connected ? "connected" : "disconnected"}${event.pid ? ` (process ${event.pid}, user ${event.uid})` : ""}`;

@@ -1,6 +1,6 @@
 // Drawing on a canvas: signals over time in one lane per unit, or one signal over another.
 
-import { duration, figure } from "./dom.js";
+import { duration, figure, hex } from "./dom.js";
 
 const LEFT = 68;
 const RIGHT = 12;
@@ -172,7 +172,7 @@ function drawGrid(context, { unit, label, top, height, range, y }, left, right, 
   for (let n = Math.ceil(range[0] / step - 1e-9); n * step <= range[1] + step * 1e-9; n++) {
     const value = n * step;
     stroke(context, left, y(value), right, y(value));
-    const text = unit === "s" ? duration(value * 1e9) : unit === "bits" ? `0x${Math.round(value).toString(16)}` : figure(value, Math.min(9, digits));
+    const text = unit === "s" ? duration(value * 1e9) : unit === "bits" ? hex(value) : figure(value, Math.min(9, digits));
     context.fillText(text, left - 6, Math.min(top + height - 5, Math.max(top + 6, y(value))));
   }
   context.strokeStyle = colour.line;

@@ -1,7 +1,7 @@
 // The scope: signals of every cycle, live, on a trigger, or from the history.
 
 import { readHistory } from "./connection.js";
-import { decimals, duration, figure, h, mark, message, quantity, save, set } from "./dom.js";
+import { decimals, duration, figure, h, hex, mark, message, quantity, save, set } from "./dom.js";
 import { drawTime, drawXY, forgetColours, laneKey, Scales, SERIES } from "./plot.js";
 import { fromHistory, rowAt, Samples, Trigger } from "./samples.js";
 
@@ -514,7 +514,7 @@ export class Scope {
     part.rows.forEach((row, k) => {
       const unit = this.#units.get(row.name) ?? "";
       const digits = () => Math.min(5, decimals(Math.max(Math.abs(least), Math.abs(greatest)), 5));
-      const text = (value) => (unit === "bits" && Number.isFinite(value) ? `0x${Math.round(value).toString(16).padStart(4, "0")}` : quantity(value, unit, digits()));
+      const text = (value) => (unit === "bits" && Number.isFinite(value) ? hex(value) : quantity(value, unit, digits()));
       const at = (index) => (index < 0 ? NaN : data.oneCycle ? data.least[k][index] : (data.least[k][index] + data.greatest[k][index]) / 2);
       let [least, greatest] = [Infinity, -Infinity];
       if (shown) {

@@ -1,6 +1,6 @@
 //! The state of bus, devices and axes as ROS diagnostics.
 
-use ecaxis_axis::AxisStatus;
+use ecaxis_axis::{AxisStatus, Controlword, Statusword};
 use ecaxis_ecat::al_status_code::al_status_text;
 use ecaxis_master::acyclic::AlState;
 use ecaxis_master::config::{AxisSetup, DeviceConfig};
@@ -125,10 +125,19 @@ fn axis(setup: &AxisSetup, device: &str, status: Option<&AxisStatus>) -> Diagnos
                 (None, Some(waiting)) => (DiagnosticLevel::Warn, waiting),
                 (None, None) => (DiagnosticLevel::Ok, status.state.to_string()),
             };
+            let statusword = Statusword::from_bits_retain(status.statusword);
+            let controlword = Controlword::from_bits_retain(status.controlword);
             let values = vec![
                 ("state", status.state.to_string()),
                 ("mode", status.mode.to_string()),
-                ("statusword", format!("{:#06x}", status.statusword)),
+                (
+                    "statusword",
+                    format!("{:#06x}: {statusword}", statusword.bits()),
+                ),
+                (
+                    "controlword",
+                    format!("{:#06x}: {controlword}", controlword.bits()),
+                ),
                 ("homed", status.homed.to_string()),
             ];
             (level, message, values)

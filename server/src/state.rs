@@ -2,7 +2,7 @@
 
 use std::sync::atomic::Ordering;
 
-use ecaxis_axis::{AxisStatus, Mode};
+use ecaxis_axis::{AxisStatus, Controlword, Mode, Statusword};
 use ecaxis_ecat::al_status_code::al_status_text;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 use ecaxis_esi::address;
@@ -238,7 +238,9 @@ fn axis_state(
                       "mode": Value::Null, "position": Value::Null, "velocity": Value::Null,
                       "torque": Value::Null, "target_position": Value::Null,
                       "target_velocity": Value::Null, "target_torque": Value::Null,
-                      "following_error": Value::Null, "waiting": Value::Null,
+                      "following_error": Value::Null, "statusword": Value::Null,
+                      "statusword_text": Value::Null, "controlword": Value::Null,
+                      "controlword_text": Value::Null, "waiting": Value::Null,
                       "fault": Value::Null, "trip": Value::Null, "stop": Value::Null,
                       "stopped": Value::Null});
     };
@@ -281,7 +283,9 @@ fn known_state(setup: &AxisSetup, status: &AxisStatus) -> Value {
         "following_error": status.following_error,
         "max_following_error": status.max_following_error,
         "statusword": status.statusword,
+        "statusword_text": Statusword::from_bits_retain(status.statusword).to_string(),
         "controlword": status.controlword,
+        "controlword_text": Controlword::from_bits_retain(status.controlword).to_string(),
         "stale_cycles": status.stale_cycles,
         "waiting": text(status.waiting.map(|waiting| waiting.to_string())),
         "fault": text(status.fault.map(|fault| fault.to_string())),

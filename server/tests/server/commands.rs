@@ -15,6 +15,12 @@ fn a_client_enables_moves_and_disables() {
     let answer = client.done("move", json!({"axis": "x", "to": 20.0, "speed": 0.5}));
     assert!(answer["request"].as_u64().is_some());
     let axis = client.axis("x");
+    // In CSP, bit 12 says that the drive follows the command value (CiA 402-2).
+    assert_eq!(axis["statusword"], json!(0x1237));
+    let text = "Operation enabled, bit 12";
+    assert_eq!(axis["statusword_text"], json!(text));
+    assert_eq!(axis["controlword"], json!(0x000f));
+    assert_eq!(axis["controlword_text"], json!("enable operation"));
     assert_eq!(axis["target_position"], json!(20.0));
     assert_eq!(axis["in_target"], json!(true));
     client.done("move", json!({"axis": "x", "by": -5.0}));
