@@ -13,5 +13,6 @@ mod init;
 mod messages;
 mod mistakes;
 mod output;
+mod rights;
 mod signatures;
 mod terminal;

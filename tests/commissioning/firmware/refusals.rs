@@ -79,6 +79,68 @@ fn a_wrong_file_is_rejected_and_the_right_one_accepted_afterwards() {
     }
 }
 
+/// Takes the device under test to a state, as another MainDevice would leave it.
+fn bring_to(bench: &mut Bench, wanted: AlState) {
+    let position = bench.position;
+    let work = async move |wire: DatagramClient| {
+        let at = device::locate(&wire, Locator::Position(position), None).await;
+        let (_, at) = at.expect("located");
+        let devices = std::slice::from_ref(&at);
+        let change = async |state| al::change_state(&wire, devices, state, START_TIMEOUT).await;
+        if wanted == AlState::Init {
+            return;
+        }
+        let sii = device::read_sii(&wire, &at, EepromAccess::IfFree).await;
+        let sii = sii.expect("read");
+        mailbox::open(&wire, &at, &sii).await.expect("in PreOp");
+        if wanted == AlState::SafeOp {
+            // The SyncManagers of the default process data, from the EEPROM.
+            for (number, sm) in sii.sync_managers.iter().enumerate().skip(2) {
+                let register = 0x0800 + 8 * u16::try_from(number).expect("few");
+                let [[a, b], [c, d]] = [sm.start_address, sm.len].map(u16::to_le_bytes);
+                let bytes = [a, b, c, d, sm.control, 0, 1, 0];
+                let written = wire.write(at.station, register, &bytes).await;
+                assert_eq!(written, Ok(1));
+            }
+            change(wanted).await.expect("in SafeOp");
+        }
+    };
+    let never = CancelToken::default();
+    run_on_link(&mut bench.link, Clock::Virtual, &never, work).expect("carried");
+    assert_eq!(bench.device().al_state().to_string(), wanted.to_string());
+}
+
+/// Once, a refusal left the device in Bootstrap, or in Init.
+#[test]
+fn a_device_that_refuses_a_file_is_in_its_earlier_state_afterwards() {
+    for state in [AlState::Init, AlState::PreOp, AlState::SafeOp] {
+        for &via in ways(0) {
+            on_a_bus(demo, 0, move |bench| {
+                bring_to(bench, state);
+                let error = bench.update(via, &[0x5a; 5000], &mut |_| {});
+                let error = error.expect_err("noise");
+                let FirmwareError::Failed { left, .. } = &error else {
+                    panic!("{error}")
+                };
+                // The program was erased before the download: its boot loader has no process data.
+                let (state, code) = match (via, state) {
+                    (UpdateMethod::Program, AlState::SafeOp) => (AlState::PreOp, 0x0014),
+                    _ => (state, 0),
+                };
+                assert_eq!(
+                    *left,
+                    FinalDeviceState::In { state, code },
+                    "{via}: {error}"
+                );
+                assert_eq!(bench.device().al_state().to_string(), state.to_string());
+                // Its objects can be read there, and the right file is accepted.
+                assert!(bench.examine().spoken.is_some());
+                bench.succeeds(via, &file(0, 5000));
+            });
+        }
+    }
+}
+
 #[test]
 fn a_device_of_another_type_is_not_changed() {
     on_a_bus(demo, 0, |bench| {
