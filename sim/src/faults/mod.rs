@@ -255,10 +255,38 @@ impl Faults {
             .any(|fault| fault.device == device && fault.kind == FaultKind::LinkBreak { port })
     }
 
+    /// Returns the times at which cables will lose their link, before `end`: at the port of a device;
+    /// without a port at all of them; without a device at the MainDevice.
+    pub(crate) fn cuts_before(&self, end: Nanos) -> impl Iterator<Item = Cut> + '_ {
+        let pending = self.running.iter().filter(|r| r.phase == Phase::Pending);
+        let pending = pending.map(|r| &r.fault).filter(move |f| f.at < end);
+        pending.filter_map(|fault| {
+            let (device, port) = match fault.kind {
+                FaultKind::LinkBreak { port } => (Some(fault.device), Some(port)),
+                FaultKind::PowerOff => (Some(fault.device), None),
+                FaultKind::Silent => (None, None),
+                _ => return None,
+            };
+            Some(Cut {
+                at: fault.at,
+                device,
+                port,
+            })
+        })
+    }
+
     /// True if the cable at the MainDevice is unplugged.
     pub(crate) fn is_silent(&self) -> bool {
         self.active().any(|fault| fault.kind == FaultKind::Silent)
     }
+}
+
+/// The loss of a link.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Cut {
+    pub at: Nanos,
+    pub device: Option<usize>,
+    pub port: Option<u8>,
 }
 
 impl ActiveFault {

@@ -371,7 +371,10 @@ impl Segment {
             self.run_to(to);
             return FrameOutcome::Lost;
         }
-        let came_through = match fate.corrupted.and_then(|at| self.corrupted_pass(nic, at)) {
+        let corrupted = fate.corrupted.and_then(|at| self.corrupted_pass(nic, at));
+        let cut = self.cut_pass(nic, start, wire);
+        let first = [corrupted, cut].into_iter().flatten().min();
+        let came_through = match first {
             Some(pass) => {
                 self.run_to(to);
                 self.walk_corrupted(nic, bytes, start, pass);

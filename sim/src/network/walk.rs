@@ -2,7 +2,8 @@
 
 use std::cmp::Ordering;
 
-use super::route::{PortPass, Route};
+use super::route::{Destination, PortPass, Route};
+use super::wiring::End;
 use super::{Nic, Segment};
 use crate::Nanos;
 use crate::device::{FrameEffects, SimDevice};
@@ -138,6 +139,34 @@ impl Segment {
                 .position(|pass| pass.device == device && pass.port == port),
             BitFlip::Somewhere(lot) => usize::try_from(lot % (passes.len() as u64 + 1)).ok(),
         }
+    }
+
+    /// Returns the index of the port pass at which a cable loses its link before the frame has passed
+    /// it, as [`Segment::corrupted_pass`] does.
+    pub(super) fn cut_pass(&self, nic: Nic, start: Nanos, wire: Nanos) -> Option<usize> {
+        let route = &self.routes[nic as usize];
+        let end = start + route.time + wire;
+        if self.next_change >= end {
+            return None;
+        }
+        let back = match route.goal {
+            Destination::Back(nic) => Some((End::MainDevice(nic), route.time)),
+            Destination::Nowhere | Destination::Closed { .. } => None,
+        };
+        let passes = route.passes.iter().map(|pass| {
+            let (device, port) = (pass.device, pass.port);
+            (End::Port { device, port }, pass.after)
+        });
+        let mut arrivals = passes.chain(back);
+        let cuts = || self.faults.cuts_before(end);
+        arrivals.position(|(at, after)| {
+            let cable = self
+                .wiring
+                .cable(at)
+                .and_then(|n| self.wiring.cables.get(n));
+            let ends = cable.map_or(&[][..], |cable| &cable.ends);
+            cuts().any(|cut| start + after + wire > cut.at && ends.iter().any(|end| cut.hits(*end)))
+        })
     }
 
     /// Like [`Segment::walk`] up to port pass `first`. From there on, devices only count the frame.

@@ -3,6 +3,7 @@
 use super::topology::{SecondPort, Topology};
 use crate::device::SimDevice;
 use crate::esc::ports::{Medium, PORTS};
+use crate::faults::Cut;
 
 /// A port of the MainDevice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -17,6 +18,19 @@ pub enum Nic {
 pub(super) enum End {
     MainDevice(Nic),
     Port { device: usize, port: u8 },
+}
+
+impl Cut {
+    /// True if the cable at this end loses its link.
+    pub(super) fn hits(self, end: End) -> bool {
+        match (self.device, end) {
+            (None, End::MainDevice(nic)) => nic == Nic::Primary,
+            (Some(cut), End::Port { device, port }) => {
+                cut == device && self.port.is_none_or(|cut| cut == port)
+            }
+            _ => false,
+        }
+    }
 }
 
 #[derive(Debug, Clone)]
