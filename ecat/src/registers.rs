@@ -18,6 +18,8 @@ pub const FMMU_COUNT: u16 = 0x0004;
 pub const FEATURES: u16 = 0x0008;
 /// Configured station address.
 pub const STATION_ADDRESS: u16 = 0x0010;
+/// DL control: forwarding rule, temporary use, and the loop of each port.
+pub const DL_CONTROL: u16 = 0x0100;
 /// DL status: links and loops of the ports.
 pub const DL_STATUS: u16 = 0x0110;
 /// AL control: the state that the MainDevice requests.

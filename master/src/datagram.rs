@@ -12,6 +12,7 @@ use ethercrab::{Command, MainDevice, WrappedRead, WrappedWrite};
 use crate::cancel::CancelToken;
 use crate::clock::{self, Nanos};
 use crate::link::pdu_loop::{MAX_DATAGRAMS, MAX_JOINED};
+use crate::link::redundant::{RingState, RingStatus};
 use crate::mailbox::{DatagramError, MailboxStatus, MailboxTransport};
 use crate::rt::exchange::BusStatus;
 use limiter::InFlightLimiter;
@@ -28,6 +29,7 @@ pub struct DatagramClient {
     device: &'static MainDevice<'static>,
     turns: &'static InFlightLimiter,
     stop: &'static CancelToken,
+    ring: Option<&'static RingStatus>,
 }
 
 impl DatagramClient {
@@ -49,7 +51,20 @@ impl DatagramClient {
             device,
             turns: Box::leak(Box::new(InFlightLimiter::new(max))),
             stop: Box::leak(Box::default()),
+            ring: None,
         }
+    }
+
+    /// Sets the ring that the datagrams take, as the link reports it.
+    #[must_use]
+    pub fn in_ring(self, ring: Option<&'static RingStatus>) -> Self {
+        Self { ring, ..self }
+    }
+
+    /// Returns the state of the ring, with cable redundancy.
+    #[must_use]
+    pub fn ring(&self) -> Option<RingState> {
+        self.ring.map(RingStatus::get)
     }
 
     #[must_use]

@@ -146,6 +146,9 @@ impl Observer for Reporter<'_> {
                 "event": "device_returned", "device": device.name, "after_s": *after_ns as f64 * 1e-9,
                 "restarted": restarted,
             })),
+            Progress::Ring { text, broken } => {
+                hub.event(json!({"event": "ring", "broken": broken, "text": text}));
+            }
             Progress::Warning(text) => warning(hub, text),
             Progress::Denied(denied) => warning(hub, &denied.to_string()),
             Progress::Overload(risk) => warning(hub, &risk.to_string()),

@@ -16,18 +16,25 @@ use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{self, Clock, Nanos};
 use ecaxis_master::config::{AxisRef, Machine};
 use ecaxis_master::link::capture::{Recorder, WriterMode};
+use ecaxis_master::link::filter::LinkStats;
+use ecaxis_master::link::redundant::{End, RedundantLink, RingEnds};
+use ecaxis_master::link::sim::{SimLink, SimRing};
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
 use ecaxis_master::mailbox::DeviceMailbox;
 use ecaxis_master::recording::Direction;
 use ecaxis_master::rt::controller::{Controller, CycleContext};
 use ecaxis_master::rt::cycle::{Engine, EngineReport};
 use ecaxis_master::samples::{SampleLayout, Samples};
-use ecaxis_master::session::{Attachments, Cause, Error, Options, Prepared, Progress, RunBuilder};
+use ecaxis_master::session::{
+    Attachments, Cause, Error, Options, Prepared, Progress, RunBuilder, simulated_bus,
+    simulated_link,
+};
 use ecaxis_master::sys::shared_memory::SharedMemory;
 use ecaxis_server::external::{
     AreaCounters, External, ExternalClient, Message, Report, StreamPoint, command_area, external,
     words,
 };
+use ecaxis_sim::SecondPort;
 use ecaxis_test_support::{axes, faults, load, machine, virtual_time};
 
 /// The machine time whose samples are kept.
@@ -100,6 +107,32 @@ impl Link for Unmetered {
     }
 }
 
+/// Both ends of a simulated ring, unmetered.
+#[derive(Debug)]
+struct UnmeteredEnds(SimRing);
+
+impl RingEnds for UnmeteredEnds {
+    fn send(&mut self, from: End, frame: &[u8]) -> Result<(), LinkError> {
+        unmetered(|| self.0.send(from, frame))
+    }
+
+    fn recv(&mut self, at: End, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+        unmetered(|| self.0.recv(at, buf))
+    }
+
+    fn next_arrival(&self) -> Option<Nanos> {
+        self.0.next_arrival()
+    }
+
+    fn main_devices(&self) -> u64 {
+        self.0.main_devices()
+    }
+
+    fn stats(&mut self) -> LinkStats {
+        self.0.stats()
+    }
+}
+
 #[test]
 fn the_counter_counts_allocations() {
     METERED.set(true);
@@ -146,6 +179,19 @@ fn metered(
     (counted, remains, ended)
 }
 
+/// Returns the simulated bus of a machine. With cable redundancy, only the bus behind both interfaces
+/// is not metered.
+fn unmetered_bus(machine: &Machine, options: &Options) -> Box<dyn Link> {
+    let (seed, faults) = (options.seed, options.faults.as_ref());
+    if machine.bus.redundant.is_none() {
+        let link = simulated_link(machine, seed, faults).expect("a bus");
+        return Box::new(Unmetered(link));
+    }
+    let bus = simulated_bus(machine, seed, faults, Some(SecondPort::Listens)).expect("a ring");
+    let ends = UnmeteredEnds(SimRing(SimLink::new(bus)));
+    Box::new(RedundantLink::new(Box::new(ends), machine.bus.cycle_ns / 2))
+}
+
 /// Same as `metered`, with repeated mailbox reads of the first devices. Returns the number of
 /// transfers as well.
 fn metered_among_users(
@@ -160,6 +206,7 @@ fn metered_among_users(
     let stop = Arc::<CancelToken>::default();
     // Every cycle also writes its sample.
     let samples = Samples::create(SampleLayout::new(&machine), SAMPLES_NS).expect("memory");
+    let link = unmetered_bus(&machine, options);
     let job = RunBuilder {
         machine: &Arc::new(machine),
         options,
@@ -171,11 +218,7 @@ fn metered_among_users(
             ..Attachments::default()
         },
     };
-    let Prepared {
-        mut parts,
-        supervisor,
-    } = job.prepare().expect("comes up");
-    parts.link = Box::new(Unmetered(parts.link));
+    let Prepared { parts, supervisor } = job.prepare_on(link).expect("comes up");
     let mut engine = Engine::new(parts);
     let mut during = pin!(supervisor.run());
     let mut context = Context::from_waker(Waker::noop());
@@ -363,6 +406,19 @@ fn the_return_of_a_device_allocates_nothing_in_the_cycle() {
     let (counted, remains, result) = metered(machine(&text), &faults(off), None, 20_000);
     assert!(matches!(result, Some(Ok(()))), "{result:?}");
     assert!(remains.stats.counters.wkc_errors > 500);
+    assert_eq!(counted, 0);
+}
+
+/// A cable of a ring breaks and is repaired.
+#[test]
+fn a_broken_ring_allocates_nothing_in_the_cycle() {
+    let text = axes(4).replace("nic = \"sim\"", "nic = \"sim\"\nredundant = \"sim2\"");
+    assert!(text.contains("redundant"));
+    let cut =
+        "[[fault]]\nkind = \"link-break\"\ndevice = 2\nport = 0\nat = \"1s\"\nfor = \"500ms\"\n";
+    let (counted, remains, result) = metered(machine(&text), &faults(cut), None, 20_000);
+    assert!(matches!(result, Some(Ok(()))), "{result:?}");
+    assert!(remains.stats.counters.lost_frames <= 1);
     assert_eq!(counted, 0);
 }
 

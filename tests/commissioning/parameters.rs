@@ -446,8 +446,7 @@ fn a_written_alias_applies_after_the_next_power_on() {
             assert_eq!(found.position, 0);
             let image = plan(&by_alias.rt_config().devices).expect("a plan");
             let answers = ScanAnswers::default();
-            let main_device = wire.main_device();
-            let bus = bring_up(main_device, &answers, &by_alias, image, &|_| {}, &Deaf).await;
+            let bus = bring_up(wire, &answers, &by_alias, image, &|_| {}, &Deaf).await;
             let bus = bus.unwrap_or_else(|error| panic!("{error}"));
             let x = &bus.devices[DeviceIndex(0)].at;
             assert_eq!((x.name.as_str(), x.position), ("x", 0));

@@ -8,4 +8,5 @@ mod causes;
 mod failures;
 mod groups;
 mod limits;
+mod redundancy;
 mod returns;

@@ -17,6 +17,9 @@ use crate::hints::{self, Failure};
 use crate::render::note;
 use crate::render::output;
 
+/// How long the second copy of a frame is awaited in a ring without a cycle.
+const COPY_TIMEOUT_NS: u64 = 5_000_000;
+
 #[derive(Debug)]
 pub(crate) struct Bus {
     on: BusKind,
@@ -28,7 +31,12 @@ pub(crate) struct Bus {
 
 #[derive(Debug)]
 enum BusKind {
-    Interface { nic: String, back_end: SocketKind },
+    Interface {
+        nic: String,
+        /// The interface at the other end of a ring.
+        second: Option<String>,
+        back_end: SocketKind,
+    },
     Sim(Box<Machine>),
 }
 
@@ -39,7 +47,13 @@ impl Bus {
             Nic::Sim => (BusKind::Sim(Box::new(machine.clone())), Clock::Virtual),
             Nic::Interface(nic) => {
                 let (nic, back_end) = (nic.clone(), machine.bus.link);
-                (BusKind::Interface { nic, back_end }, Clock::Real)
+                let second = machine.bus.redundant.clone();
+                let on = BusKind::Interface {
+                    nic,
+                    second,
+                    back_end,
+                };
+                (on, Clock::Real)
             }
         };
         let options = Options {
@@ -56,7 +70,11 @@ impl Bus {
     pub fn interface(nic: &str) -> Self {
         let (nic, back_end) = (nic.to_owned(), SocketKind::default());
         Self {
-            on: BusKind::Interface { nic, back_end },
+            on: BusKind::Interface {
+                nic,
+                second: None,
+                back_end,
+            },
             options: Options::default(),
             alone: false,
         }
@@ -114,18 +132,29 @@ impl Bus {
         let link: Box<dyn Link> = match on {
             BusKind::Sim(machine) => {
                 let faults = options.faults.as_ref();
-                let segment = session::simulated_bus(&machine, options.seed, faults, None)?;
-                Box::new(link::sim::SimLink::new(segment))
+                session::simulated_link(&machine, options.seed, faults)?
             }
-            BusKind::Interface { nic, back_end } => {
-                // Interface settings that only disturb a cycle are irrelevant here.
-                let (mut link, _) = match alone {
-                    true => link::open_exclusive(&nic, back_end)?,
-                    false => link::open(&nic, back_end)?,
+            BusKind::Interface {
+                nic,
+                second,
+                back_end,
+            } => {
+                let open = |nic: &str| -> Result<Box<dyn Link>, Error> {
+                    // Interface settings that only disturb a cycle are irrelevant here.
+                    let (mut link, _) = match alone {
+                        true => link::open_exclusive(nic, back_end)?,
+                        false => link::open(nic, back_end)?,
+                    };
+                    let frames = link::sniff_foreign_frames(link.as_mut(), Instant::now())
+                        .map_err(Cause::Link)?;
+                    heard.fetch_add(frames, Ordering::Relaxed);
+                    Ok(link)
                 };
-                let frames = link::sniff_foreign_frames(link.as_mut(), Instant::now())
-                    .map_err(Cause::Link)?;
-                heard.store(frames, Ordering::Relaxed);
+                let first = open(&nic)?;
+                let link = match second {
+                    None => first,
+                    Some(second) => session::ring(first, open(&second)?, COPY_TIMEOUT_NS),
+                };
                 // Another ecaxis may drive a machine on this interface.
                 Box::new(link::source_address::PrivateMacLink::new(
                     link,

@@ -50,8 +50,9 @@ impl BusArgs {
                 return Err(Failure::new(WRONG, message).hint("add --sim"));
             }
         }
+        let ring = machine.bus.redundant.as_ref().map(|_| SecondPort::Listens);
         let script = self.faults.as_deref();
-        script.map(|path| faults(path, machine, None)).transpose()
+        script.map(|path| faults(path, machine, ring)).transpose()
     }
 }
 

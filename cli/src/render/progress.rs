@@ -144,7 +144,13 @@ impl Observer for ProgressPrinter {
                     note(&format!("  = help: {help}"));
                 }
             }
-            Progress::Warning(text) => note(&format!("warning: {text}")),
+            Progress::Ring {
+                text,
+                broken: false,
+            } => note(text),
+            Progress::Ring { text, .. } | Progress::Warning(text) => {
+                note(&format!("warning: {text}"));
+            }
             Progress::Emergency(report) => note(&format!("warning: {report}")),
             Progress::Topology(_) | Progress::Mailboxes(_) => {}
             Progress::GroupStopped { group, cause } => {

@@ -3,10 +3,13 @@
 use ecaxis_ecat::registers;
 
 use super::enumerate;
-use super::topology::{PORT_ORDER, ParentPort, open_ports, parents};
+use super::topology::{PORT_ORDER, ParentPort, open_ports, parents, ring_end};
+use crate::concurrent::try_join_all;
 use crate::datagram::DatagramClient;
+use crate::link::redundant::RingState;
 use crate::report::{Cause, Error};
 
+const STEP: &str = "measuring propagation delays";
 /// The number of measurements for a mean: receive times have a resolution of 10 ns.
 const LATCHES: u32 = 8;
 
@@ -27,9 +30,31 @@ pub const fn has_receive_times(features: u16) -> bool {
     features & DC != 0
 }
 
+/// Reads what [`measure`] needs to know of all devices, with their station addresses.
+///
+/// # Errors
+/// A device that does not answer.
+pub async fn devices(wire: &DatagramClient) -> Result<(Vec<u16>, Vec<MeasuredDevice>), Error> {
+    let each = (0..enumerate::count(wire).await?).map(async |position| {
+        let word = async |register| {
+            let bytes = enumerate::at(wire, position, STEP, register).await?;
+            Ok::<_, Error>(u16::from_le_bytes(bytes))
+        };
+        let device = MeasuredDevice {
+            position,
+            dl_status: word(registers::DL_STATUS).await?,
+            receive_times: has_receive_times(word(registers::FEATURES).await?),
+        };
+        Ok::<_, Error>((word(registers::STATION_ADDRESS).await?, device))
+    });
+    let devices = try_join_all(each).await?;
+    Ok(devices.into_iter().unzip())
+}
+
 /// Returns the one-way delays in ns from the first device with receive times; `None` for devices
 /// without them. `devices` are all devices of the segment, in order. Latching receive times disturbs
-/// another measurement only.
+/// another measurement only. A closed ring is open meanwhile. In a broken one, the delays of the line
+/// behind the break count from the second interface.
 ///
 /// # Errors
 /// A device that does not answer.
@@ -37,31 +62,96 @@ pub async fn measure(
     wire: &DatagramClient,
     devices: &[MeasuredDevice],
 ) -> Result<Vec<Option<u32>>, Error> {
-    const STEP: &str = "measuring propagation delays";
-    let uplinks = parents(devices.iter().map(|device| device.dl_status));
-    let nodes = devices.iter().zip(uplinks);
+    match wire.ring() {
+        Some(RingState::Closed) => {
+            let end = ring_end(devices.iter().map(|device| device.dl_status));
+            let Some(end) = end else {
+                return Ok(vec![None; devices.len()]);
+            };
+            // A frame passes each port once in a closed ring, and a delay needs two times.
+            let control = open_ring(wire, end).await?;
+            let mut line = devices.to_vec();
+            if let Some(last) = line.get_mut(usize::from(end.device)) {
+                last.dl_status |= 1 << (8 + 2 * end.port);
+            }
+            let measured = Box::pin(measure_lines(wire, &line, line.len())).await;
+            write_loops(wire, end, control).await?;
+            measured
+        }
+        Some(RingState::Broken { behind, .. }) => {
+            measure_lines(wire, devices, usize::from(behind).min(devices.len())).await
+        }
+        Some(RingState::Silent) | None => measure_lines(wire, devices, devices.len()).await,
+    }
+}
+
+/// Closes the port of the last device that leads to the second interface, for at most a second.
+/// Returns the setting before.
+async fn open_ring(wire: &DatagramClient, end: ParentPort) -> Result<[u8; 2], Error> {
+    const TEMPORARY: u8 = 0x02;
+    const CLOSED: u8 = 0x03;
+    let control: [u8; 2] = enumerate::at(wire, end.device, STEP, registers::DL_CONTROL).await?;
+    let [rule, loops] = control;
+    let opened = [rule | TEMPORARY, loops | CLOSED << (2 * end.port)];
+    write_loops(wire, end, opened).await?;
+    Ok(control)
+}
+
+async fn write_loops(wire: &DatagramClient, end: ParentPort, to: [u8; 2]) -> Result<(), Error> {
+    let written = wire.write_at(end.device, registers::DL_CONTROL, &to).await;
+    match written {
+        Ok(1) => Ok(()),
+        answer => Err(enumerate::no_answer(end.device, STEP, answer)),
+    }
+}
+
+/// Measures a line that a frame of the first interface passes, and one behind it that a frame of the
+/// second interface passes.
+async fn measure_lines(
+    wire: &DatagramClient,
+    devices: &[MeasuredDevice],
+    first: usize,
+) -> Result<Vec<Option<u32>>, Error> {
+    let (line, other) = devices.split_at(first);
+    let uplinks = parents(line.iter().map(|device| device.dl_status));
+    let nodes = line.iter().zip(uplinks);
     let nodes: Vec<_> = nodes
         .map(|(device, uplink)| TreeNode {
             open: open_ports(device.dl_status),
             uplink,
         })
         .collect();
+    let entries = entries(other);
     let mut sums: Vec<Option<i64>> = vec![None; devices.len()];
     for _ in 0..LATCHES {
         wire.write_all(registers::DC_RECEIVE_TIME, &[0; 4])
             .await
             .map_err(|error| Error::from(Cause::Datagram(error)).with_action(STEP))?;
-        let mut times = Vec::with_capacity(devices.len());
-        for device in devices {
-            times.push(if device.receive_times {
-                let register = registers::DC_RECEIVE_TIME;
-                let bytes = enumerate::at(wire, device.position, STEP, register).await?;
-                Some(receive_times(bytes))
-            } else {
-                None
-            });
-        }
-        for (sum, delay) in sums.iter_mut().zip(delays(&nodes, &times)) {
+        let times = devices.iter().map(async |device| {
+            if !device.receive_times {
+                return Ok::<_, Error>(None);
+            }
+            let (at, register) = (device.position, registers::DC_RECEIVE_TIME);
+            let ports = receive_times(enumerate::at(wire, at, STEP, register).await?);
+            Ok(Some(ports))
+        });
+        let times = try_join_all(times).await?;
+        let processed = other.iter().map(async |device| {
+            if !device.receive_times {
+                return Ok::<_, Error>(None);
+            }
+            let (at, register) = (device.position, registers::DC_RECEIVE_TIME_UNIT);
+            let bytes = enumerate::at(wire, at, STEP, register).await?;
+            Ok(Some(u32::from_le_bytes(bytes)))
+        });
+        let processed = try_join_all(processed).await?;
+        let (times, other_times) = times.split_at(first);
+        let measured = delays(&nodes, times).into_iter().chain(delays_from_end(
+            &entries,
+            other_times,
+            &processed,
+        ));
+        for (sum, delay) in sums.iter_mut().zip(measured) {
             if let Some(delay) = delay {
                 *sum = Some(sum.unwrap_or(0) + delay);
             }
@@ -69,6 +159,95 @@ pub async fn measure(
     }
     let mean = |sum: i64| u32::try_from((sum / i64::from(LATCHES)).max(0)).unwrap_or(u32::MAX);
     Ok(sums.into_iter().map(|sum| sum.map(mean)).collect())
+}
+
+/// Returns the delays in a closed ring, from those of a ring that was broken behind `first` devices. The
+/// cable at the break is taken to be as long as the others.
+#[must_use]
+pub fn joined(measured: &[Option<u32>], first: usize) -> Vec<Option<u32>> {
+    let (line, other) = measured.split_at(first.min(measured.len()));
+    let (Some(before), Some(after)) = (
+        line.iter().rev().find_map(|delay| *delay),
+        other.iter().find_map(|delay| *delay),
+    ) else {
+        let begin = other.iter().find_map(|delay| *delay).unwrap_or(0);
+        let moved = other
+            .iter()
+            .map(|delay| delay.map(|delay| delay.saturating_sub(begin)));
+        return line.iter().copied().chain(moved).collect();
+    };
+    let hops = |line: &[Option<u32>]| {
+        let known: Vec<u32> = line.iter().flatten().copied().collect();
+        known
+            .windows(2)
+            .map(|pair| pair[1].saturating_sub(pair[0]))
+            .collect::<Vec<_>>()
+    };
+    let mut hops = [hops(line), hops(other)].concat();
+    hops.sort_unstable();
+    let hop = hops.get(hops.len() / 2).copied().unwrap_or(0);
+    let begin = before.saturating_add(hop);
+    let moved = other
+        .iter()
+        .map(|delay| delay.map(|delay| begin.saturating_add(delay.saturating_sub(after))));
+    line.iter().copied().chain(moved).collect()
+}
+
+/// Returns the delays in a ring that is broken behind `first` devices, from those of a closed one. A
+/// frame of the second interface passes all devices behind the break, and then each of them again.
+#[must_use]
+pub fn split(line: &[Option<u32>], first: usize) -> Vec<Option<u32>> {
+    let (before, behind) = line.split_at(first.min(line.len()));
+    let begin = behind.iter().find_map(|delay| *delay).unwrap_or(0);
+    let end = behind.iter().rev().find_map(|delay| *delay).unwrap_or(0);
+    let moved = behind.iter().map(|delay| {
+        delay.map(|delay| {
+            end.saturating_sub(begin)
+                .saturating_add(delay.saturating_sub(begin))
+        })
+    });
+    before.iter().copied().chain(moved).collect()
+}
+
+/// Returns the port at which a frame of the second interface enters each device of its line first;
+/// `None` for devices on a branch.
+fn entries(line: &[MeasuredDevice]) -> Vec<Option<u8>> {
+    let status = line.iter().map(|device| device.dl_status);
+    let mut entries = vec![None; line.len()];
+    let parents = parents(status.clone());
+    let mut next = ring_end(status);
+    // The depth never exceeds the number of devices.
+    while let Some(end) = next {
+        let device = usize::from(end.device);
+        match entries.get_mut(device) {
+            Some(entry @ None) => *entry = Some(end.port),
+            _ => break,
+        }
+        next = parents.get(device).copied().flatten();
+    }
+    entries
+}
+
+/// Returns the delays of the devices that a frame of the second interface passes: first towards the
+/// break, then back through the processing units. It passes the device at the end twice, `longest`
+/// apart, and each other device in between. `processed` are the receive times of the processing
+/// units.
+fn delays_from_end(
+    entries: &[Option<u8>],
+    times: &[Option<[u32; 4]>],
+    processed: &[Option<u32>],
+) -> Vec<Option<i64>> {
+    let both = entries.iter().zip(times).zip(processed);
+    let apart: Vec<Option<i64>> = both
+        .map(|((entry, times), processed)| {
+            let entered = time(times.as_ref()?, (*entry)?);
+            // `as` keeps the bits, as in `between`.
+            Some(i64::from((*processed)?.wrapping_sub(entered) as i32))
+        })
+        .collect();
+    let longest = apart.iter().flatten().copied().max().unwrap_or(0);
+    let delay = |apart: Option<i64>| Some(i64::midpoint(longest, apart?));
+    apart.into_iter().map(delay).collect()
 }
 
 /// Parses 0x0900 to 0x090F: local times in ns at which a frame arrived at each port.

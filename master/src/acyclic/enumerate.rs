@@ -181,7 +181,11 @@ pub async fn at<const N: usize>(
 }
 
 /// Returns the error of a device that should have answered.
-fn no_answer(position: u16, action: &'static str, answer: Result<u16, DatagramError>) -> Error {
+pub(super) fn no_answer(
+    position: u16,
+    action: &'static str,
+    answer: Result<u16, DatagramError>,
+) -> Error {
     match answer {
         Ok(_) | Err(DatagramError::Timeout { .. }) => Cause::Silent { position, action }.into(),
         Err(error) => Error::from(Cause::Datagram(error)).with_action(action),

@@ -4,6 +4,8 @@
 //! sheet, section I, 3.1). The device order is therefore a depth-first walk of the tree. Frames are
 //! assumed to enter at port 0, as with correct cabling.
 
+use crate::link::redundant::RingState;
+
 /// The order in which frames pass the ports.
 pub const PORT_ORDER: [u8; 4] = [0, 3, 1, 2];
 
@@ -65,6 +67,42 @@ pub fn parents(dl_status: impl IntoIterator<Item = u16>) -> Vec<Option<ParentPor
         waiting.extend(behind.map(|port| ParentPort { device, port }));
     }
     parents
+}
+
+/// Returns the DL status of the device at a position as if a broken ring were a line: the ports at
+/// the break are open. The port in front of it is taken to be the usual one.
+#[must_use]
+pub fn in_line(position: u16, dl_status: u16, ring: Option<RingState>) -> u16 {
+    let Some(RingState::Broken { behind, devices }) = ring else {
+        return dl_status;
+    };
+    let open = |port: u16| dl_status & !(1 << (8 + 2 * port)) | 1 << (9 + 2 * port);
+    if behind == 0 || behind >= devices {
+        dl_status
+    } else if position == behind {
+        open(0)
+    } else if position + 1 == behind {
+        let closed = open_ports(dl_status).map(|open| !open);
+        let port = [1, 2, 3]
+            .into_iter()
+            .find(|port| closed[usize::from(*port)]);
+        port.map_or(dl_status, open)
+    } else {
+        dl_status
+    }
+}
+
+/// Returns the open port that no device is connected to: in a closed ring, the one that leads to the
+/// second interface. `None` if there are several.
+#[must_use]
+pub fn ring_end(dl_status: impl IntoIterator<Item = u16> + Clone) -> Option<ParentPort> {
+    let parents = parents(dl_status.clone());
+    let open = (0..).zip(dl_status).flat_map(|(device, status)| {
+        let ports = (0..).zip(open_ports(status)).skip(1);
+        ports.filter_map(move |(port, open)| open.then_some(ParentPort { device, port }))
+    });
+    let mut free = open.filter(|port| !parents.contains(&Some(*port)));
+    free.next().filter(|_| free.next().is_none())
 }
 
 /// Returns the position of a device whose IN and OUT are swapped, so that frames enter it at

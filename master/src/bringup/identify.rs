@@ -194,7 +194,12 @@ pub(super) async fn tolerate_reversed(
         "IN and OUT are swapped at the device at position {at}: frames enter at its port {port} instead of port 0. \
          No device uses distributed clocks, so the run goes on"
     )));
-    Some(FIRST_STATION..=FIRST_STATION.saturating_add(count - 1))
+    Some(stations(count))
+}
+
+/// Returns the station addresses that ethercrab's scan assigns.
+pub(super) fn stations(count: u16) -> RangeInclusive<u16> {
+    FIRST_STATION..=FIRST_STATION.saturating_add(count.saturating_sub(1))
 }
 
 /// Names the device whose IN and OUT are swapped. `at`: its index on the bus; `port`: the port at which

@@ -20,12 +20,14 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
+use crate::acyclic::delays;
 use crate::acyclic::{AlState, DeviceRef, StateTimeouts, Transition, al, enumerate, topology};
 use crate::clock;
 use crate::concurrent::try_join_all;
 use crate::config::state_timeouts::mailbox_timeouts;
 use crate::config::{AdoptedUnits, DeviceConfig, LimitConflict, MAX_SUBDEVICES, Machine};
 use crate::datagram::DatagramClient;
+use crate::link::redundant::RingState;
 use crate::link::scan_answers::{ScanAnswers, ScanFindings};
 use crate::mailbox::CoeClient;
 use crate::mailbox::worker::EmergencySink;
@@ -89,6 +91,10 @@ pub struct BusDevice {
     pub op_only: Vec<u16>,
 }
 
+/// The devices of a ring in the order of the segment, each with its propagation delay in ns if the ring
+/// is closed; `None` without a clock.
+pub type RingDelays = Vec<(DeviceIndex, Option<u32>)>;
+
 /// A segment in SafeOp, ready for cyclic exchange.
 #[derive(Debug)]
 pub struct Bus {
@@ -98,6 +104,9 @@ pub struct Bus {
     pub dc: Option<ClockPlan>,
     /// True if all clocks had settled before SafeOp.
     pub clocks_settled: bool,
+    /// The propagation delays in a closed ring, in the order of the segment; `None` without cable
+    /// redundancy.
+    pub ring_delays: Option<RingDelays>,
     /// The durations of the steps so far.
     pub times: StepTimes,
 }
@@ -128,14 +137,14 @@ impl Bus {
 /// Brings the segment from any state to SafeOp. Passes emergencies of the devices to the listener,
 /// on success and on failure. `answers` are those of the MainDevice's PDU loop.
 pub async fn bring_up(
-    main_device: &'static MainDevice<'static>,
+    wire: DatagramClient,
     answers: &ScanAnswers,
     machine: &Machine,
     image: ImagePlan,
     progress: &dyn Fn(Step),
     listener: &dyn EmergencySink,
 ) -> Result<Bus, Error> {
-    let wire = DatagramClient::without_cycle(main_device);
+    let main_device = wire.main_device();
     progress(Step::Scan);
     let times = StepTimes::default();
     let scan = async {
@@ -148,7 +157,11 @@ pub async fn bring_up(
         al::acknowledge_errors_in_init(&wire).await;
         let ahead = Box::pin(eeproms::read_ahead(&wire, machine, count));
         let mut ahead = times.measure("EEPROMs", None, ahead).await?;
-        ahead.as_line = identify::tolerate_reversed(&wire, machine, count, progress).await;
+        ahead.as_line = match wire.ring() {
+            // ethercrab does not know rings; `measure_delays` measures them.
+            Some(_) => Some(identify::stations(count)),
+            None => identify::tolerate_reversed(&wire, machine, count, progress).await,
+        };
         answers.replace(ahead);
         // ethercrab's tables are large, and futures hold them by value.
         let scan = Box::pin(main_device.init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now));
@@ -185,6 +198,13 @@ pub async fn bring_up(
     // From here on, ethercrab only carries datagrams; see docs/decisions/0001.
     drop(group);
     let mut devices = found;
+    let mut ring_delays = None;
+    if let Some(ring) = wire.ring() {
+        progress(ring_step(machine, ring));
+        let measure = measure_delays(&wire, ring, &mut devices);
+        let measured = times.measure("propagation delays", None, measure).await?;
+        ring_delays = Some(measured);
+    }
     let reference = clocks::reference(&devices);
     let set_up = Box::pin(set_up(
         &wire,
@@ -205,8 +225,41 @@ pub async fn bring_up(
         image,
         dc,
         clocks_settled,
+        ring_delays,
         times,
     })
+}
+
+/// Returns the report on the ring at the start.
+fn ring_step(machine: &Machine, ring: RingState) -> Step {
+    let text = ring.text(machine.devices.len(), |position| name_at(machine, position));
+    match ring {
+        RingState::Closed => Step::Ring(text),
+        RingState::Broken { .. } | RingState::Silent => Step::Warning(text),
+    }
+}
+
+/// Measures the delays of a ring, which ethercrab has taken for a line.
+async fn measure_delays(
+    wire: &DatagramClient,
+    ring: RingState,
+    devices: &mut [BusDevice],
+) -> Result<RingDelays, Error> {
+    let (stations, measured) = delays::devices(wire).await?;
+    let delays = delays::measure(wire, &measured).await?;
+    let closed = match ring.split() {
+        Some(first) => delays::joined(&delays, usize::from(first)),
+        None => delays.clone(),
+    };
+    let mut of_ring = Vec::new();
+    for ((station, delay), closed) in stations.into_iter().zip(delays).zip(closed) {
+        let mut numbered = (0..).map(DeviceIndex).zip(&mut *devices);
+        if let Some((index, device)) = numbered.find(|(_, d)| d.at.station == station) {
+            device.propagation_delay = delay.unwrap_or(0);
+            of_ring.push((index, closed));
+        }
+    }
+    Ok(of_ring)
 }
 
 /// Reads what bring-up needs to know of one device.
@@ -237,6 +290,9 @@ async fn describe(
     let dc = receive_times && clocks::has_system_time(wire, &at).await?;
     let info = &config.device.info;
     let coe = mailbox::open(wire, config, &at, progress).await?;
+    let status = enumerate::at(wire, position, "reading its ports", registers::DL_STATUS).await;
+    // Used only for a later comparison; 0 if unreadable.
+    let dl_status = status.map_or(0, u16::from_le_bytes);
     Ok(BusDevice {
         coe: coe.map(|layout| CoeClient::new(layout).with_timeouts(mailbox_timeouts(info))),
         timeouts: StateTimeouts::new(info),
@@ -248,10 +304,7 @@ async fn describe(
         follows: false,
         serial: sub_device.identity().serial,
         propagation_delay,
-        // Used only for a later comparison; 0 if unreadable.
-        dl_status: enumerate::at(wire, position, "reading its ports", registers::DL_STATUS)
-            .await
-            .map_or(0, u16::from_le_bytes),
+        dl_status: topology::in_line(position, dl_status, wire.ring()),
         op_only: Vec::new(),
     })
 }

@@ -236,8 +236,13 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
         Some(name) => nic(name, p),
         None => Some(Nic::Sim),
     };
+    let redundant = raw
+        .redundant
+        .as_ref()
+        .map(|name| redundant(name, nic.as_ref(), p));
     Some(Bus {
         nic: nic?,
+        redundant: redundant.flatten(),
         cycle_ns: cycle_ns?,
         lost_frames,
         cpu: raw.cpu.value().and_then(|cpu| usize::try_from(cpu).ok()),
@@ -298,6 +303,29 @@ fn nic(name: &Spanned<String>, p: &mut Problems<'_>) -> Option<Nic> {
             );
             None
         }
+    }
+}
+
+/// Returns the interface at the other end of a ring.
+fn redundant(name: &Spanned<String>, first: Option<&Nic>, p: &mut Problems<'_>) -> Option<String> {
+    let second = nic(name, p)?;
+    match (first, &second) {
+        (Some(Nic::Interface(first)), Nic::Interface(second)) if first == second => {
+            let hint = "write the interface at the other end of the ring, or remove `redundant`";
+            p.add_hint(name.span(), format!("`nic` is \"{first}\" too"), hint);
+            None
+        }
+        (Some(Nic::Interface(_)), Nic::Sim) => {
+            let hint = "write the interface at the other end of the ring";
+            p.add_hint(
+                name.span(),
+                "`nic` is not the simulated bus".to_owned(),
+                hint,
+            );
+            None
+        }
+        (_, Nic::Interface(second)) => Some(second.clone()),
+        (_, Nic::Sim) => Some("sim".to_owned()),
     }
 }
 

@@ -131,6 +131,8 @@ pub struct ServerSetup {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Bus {
     pub nic: Nic,
+    /// The interface at the other end of the ring, with cable redundancy.
+    pub redundant: Option<String>,
     pub cycle_ns: u64,
     /// The number of consecutive cycles without a valid answer that stops the axes.
     pub lost_frames: u32,
@@ -180,6 +182,7 @@ impl Default for Bus {
     fn default() -> Self {
         Self {
             nic: Nic::Sim,
+            redundant: None,
             cycle_ns: 1_000_000,
             lost_frames: 3,
             cpu: None,

@@ -18,6 +18,7 @@ use std::time::Duration;
 
 use rtrb::{Consumer, Producer, RingBuffer};
 
+use super::redundant::RingStatus;
 use super::{Link, LinkError, LinkStats, MAX_FRAME, Nanos};
 use crate::clock;
 use crate::recording::Direction;
@@ -270,6 +271,10 @@ impl Link for CapturingLink {
 
     fn stats(&mut self) -> LinkStats {
         self.inner.stats()
+    }
+
+    fn ring(&self) -> Option<&'static RingStatus> {
+        self.inner.ring()
     }
 
     fn exhausted_reason(&self) -> Option<&'static str> {

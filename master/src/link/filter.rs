@@ -4,6 +4,7 @@ use serde::Serialize;
 
 use super::MAX_FRAME;
 use super::pdu_loop::ETHERCAT;
+use super::redundant::MARK;
 
 /// Ethernet header and EtherCAT header.
 const HEADERS: usize = 16;
@@ -73,6 +74,18 @@ impl LinkStats {
     }
 
     /// True if any counter is not zero.
+    /// Returns the sum of the counters of two interfaces.
+    #[must_use]
+    pub(super) fn plus(self, other: Self) -> Self {
+        Self {
+            foreign: self.foreign + other.foreign,
+            main_devices: self.main_devices + other.main_devices,
+            tagged: self.tagged + other.tagged,
+            damaged: self.damaged + other.damaged,
+            dropped: self.dropped + other.dropped,
+        }
+    }
+
     #[must_use]
     pub fn any(&self) -> bool {
         *self != Self::default()
@@ -110,7 +123,8 @@ pub fn classify_frame(seen: &ReceivedFrame<'_>) -> Result<(), RejectReason> {
     if seen.packet_type == libc::PACKET_OTHERHOST {
         return Err(RejectReason::Tagged);
     }
-    if rest[0] & !PROCESSED != SOURCE[0] || rest[1..4] != SOURCE[1..] {
+    let source = [rest[0] & !PROCESSED, rest[1], rest[2], rest[3] & !MARK];
+    if source != SOURCE {
         return Err(RejectReason::MainDevice);
     }
     // ETG.1000.4, table 11: 11 bits length, one reserved bit, and the type; 1 means datagrams.
@@ -163,6 +177,11 @@ pub(super) mod tests {
         assert_eq!(judged(|f| *f = answer(12)), Ok(()), "a runt");
         assert_eq!(judged(|f| f[10..12].copy_from_slice(&[0x10, 0x10])), Ok(()));
         assert_eq!(judged(|f| f[6] = 0x10), Ok(()), "nothing has processed it");
+        assert_eq!(
+            judged(|f| f[9] = 0x90),
+            Ok(()),
+            "from the other end of a ring"
+        );
     }
 
     #[test]
@@ -226,7 +245,8 @@ pub(super) mod tests {
             if classify_frame(&seen).is_ok() {
                 prop_assert_eq!(more, 0);
                 prop_assert_eq!(&frame[..6], &ours[..6]);
-                prop_assert_eq!(&frame[7..10], &ours[7..10]);
+                prop_assert_eq!(&frame[7..9], &ours[7..9]);
+                prop_assert_eq!(frame[9] & !MARK, ours[9]);
                 prop_assert_eq!(&frame[12..14], &ours[12..14]);
                 let len = usize::from(u16::from_le_bytes([frame[14], frame[15]]) & 0x07ff);
                 prop_assert!(16 + len <= frame.len() && frame.len() <= MAX_FRAME);

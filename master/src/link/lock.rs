@@ -12,6 +12,7 @@ use rustix::net::{
     AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, connect, listen, socket_with,
 };
 
+use super::redundant::RingStatus;
 use super::{
     Link, LinkError, LinkStats, MAX_FRAME, Nanos, NicWarning, OpenError, SocketKind, capture,
 };
@@ -116,6 +117,10 @@ impl Link for LockedLink {
 
     fn notices(&mut self) -> Vec<String> {
         self.link.notices()
+    }
+
+    fn ring(&self) -> Option<&'static RingStatus> {
+        self.link.ring()
     }
 
     fn exhausted_reason(&self) -> Option<&'static str> {

@@ -9,6 +9,7 @@
 //!   interface;
 //! - [`capture`]: records the frames of any link;
 //! - [`replay`]: a recording in place of a bus;
+//! - [`redundant`]: cable redundancy, two interfaces as one link;
 //! - [`scan_answers`]: answers ethercrab's scan from what was found before;
 //! - [`pdu_loop`]: connects ethercrab to a link.
 
@@ -23,6 +24,7 @@ mod joined_frame;
 pub mod lock;
 pub mod nic;
 pub mod pdu_loop;
+pub mod redundant;
 pub mod replay;
 pub mod scan_answers;
 pub mod sim;
@@ -71,6 +73,11 @@ pub trait Link: fmt::Debug + Send {
     /// Returns further notices for the end of a run. Not for the cycle.
     fn notices(&mut self) -> Vec<String> {
         Vec::new()
+    }
+
+    /// Returns the state of the ring, if the link has both ends of one.
+    fn ring(&self) -> Option<&'static redundant::RingStatus> {
+        None
     }
 
     /// Returns why no more frames can arrive, if the link knows it. Not for the cycle.

@@ -1,8 +1,9 @@
 //! The simulated segment as a link, in the same thread and on the same clock.
 
-use ecaxis_sim::{FrameOutcome, Segment};
+use ecaxis_sim::{FrameOutcome, Nic, Segment};
 
 use super::filter::{LinkStats, ReceivedFrame, classify_frame};
+use super::redundant::{End, RingEnds};
 use super::{FrameQueue, Link, LinkError, MAX_FRAME, Nanos};
 use crate::clock;
 
@@ -16,7 +17,8 @@ pub struct SimLink {
     segment: Segment,
     /// The clock's time at the segment's time zero.
     start: Nanos,
-    queue: FrameQueue,
+    /// The frames on their way to each port of the MainDevice.
+    queues: [FrameQueue; 2],
     stats: LinkStats,
 }
 
@@ -27,7 +29,7 @@ impl SimLink {
         Self {
             segment,
             start: clock::now(),
-            queue: FrameQueue::new(IN_FLIGHT),
+            queues: [FrameQueue::new(IN_FLIGHT), FrameQueue::new(IN_FLIGHT)],
             stats: LinkStats::default(),
         }
     }
@@ -37,25 +39,32 @@ impl SimLink {
         &self.segment
     }
 
-    /// Returns the segment, for example to switch a device off or unplug a cable between frames.
     pub fn segment_mut(&mut self) -> &mut Segment {
         &mut self.segment
     }
-}
 
-impl Link for SimLink {
-    fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
+    fn send_from(&mut self, from: Nic, frame: &[u8]) -> Result<(), LinkError> {
         let now = clock::now().saturating_sub(self.start);
-        let slot = self.queue.store(frame)?;
-        if let FrameOutcome::Back { at, again, .. } = self.segment.transit(slot.frame(), now) {
-            let copy = again.map(|at| (at, slot.clone()));
-            self.queue.push(at.saturating_add(self.start));
-            // A copy without a free slot is lost.
-            if let Some((at, copy)) = copy
-                && let Some(slot) = self.queue.vacant()
-            {
-                *slot = copy;
-                self.queue.push(at.saturating_add(self.start));
+        let [first, second] = &mut self.queues;
+        // The frame waits where it was sent, until its destination is known.
+        let (own, other) = match from {
+            Nic::Primary => (first, second),
+            Nic::Secondary => (second, first),
+        };
+        let slot = own.store(frame)?;
+        if let FrameOutcome::Back { at, nic, again } =
+            self.segment.transit_from(from, slot.frame(), now)
+        {
+            let arrivals = [Some(at), again].into_iter().flatten();
+            let arrivals = arrivals.map(|at| at.saturating_add(self.start));
+            let copy = slot.clone();
+            let queue = if nic == from { own } else { other };
+            for at in arrivals {
+                // A copy without a free slot is lost.
+                if let Some(slot) = queue.vacant() {
+                    *slot = copy.clone();
+                    queue.push(at);
+                }
             }
         }
         if let Some((_, frame)) = self.segment.take_overheard() {
@@ -72,9 +81,15 @@ impl Link for SimLink {
         }
         Ok(())
     }
+}
+
+impl Link for SimLink {
+    fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
+        self.send_from(Nic::Primary, frame)
+    }
 
     fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
-        Ok(self.queue.receive(clock::now(), buf))
+        Ok(self.queues[0].receive(clock::now(), buf))
     }
 
     fn main_devices(&self) -> u64 {
@@ -86,7 +101,37 @@ impl Link for SimLink {
     }
 
     fn next_arrival(&self) -> Option<Nanos> {
-        self.queue.next_due()
+        self.queues[0].next_due()
+    }
+}
+
+/// Both ends of a simulated ring.
+#[derive(Debug)]
+pub struct SimRing(pub SimLink);
+
+impl RingEnds for SimRing {
+    fn send(&mut self, from: End, frame: &[u8]) -> Result<(), LinkError> {
+        let nic = match from {
+            End::First => Nic::Primary,
+            End::Second => Nic::Secondary,
+        };
+        self.0.send_from(nic, frame)
+    }
+
+    fn recv(&mut self, at: End, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+        Ok(self.0.queues[at as usize].receive(clock::now(), buf))
+    }
+
+    fn next_arrival(&self) -> Option<Nanos> {
+        self.0.queues.iter().filter_map(FrameQueue::next_due).min()
+    }
+
+    fn main_devices(&self) -> u64 {
+        self.0.stats.main_devices
+    }
+
+    fn stats(&mut self) -> LinkStats {
+        self.0.stats
     }
 }
 

@@ -1,6 +1,7 @@
 //! Distinguishes programs on the same interface by their source address. A running machine must not
 //! take the answers to another program's scan for its own.
 
+use super::redundant::RingStatus;
 use super::{Link, LinkError, LinkStats, MAX_FRAME, Nanos};
 
 /// The last two bytes of the source address; the first four are the same in all frames of this
@@ -79,6 +80,10 @@ impl Link for PrivateMacLink {
         let mut stats = self.link.stats();
         stats.foreign += self.others;
         stats
+    }
+
+    fn ring(&self) -> Option<&'static RingStatus> {
+        self.link.ring()
     }
 
     fn finish(self: Box<Self>) -> std::io::Result<Option<super::capture::RecordStats>> {

@@ -40,6 +40,8 @@ pub enum Step {
         device: String,
         what: String,
     },
+    /// The state of the ring, with cable redundancy.
+    Ring(String),
     /// A warning; the bring-up continues.
     Warning(String),
 }
@@ -81,7 +83,7 @@ impl fmt::Display for Step {
             }
             Self::State(state) => write!(f, "all SubDevices in {state}"),
             Self::Adopted { device, what } => write!(f, "`{device}`: {what}"),
-            Self::Warning(text) => f.write_str(text),
+            Self::Ring(text) | Self::Warning(text) => f.write_str(text),
         }
     }
 }

@@ -90,6 +90,11 @@ pub enum Progress {
         /// It had no power: the position of an incremental encoder is lost.
         restarted: bool,
     },
+    /// A cable of the ring is broken, or the ring is closed again.
+    Ring {
+        text: String,
+        broken: bool,
+    },
     /// The status of the machine, five times a second of machine time.
     Status(Status),
     Stopping,

@@ -44,7 +44,7 @@ use crate::text::panic_text;
 pub use bus::{run_on_link, with_bus};
 use cycle_thread::CycleRun;
 use fault_evidence::{BringUpEvidence, RunEvidence};
-pub use open::{recorded, recording_comment, simulated_bus, topology};
+pub use open::{recorded, recording_comment, ring, simulated_bus, simulated_link, topology};
 pub use prepare::{Prepared, RunBuilder};
 use prepare::{broadcast_init, prefer_replay_end};
 pub use signals::{SignalReport, stop_on_signals};

@@ -14,12 +14,13 @@ use ecaxis_sim::{
 use super::{Cause, Error, Options};
 use crate::acyclic::eeprom::size_of;
 use crate::acyclic::image::with_alias;
-use crate::clock::{self, Clock};
+use crate::clock::{self, Clock, Nanos};
 use crate::config::sim::{self, bus_order};
 use crate::config::{DeviceConfig, Locator, Machine, Nic};
 use crate::link::capture::{CapturingLink, Recorder, WriterMode};
+use crate::link::redundant::{Interfaces, RedundantLink, RingEnds};
 use crate::link::replay::Replay;
-use crate::link::sim::SimLink;
+use crate::link::sim::{SimLink, SimRing};
 use crate::link::{self, Link, NicWarning, OpenError};
 use crate::recording;
 use crate::sys::rt_thread;
@@ -40,28 +41,65 @@ pub fn link(
             let reader = recording::open(path).map_err(failed)?;
             Box::new(Replay::new(reader).map_err(failed)?)
         }
-        (None, Nic::Sim) => Box::new(SimLink::new(simulated_bus(
-            machine,
-            options.seed,
-            options.faults.as_ref(),
-            None,
-        )?)),
+        (None, Nic::Sim) => simulated_link(machine, options.seed, options.faults.as_ref())?,
         (None, Nic::Interface(nic)) => {
-            let (mut link, concerns) = link::open_exclusive(nic, machine.bus.link)?;
-            let opened = Instant::now();
-            // Meanwhile; `become_realtime` repeats it and reports what is denied.
-            let _ = rt_thread::lock_memory();
-            // The first frame would set another MainDevice's drives to Init.
-            let frames = link::sniff_foreign_frames(link.as_mut(), opened).map_err(Cause::Link)?;
-            if frames > 0 {
-                let nic = nic.clone();
-                return Err(OpenError::Driven { nic, frames }.into());
+            let mut open = |nic: &String| -> Result<Box<dyn Link>, Error> {
+                let (mut link, concerns) = link::open_exclusive(nic, machine.bus.link)?;
+                let opened = Instant::now();
+                // Meanwhile; `become_realtime` repeats it and reports what is denied.
+                let _ = rt_thread::lock_memory();
+                // The first frame would set another MainDevice's drives to Init.
+                let frames = link::sniff_foreign_frames(link.as_mut(), opened);
+                let frames = frames.map_err(Cause::Link)?;
+                if frames > 0 {
+                    let nic = nic.clone();
+                    return Err(OpenError::Driven { nic, frames }.into());
+                }
+                concerns.into_iter().for_each(&mut report);
+                Ok(link)
+            };
+            let link = open(nic)?;
+            match &machine.bus.redundant {
+                None => link,
+                Some(second) => ring(link, open(second)?, copy_timeout(machine)),
             }
-            concerns.into_iter().for_each(&mut report);
-            link
         }
     };
     recorded(link, options, &recording_comment(machine))
+}
+
+/// Returns the links at both ends of a ring as one link, which waits so long for the second copy of a
+/// frame.
+#[must_use]
+pub fn ring(first: Box<dyn Link>, second: Box<dyn Link>, copy_timeout: Nanos) -> Box<dyn Link> {
+    redundant(Interfaces([first, second]), copy_timeout)
+}
+
+fn redundant(ends: impl RingEnds + 'static, copy_timeout: Nanos) -> Box<dyn Link> {
+    Box::new(RedundantLink::new(Box::new(ends), copy_timeout))
+}
+
+/// How long the cycle waits for the second copy of a frame: it waits three quarters of a cycle for
+/// its answers.
+fn copy_timeout(machine: &Machine) -> Nanos {
+    machine.bus.cycle_ns / 2
+}
+
+/// Returns a link to the simulated bus of the machine file.
+///
+/// # Errors
+/// As [`simulated_bus`].
+pub fn simulated_link(
+    machine: &Machine,
+    seed: u64,
+    faults: Option<&FaultScript>,
+) -> Result<Box<dyn Link>, Error> {
+    let ring = machine.bus.redundant.as_ref().map(|_| SecondPort::Listens);
+    let link = SimLink::new(simulated_bus(machine, seed, faults, ring)?);
+    Ok(match ring {
+        None => Box::new(link),
+        Some(_) => redundant(SimRing(link), copy_timeout(machine)),
+    })
 }
 
 /// Returns the comment at the begin of a machine's recordings.

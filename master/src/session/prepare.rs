@@ -31,7 +31,7 @@ use crate::rt::cycle::{EngineConfig, Signals, first_snapshot};
 use crate::rt::exchange::{Exchange, ExchangeDevice};
 use crate::rt::image::{self, AxisBits, BitField, DeviceRegion, ImagePlan, NotMapped, SignalBits};
 use crate::rt::phase::Phase;
-use crate::supervise::Supervisor;
+use crate::supervise::{RingWatch, Supervisor};
 
 /// A segment in SafeOp with everything that the cycle needs.
 #[derive(Debug)]
@@ -102,7 +102,7 @@ impl RunBuilder<'_> {
             Ok(mut bus) => {
                 let machine = &apply_drive_units(machine, &bus);
                 let (_, slots, signals) = plan(machine)?;
-                let wire = DatagramClient::new(main_device);
+                let wire = DatagramClient::new(main_device).in_ring(link.ring());
                 let config = machine.rt_config();
                 let clock = options.clock;
                 let members = bus.devices.iter().map(|device| ExchangeDevice {
@@ -175,6 +175,7 @@ impl RunBuilder<'_> {
                     bus_status,
                     clock_tree: None,
                     returns: None,
+                    ring: RingWatch::default(),
                 };
                 Ok(Prepared { parts, supervisor })
             }
@@ -187,7 +188,7 @@ impl RunBuilder<'_> {
                     Cause::Interrupted | Cause::Panicked(_) | Cause::Link(_)
                 ) {
                     seen.looks = vec![DeviceSnapshot::default(); machine.devices.len()];
-                    let wire = DatagramClient::without_cycle(main_device);
+                    let wire = DatagramClient::without_cycle(main_device).in_ring(link.ring());
                     let stations: Vec<_> = (crate::acyclic::enumerate::FIRST_STATION..)
                         .take(machine.devices.len())
                         .collect();
@@ -348,14 +349,8 @@ fn bring_up_catching_panics(
     let run = std::panic::AssertUnwindSafe(|| {
         let answers = port.scan_answers.clone();
         // ethercrab's tables make the future large: nothing holds it on the stack.
-        let bring_up = Box::pin(bring_up(
-            main_device,
-            &answers,
-            machine,
-            image,
-            &report,
-            log,
-        ));
+        let wire = DatagramClient::without_cycle(main_device).in_ring(link.ring());
+        let bring_up = Box::pin(bring_up(wire, &answers, machine, image, &report, log));
         drive_pdu_loop(port, link, clock, stop.run_until_requested(bring_up))
     });
     match std::panic::catch_unwind(run) {

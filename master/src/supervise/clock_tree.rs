@@ -11,12 +11,12 @@ use ecaxis_ecat::registers;
 use tokio::sync::{Mutex, watch};
 
 use super::Supervisor;
-use crate::acyclic::delays::{self, MeasuredDevice};
-use crate::acyclic::enumerate;
+use crate::acyclic::delays;
 use crate::acyclic::topology::open_ports;
-use crate::bringup::BusDevice;
+use crate::bringup::RingDelays;
 use crate::clock;
 use crate::datagram::DatagramClient;
+use crate::link::redundant::RingState;
 use crate::mailbox::MailboxTransport;
 use crate::report::{Cause, Error};
 use crate::rt::channel::Snapshot;
@@ -33,6 +33,8 @@ const NOISE_NS: u32 = 40;
 pub(crate) struct ClockTree {
     /// The ports that forward frames.
     open: IndexVec<DeviceIndex, [bool; 4]>,
+    /// In a ring: the number of devices in front of the break, if there is one.
+    split: Option<u16>,
     reference: Option<DeviceIndex>,
 }
 
@@ -46,6 +48,7 @@ impl Supervisor {
         let devices = self.bus.devices.iter();
         let tree = ClockTree {
             open: devices.map(|device| open_ports(device.dl_status)).collect(),
+            split: self.wire.ring().and_then(RingState::split),
             reference: None,
         };
         let changes = self.bus.dc.as_ref().map(|_| {
@@ -53,12 +56,23 @@ impl Supervisor {
             self.clock_tree = Some(sender);
             changes
         });
-        let clocks = clocks(&self.bus.devices);
-        let wire = self.wire;
+        let delays = self.delays(latch);
         async move {
             if let Some(changes) = changes {
-                follow(&wire, &clocks, &latch, changes).await;
+                follow(&delays, changes).await;
             }
+        }
+    }
+
+    pub(super) fn delays(&self, latch: Arc<Mutex<()>>) -> Delays {
+        let devices = self.bus.devices.iter();
+        Delays {
+            wire: self.wire,
+            clocks: devices
+                .map(|device| (device.at.station, device.follows))
+                .collect(),
+            ring: self.bus.ring_delays.clone(),
+            latch,
         }
     }
 
@@ -72,6 +86,10 @@ impl Supervisor {
             let last = now.reference;
             now.reference = reference.or(last);
             let mut changed = last.is_some() && last != now.reference;
+            if let Some(ring) = self.wire.ring() {
+                // The ports open and close with it, and the last one for each measurement.
+                return changed | (std::mem::replace(&mut now.split, ring.split()) != ring.split());
+            }
             for (open, found) in now.open.iter_mut().zip(&snapshot.diagnoses) {
                 if found.answers && found.has_read(DiagnosticRegister::DlStatus) {
                     let read = open_ports(found.dl_status);
@@ -83,92 +101,95 @@ impl Supervisor {
     }
 }
 
-/// The station address of each device, and whether its clock follows the reference clock.
-type Clocks = IndexVec<DeviceIndex, (u16, bool)>;
-
-pub(super) fn clocks(devices: &IndexVec<DeviceIndex, BusDevice>) -> Clocks {
-    let devices = devices.iter();
-    devices
-        .map(|device| (device.at.station, device.follows))
-        .collect()
+/// The propagation delays in the devices.
+#[derive(Debug)]
+pub(super) struct Delays {
+    wire: DatagramClient,
+    /// The station address of each device, and whether its clock follows the reference clock.
+    clocks: IndexVec<DeviceIndex, (u16, bool)>,
+    /// Known in a ring: a measurement would open it.
+    ring: Option<RingDelays>,
+    /// Held while the receive times of all devices belong to one frame.
+    latch: Arc<Mutex<()>>,
 }
 
-/// Measures the delays after each change, until the sender is dropped.
-async fn follow(
-    wire: &DatagramClient,
-    clocks: &Clocks,
-    latch: &Mutex<()>,
-    mut changes: watch::Receiver<ClockTree>,
-) {
+/// Updates the delays after each change, until the sender is dropped.
+async fn follow(delays: &Delays, mut changes: watch::Receiver<ClockTree>) {
     while changes.changed().await.is_ok() {
-        clock::delay(SETTLING_TIME).await;
+        if delays.ring.is_none() {
+            clock::delay(SETTLING_TIME).await;
+        }
         if changes.has_changed().unwrap_or(true) {
             continue;
         }
         let reference = changes.borrow().reference;
-        let reference = reference.and_then(|device| clocks.get(device)).copied();
         let still_valid = || !changes.has_changed().unwrap_or(true);
-        if let Some((reference, _)) = reference
-            && let Err(error) = update(wire, clocks, reference, latch, still_valid).await
+        if let Some(reference) = reference
+            && let Err(error) = delays.update(reference, still_valid).await
         {
-            // The next change starts another measurement.
+            // The next change starts another update.
             tracing::info!("{error}");
         }
     }
 }
 
-/// Measures all delays and writes those that have changed.
-pub(super) async fn update(
-    wire: &DatagramClient,
-    clocks: &Clocks,
-    reference: u16,
-    latch: &Mutex<()>,
-    still_valid: impl Fn() -> bool,
-) -> Result<(), Error> {
-    let mut stations = Vec::new();
-    let mut devices = Vec::new();
-    for position in 0..enumerate::count(wire).await? {
-        let word = async |register| {
-            let bytes = enumerate::at(wire, position, STEP, register).await?;
-            Ok::<_, Error>(u16::from_le_bytes(bytes))
-        };
-        stations.push(word(registers::STATION_ADDRESS).await?);
-        devices.push(MeasuredDevice {
-            position,
-            dl_status: word(registers::DL_STATUS).await?,
-            receive_times: delays::has_receive_times(word(registers::FEATURES).await?),
-        });
-    }
-    let measured = {
-        let _held = latch.lock().await;
-        delays::measure(wire, &devices).await?
-    };
-    let measured = || stations.iter().copied().zip(&measured);
-    let find = |wanted| measured().find(|(station, _)| *station == wanted);
-    let Some((_, Some(first))) = find(reference) else {
-        return Ok(());
-    };
-    for (station, delay) in measured() {
-        let follows = clocks.contains(&(station, true));
-        let (Some(delay), true) = (delay, follows && station != reference) else {
-            continue;
-        };
-        let delay = delay.saturating_sub(*first);
-        let failed = |error| Error::from(Cause::Datagram(error)).with_action(STEP);
-        let mut written = [0; 4];
-        let register = registers::DC_SYSTEM_TIME_DELAY;
-        let read = wire.read(station, register, &mut written).await;
-        let written = u32::from_le_bytes(written);
-        if read.map_err(failed)? == 0 || written.abs_diff(delay) <= NOISE_NS {
-            continue;
-        }
-        // A later change may have moved the devices.
-        if !still_valid() {
+impl Delays {
+    /// Determines all delays and writes those that have changed.
+    pub(super) async fn update(
+        &self,
+        reference: DeviceIndex,
+        still_valid: impl Fn() -> bool,
+    ) -> Result<(), Error> {
+        let Some(&(reference, _)) = self.clocks.get(reference) else {
             return Ok(());
+        };
+        let wire = &self.wire;
+        let (stations, measured) = match &self.ring {
+            None => {
+                let (stations, devices) = delays::devices(wire).await?;
+                let _held = self.latch.lock().await;
+                (stations, delays::measure(wire, &devices).await?)
+            }
+            Some(ring) => {
+                let station = |device| self.clocks.get(device).map_or(0, |(station, _)| *station);
+                let stations = ring.iter().map(|(device, _)| station(*device)).collect();
+                let closed: Vec<_> = ring.iter().map(|(_, delay)| *delay).collect();
+                let now = match wire.ring().and_then(RingState::split) {
+                    Some(first) => delays::split(&closed, usize::from(first)),
+                    None => closed,
+                };
+                (stations, now)
+            }
+        };
+        let measured = || stations.iter().copied().zip(&measured);
+        let find = |wanted| measured().find(|(station, _)| *station == wanted);
+        let Some((_, Some(first))) = find(reference) else {
+            return Ok(());
+        };
+        for (station, delay) in measured() {
+            let follows = self.clocks.contains(&(station, true));
+            let (Some(delay), true) = (delay, follows && station != reference) else {
+                continue;
+            };
+            let delay = delay.saturating_sub(*first);
+            let failed = |error| Error::from(Cause::Datagram(error)).with_action(STEP);
+            let mut written = [0; 4];
+            let register = registers::DC_SYSTEM_TIME_DELAY;
+            let read = wire.read(station, register, &mut written).await;
+            let written = u32::from_le_bytes(written);
+            if read.map_err(failed)? == 0 || written.abs_diff(delay) <= NOISE_NS {
+                continue;
+            }
+            // A later change may have moved the devices.
+            if !still_valid() {
+                return Ok(());
+            }
+            tracing::info!(
+                "station 0x{station:04x}: propagation delay {written} ns, now {delay} ns"
+            );
+            let write = wire.write(station, register, &delay.to_le_bytes()).await;
+            write.map_err(failed)?;
         }
-        tracing::info!("station 0x{station:04x}: propagation delay {written} ns, now {delay} ns");
-        let write = wire.write(station, register, &delay.to_le_bytes()).await;
-        write.map_err(failed)?;
+        Ok(())
     }
-    Ok(())
 }

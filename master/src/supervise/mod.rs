@@ -33,6 +33,7 @@ use crate::rt::exchange::{BusStatus, DiagnosticRegister, SubDeviceDiagnostics};
 use clock_tree::ClockTree;
 use groups::StoppedGroup;
 use returns::ReturnPort;
+pub(crate) use ring::RingWatch;
 
 mod clock_tree;
 mod coordinated;
@@ -42,6 +43,7 @@ mod groups;
 pub mod operator;
 mod program;
 mod returns;
+mod ring;
 mod shut_down;
 
 /// The period at which the supervisor reads the cycle's snapshot.
@@ -102,6 +104,8 @@ pub struct Supervisor {
     pub bus_status: Arc<BusStatus>,
     /// The end of the task that brings devices back.
     pub(crate) returns: Option<ReturnPort>,
+    /// What was reported of the ring, with cable redundancy.
+    pub(crate) ring: RingWatch,
 }
 
 /// The result of the machine's program.
@@ -402,6 +406,7 @@ impl Supervisor {
         self.pass_events_on();
         self.report_limits(&snapshot);
         self.follow_clock_tree(&snapshot);
+        self.follow_ring();
         if clock::now().saturating_sub(self.last_status) >= STATUS_PERIOD {
             self.last_status = clock::now();
             self.report(Progress::Status(Status::new(&self.machine, &snapshot)));

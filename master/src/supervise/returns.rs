@@ -16,9 +16,9 @@ use ecaxis_esi::Identity;
 use tokio::sync::{Mutex, oneshot};
 
 use super::Supervisor;
-use super::clock_tree;
+use super::clock_tree::Delays;
 use crate::acyclic::eeprom::{EepromAccess, with_eeprom};
-use crate::acyclic::topology::parents;
+use crate::acyclic::topology::{in_line, parents};
 use crate::acyclic::{AlState, DeviceRef, StateError, al, enumerate};
 use crate::bringup::device_return::{RunningBus, RunningSync, bring_back, reset};
 use crate::bringup::{BusDevice, Step, compare_identity, enable_op_only};
@@ -62,6 +62,7 @@ impl Supervisor {
             bus_status: Arc::clone(&self.bus_status),
             progress: self.progress.clone(),
             searches: vec![Search::default(); self.bus.devices.len()].into(),
+            delays: self.delays(Arc::clone(&latch)),
             latch,
         };
         async move {
@@ -97,6 +98,7 @@ struct ReturnTask {
     bus_status: Arc<BusStatus>,
     progress: std::sync::mpsc::Sender<Progress>,
     searches: IndexVec<DeviceIndex, Search>,
+    delays: Delays,
     latch: Arc<Mutex<()>>,
 }
 
@@ -178,11 +180,8 @@ impl ReturnTask {
             }
         }
         let reference = self.bus_status.reference();
-        let reference = reference.and_then(|reference| self.devices.get(reference));
         if let (Some(reference), false) = (reference, present.is_empty()) {
-            let clocks = clock_tree::clocks(&self.devices);
-            let station = reference.at.station;
-            let updated = clock_tree::update(&self.wire, &clocks, station, &self.latch, || true);
+            let updated = self.delays.update(reference, || true);
             if let Err(error) = updated.await {
                 // The clock then settles later, or the attempt fails.
                 tracing::debug!("{error}");
@@ -228,7 +227,11 @@ impl ReturnTask {
             try_join_all((0..count).map(word)).await
         };
         let stations = words(registers::STATION_ADDRESS).await?;
-        let status = words(registers::DL_STATUS).await?;
+        let status = words(registers::DL_STATUS).await?.into_iter();
+        let ring = self.wire.ring();
+        let status = (0..)
+            .zip(status)
+            .map(|(at, status)| in_line(at, status, ring));
         let mut identified: Vec<Option<DeviceIndex>> = Vec::new();
         let mut found = Vec::new();
         for ((position, station), parent) in (0..).zip(stations).zip(parents(status)) {

@@ -90,6 +90,9 @@ fn bus(machine: &Machine, out: &mut Document) {
         Nic::Sim => row("nic", "sim", "the simulated bus, from the same ESI files"),
         Nic::Interface(name) => row("nic", name, ""),
     }
+    if let Some(second) = &bus.redundant {
+        row("redundant", second, "the other end of the ring");
+    }
     let cycle = time(bus.cycle_ns);
     row(
         "cycle",

@@ -406,6 +406,7 @@ impl Observer for Listener {
                 after_ns,
                 restarted,
             } => (device_returned(device, *after_ns, *restarted), false),
+            Progress::Ring { text, broken } => (text.clone(), *broken),
             Progress::GroupReleased { group } => {
                 let text = format!("the group `{group}` has been reset: e enables");
                 (text, false)

@@ -76,6 +76,9 @@ table! { "[bus]",
     table RawBus {
         /// Network interface, or `"sim"` for the simulated bus (text; default `"sim"`)
         nic: Key<String>,
+        /// Cable redundancy: the interface at the other end of the ring; any other name on the simulated
+        /// bus (text; default none)
+        redundant: Key<String>,
         /// Time from frame to frame; also 0x60C2 and SYNC0 (time, 50 µs to 100 ms)
         cycle: Key<Ns> [50_000..=100 * MS] = "\"1ms\"",
         /// Consecutive cycles without a valid answer that stop the axes, see below (1 to 1000;

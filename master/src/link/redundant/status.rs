@@ -1,0 +1,118 @@
+//! What the copies of the last frames have shown of the ring.
+
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+
+use super::End;
+
+/// The path of a copy of a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct CopyPath {
+    /// True if it came back to the interface that had sent it: the ring is broken.
+    pub returned: bool,
+    /// How many devices have processed it; `None` if the frame had no broadcast.
+    pub devices: Option<u16>,
+}
+
+/// The state of a ring.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RingState {
+    /// No frame has come back yet, or none does any longer.
+    Silent,
+    Closed,
+    /// The ring is broken behind as many devices, of `devices` that answer.
+    Broken {
+        behind: u16,
+        devices: u16,
+    },
+}
+
+impl RingState {
+    /// Returns the number of devices in front of the break, if it is broken.
+    #[must_use]
+    pub const fn split(self) -> Option<u16> {
+        match self {
+            Self::Broken { behind, .. } => Some(behind),
+            Self::Silent | Self::Closed => None,
+        }
+    }
+
+    /// Returns a sentence about the ring of a number of devices. `name` returns the device at a
+    /// position.
+    #[must_use]
+    pub fn text(self, all: usize, name: impl Fn(u16) -> String) -> String {
+        match self {
+            Self::Silent => "no frame comes back to either end of the ring".to_owned(),
+            Self::Closed => "the ring is closed: a single broken cable stops nothing".to_owned(),
+            Self::Broken { behind, devices } => {
+                let all = u16::try_from(all).unwrap_or(u16::MAX).max(devices);
+                let missing = all - devices;
+                let before = match behind.checked_sub(1) {
+                    None => "the first interface (`nic`)".to_owned(),
+                    Some(before) => format!("`{}`", name(before)),
+                };
+                let after = match behind + missing {
+                    after if after < all => format!("`{}`", name(after)),
+                    _ => "the second interface (`redundant`)".to_owned(),
+                };
+                if missing > 0 {
+                    return format!(
+                        "the ring is broken between {before} and {after}, and frames do not reach {missing} \
+                         of {all} devices"
+                    );
+                }
+                format!(
+                    "the ring is broken between {before} and {after}: every device is still reached, \
+                     but the next broken cable stops a part of the machine"
+                )
+            }
+        }
+    }
+}
+
+/// The state of a ring, shared between its link and the rest of the program.
+#[derive(Debug, Default)]
+pub struct RingStatus {
+    /// Of each interface's copy: [`ARRIVED`], [`RETURNED`] and the number of devices.
+    copies: [AtomicU64; 2],
+}
+
+const ARRIVED: u64 = 1 << 16;
+const RETURNED: u64 = 1 << 17;
+
+impl RingStatus {
+    /// Sets whether the copy of an interface came back to it and how many devices have processed it;
+    /// `None` if it does not arrive.
+    pub(super) fn set(&self, from: End, path: Option<(bool, u16)>) {
+        let word = path.map_or(0, |(returned, devices)| {
+            ARRIVED | if returned { RETURNED } else { 0 } | u64::from(devices)
+        });
+        self.copies[from as usize].store(word, Relaxed);
+    }
+
+    /// Returns how many devices have processed the last copy of an interface with a broadcast, if it
+    /// took the same path.
+    pub(super) fn devices(&self, from: End, returned: bool) -> Option<u16> {
+        let word = self.copies[from as usize].load(Relaxed);
+        let same = word & ARRIVED != 0 && (word & RETURNED != 0) == returned;
+        same.then_some((word & 0xffff) as u16)
+    }
+
+    #[must_use]
+    pub fn get(&self) -> RingState {
+        let [first, second] = [&self.copies[0], &self.copies[1]].map(|copy| copy.load(Relaxed));
+        let devices = |word: u64| (word & 0xffff) as u16;
+        if first & ARRIVED != 0 && first & RETURNED == 0
+            || second & ARRIVED != 0 && second & RETURNED == 0
+        {
+            RingState::Closed
+        } else if (first | second) & ARRIVED == 0 {
+            RingState::Silent
+        } else {
+            // The copy that does not arrive has met no device.
+            RingState::Broken {
+                behind: devices(first),
+                devices: devices(first).saturating_add(devices(second)),
+            }
+        }
+    }
+}
