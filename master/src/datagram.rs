@@ -67,6 +67,12 @@ impl DatagramClient {
         self.ring.map(RingStatus::get)
     }
 
+    /// Returns true if the cables of both interfaces of a ring are exchanged.
+    #[must_use]
+    pub fn swapped(&self) -> bool {
+        self.ring.is_some_and(RingStatus::swapped)
+    }
+
     #[must_use]
     pub fn main_device(&self) -> &'static MainDevice<'static> {
         self.device

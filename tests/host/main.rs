@@ -7,6 +7,7 @@ mod bench;
 mod first_steps;
 mod interruptions;
 mod link;
+mod redundancy;
 mod signals;
 mod stop_trials;
 mod veth;

@@ -14,6 +14,8 @@ use ecaxis_master::session::{Options, Progress, run_on, run_with, simulated_bus}
 use ecaxis_sim::SecondPort;
 use ecaxis_test_support::{Heard, axes, faults, machine, run, virtual_time};
 
+use super::returns::{line_text, returned};
+
 const DRIVES: usize = 8;
 const CYCLE_NS: u64 = 1_000_000;
 /// The phases of the cycle at which cables break.
@@ -183,6 +185,47 @@ fn a_second_break_stops_the_machine_and_names_the_drives_between() {
     );
 }
 
+/// Where groups stop alone, the drives between two breaks return once a cable is repaired.
+#[test]
+fn drives_between_two_breaks_return() {
+    let steps = "\n[[step]]\nenable = true\n\n[[step]]\nmove = { a0 = 80.0 }\n\n[[step]]\nmove = { a0 = -80.0 }\n\
+        \n[[step]]\nreset = [\"a3\", \"a4\", \"a5\"]\n\n[[step]]\nenable = [\"a3\", \"a4\", \"a5\"]\n\
+        \n[[step]]\nmove = { a0 = 1.0, a3 = 2.0, a5 = 3.0, a7 = 4.0 }\n";
+    let text = line_text(DRIVES, steps);
+    let text = text.replacen("nic = \"sim\"", "nic = \"sim\"\nredundant = \"sim2\"", 1);
+    let script =
+        break_at(3, 2_000_000_000, 1_500_000_000) + &break_at(6, 2_300_000_000, 500_000_000);
+    let (outcome, heard) = run(machine(&text), faults(&script));
+    let (warnings, reports) = (heard.warnings(), reports(&heard));
+    outcome
+        .result
+        .unwrap_or_else(|error| panic!("{error}; {warnings:?}; {reports:?}"));
+    let mut names: Vec<_> = returned(&heard)
+        .into_iter()
+        .map(|(name, ..)| name)
+        .collect();
+    names.sort_unstable();
+    assert_eq!(names, ["a3", "a4", "a5"], "{warnings:?}");
+    for (text, report) in [
+        "between `a2` and `a3`: every device",
+        "between `a2` and `a6`, and frames do not reach 3 of 8 devices",
+        "between `a2` and `a3`: every device",
+        "is closed",
+    ]
+    .into_iter()
+    .zip(&reports)
+    {
+        assert!(report.contains(text), "{reports:#?}");
+    }
+    let summary = outcome.summary.expect("a summary");
+    let at: Vec<_> = summary
+        .axes
+        .iter()
+        .map(|axis| axis.target_position)
+        .collect();
+    assert_eq!([at[0], at[3], at[5], at[7]], [1.0, 2.0, 3.0, 4.0]);
+}
+
 /// The bus comes up with one cable out, whichever it is, and the ring is closed during the motion.
 #[test]
 fn a_broken_ring_comes_up_and_is_repaired_in_motion() {
@@ -295,4 +338,60 @@ fn clocks_behind_a_break_stay_in_their_window() {
             "cable {cable}"
         );
     }
+}
+
+/// A ring whose cables are exchanged at the computer.
+#[derive(Debug)]
+struct Exchanged(SimRing);
+
+const fn other(end: End) -> End {
+    match end {
+        End::First => End::Second,
+        End::Second => End::First,
+    }
+}
+
+impl RingEnds for Exchanged {
+    fn send(&mut self, from: End, frame: &[u8]) -> Result<(), LinkError> {
+        self.0.send(other(from), frame)
+    }
+
+    fn recv(&mut self, at: End, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+        self.0.recv(other(at), buf)
+    }
+
+    fn next_arrival(&self) -> Option<u64> {
+        self.0.next_arrival()
+    }
+
+    fn main_devices(&self) -> u64 {
+        self.0.main_devices()
+    }
+
+    fn stats(&mut self) -> LinkStats {
+        self.0.stats()
+    }
+}
+
+#[test]
+fn exchanged_cables_are_reported_and_do_not_matter() {
+    let options = faults(&break_at(3, 2_000_000_000, 500_000_000));
+    options.clock.enter();
+    let machine = ring();
+    let script = options.faults.as_ref();
+    let bus = simulated_bus(&machine, 1, script, Some(SecondPort::Listens)).expect("a ring");
+    let ends = Exchanged(SimRing(SimLink::new(bus)));
+    let link = Box::new(RedundantLink::new(Box::new(ends), CYCLE_NS / 2));
+    let (mut heard, stop) = (Heard::default(), Arc::<CancelToken>::default());
+    let outcome = run_on(link, machine, options, stop, &mut heard);
+    let warnings = heard.warnings();
+    outcome
+        .result
+        .unwrap_or_else(|error| panic!("{error}; {warnings:?}"));
+    assert!(
+        matches!(&warnings[..], [text] if text.contains("are exchanged")),
+        "{warnings:?}"
+    );
+    let reports = reports(&heard);
+    assert!(reports[0].contains("between `a2` and `a3`"), "{reports:?}");
 }

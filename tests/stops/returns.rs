@@ -14,7 +14,7 @@ fn line(count: usize, steps: &str) -> Machine {
     machine(&line_text(count, steps))
 }
 
-fn line_text(count: usize, steps: &str) -> String {
+pub(super) fn line_text(count: usize, steps: &str) -> String {
     let mut text = String::from("[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n");
     for position in 0..count {
         let limits = "limits = { position = [-100.0, 100.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 1.0 }";
@@ -28,7 +28,7 @@ fn line_text(count: usize, steps: &str) -> String {
 }
 
 /// Returns name, time in ns and whether it had no power, of each device that returned.
-fn returned(heard: &Heard) -> Vec<(String, u64, bool)> {
+pub(super) fn returned(heard: &Heard) -> Vec<(String, u64, bool)> {
     let each = heard.0.iter().filter_map(|progress| match progress {
         Progress::DeviceReturned {
             device,

@@ -201,6 +201,10 @@ pub async fn bring_up(
     let mut ring_delays = None;
     if let Some(ring) = wire.ring() {
         progress(ring_step(machine, ring));
+        if wire.swapped() {
+            let text = "the cables of `nic` and `redundant` are exchanged: `redundant` leads to the first device";
+            progress(Step::Warning(text.to_owned()));
+        }
         let measure = measure_delays(&wire, ring, &mut devices);
         let measured = times.measure("propagation delays", None, measure).await?;
         ring_delays = Some(measured);

@@ -30,6 +30,13 @@ pub enum End {
 
 impl End {
     pub const BOTH: [Self; 2] = [Self::First, Self::Second];
+
+    const fn swapped(self, swapped: bool) -> Self {
+        match (self, swapped) {
+            (Self::First, false) | (Self::Second, true) => Self::First,
+            (Self::Second, false) | (Self::First, true) => Self::Second,
+        }
+    }
 }
 
 /// Both interfaces of a ring. RT: as [`Link`].
@@ -161,11 +168,26 @@ impl RedundantLink {
 
     /// Takes what both interfaces have received. Returns the slot of an answer that is complete.
     fn collect(&mut self) -> Result<Option<usize>, LinkError> {
+        let mut failures = 0;
         for at in End::BOTH {
-            while let Some(len) = self.ends.recv(at, &mut self.scratch)? {
-                let complete = self.take(at, len);
-                if complete.is_some() {
-                    return Ok(complete);
+            loop {
+                let interface = at.swapped(self.status.swapped());
+                match self.ends.recv(interface, &mut self.scratch) {
+                    Ok(Some(len)) => {
+                        let complete = self.take(at, len);
+                        if complete.is_some() {
+                            return Ok(complete);
+                        }
+                    }
+                    Ok(None) => break,
+                    // An interface that goes down reports it once; the other one carries on.
+                    Err(error) => {
+                        failures += 1;
+                        if failures == End::BOTH.len() {
+                            return Err(error);
+                        }
+                        break;
+                    }
                 }
             }
         }
@@ -208,6 +230,11 @@ impl RedundantLink {
         let both = slot.copies.iter().all(Option::is_some);
         if let [Some(first), Some(second)] = slot.copies.map(|copy| copy?.devices) {
             self.all_devices = first.wrapping_add(second);
+            let crossed = slot.copies.iter().flatten().all(|copy| !copy.returned);
+            if crossed && first == 0 && second > 0 {
+                // All devices process the copy that enters at the first device.
+                self.status.swap();
+            }
         }
         // Without a broadcast, the last copy on the same path shows how many have processed it.
         let processed = devices.or_else(|| self.status.devices(from, returned));
@@ -279,7 +306,7 @@ impl Link for RedundantLink {
         let index = self.next % SLOTS;
         self.next += 1;
         self.oldest = self.oldest.max(self.next.saturating_sub(SLOTS));
-        let split = self.status.get().split();
+        let before = self.status.before();
         let slot = &mut self.slots[index];
         let place = slot.sent.get_mut(..frame.len());
         let place = place.ok_or(LinkError::TooLong(frame.len()))?;
@@ -294,9 +321,10 @@ impl Link for RedundantLink {
         for from in End::BOTH {
             let copy = &mut self.scratch[..frame.len()];
             copy.copy_from_slice(frame);
-            address(copy, from, split);
+            address(copy, from, before);
             // An interface without a cable may refuse the frame; the other one carries on.
-            if let Err(error) = self.ends.send(from, copy) {
+            let interface = from.swapped(self.status.swapped());
+            if let Err(error) = self.ends.send(interface, copy) {
                 failures += 1;
                 sent = Err(error);
             }
@@ -359,9 +387,9 @@ fn datagrams(frame: &[u8]) -> impl Iterator<Item = Datagram> {
     })
 }
 
-/// Prepares the copy of an interface. Positions count from the begin of each line, so a datagram to
+/// Prepares the copy of an interface; the first one's passes `before` devices. Positions count from the begin of each line, so a datagram to
 /// a position is addressed in one copy only. ARMW then writes to one line only; nothing here uses it.
-fn address(copy: &mut [u8], from: End, split: Option<u16>) {
+fn address(copy: &mut [u8], from: End, before: u16) {
     const NOP: u8 = 0;
     if from == End::Second {
         copy[MARK_AT] |= MARK;
@@ -377,14 +405,13 @@ fn address(copy: &mut [u8], from: End, split: Option<u16>) {
             Command::APRD | Command::APWR | Command::APRW | Command::ARMW
         ) {
             let position = 0_u16.wrapping_sub(header.address as u16);
-            match (from, split) {
-                (End::First, Some(first)) if position >= first => head[0] = NOP,
-                (End::First, _) => {}
-                (End::Second, Some(first)) if position >= first => {
-                    let there = first.wrapping_sub(position).to_le_bytes();
+            match (from, position < before) {
+                (End::First, true) => {}
+                (End::Second, false) => {
+                    let there = before.wrapping_sub(position).to_le_bytes();
                     head[2..4].copy_from_slice(&there);
                 }
-                (End::Second, _) => head[0] = NOP,
+                _ => head[0] = NOP,
             }
         }
         if !header.more {

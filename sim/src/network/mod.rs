@@ -220,6 +220,18 @@ impl Segment {
         true
     }
 
+    /// Unplugs the cable at a port of the MainDevice, or plugs it in again.
+    pub fn plug_main_device(&mut self, nic: Nic, plugged: bool) {
+        let cable = self.wiring.cable(End::MainDevice(nic));
+        let Some(cable) = cable.and_then(|n| self.wiring.cables.get_mut(n)) else {
+            return;
+        };
+        if cable.pulled == plugged {
+            cable.pulled = !plugged;
+            self.relink();
+        }
+    }
+
     /// Switches a device off or on. A device that is switched on starts in Init. Devices that it
     /// powers through the E-bus follow.
     pub fn power(&mut self, device: usize, on: bool) {

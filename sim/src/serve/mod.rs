@@ -60,6 +60,8 @@ const MOST_HELD: usize = 4096;
 const IDLE_NS: Nanos = 1_000_000;
 /// The number of idle rounds between two checks of the interface.
 const CHECK: u64 = 100;
+/// The period in ns at which the links of the interfaces are read.
+const CARRIER_PERIOD_NS: Nanos = 10_000_000;
 /// The minimum delay of a reply in ns. Timers are too coarse for shorter delays.
 const HOLD_NS: Nanos = 100_000;
 
@@ -99,8 +101,15 @@ impl Server {
         };
         let mut buffer = [0_u8; MAX_FRAME];
         let mut idle = 0_u64;
+        let mut carriers_due = 0;
         while !stop() {
             let now = clock(libc::CLOCK_MONOTONIC);
+            if now >= carriers_due {
+                carriers_due = now.saturating_add(CARRIER_PERIOD_NS);
+                for (socket, nic) in self.sockets.iter().zip([Nic::Primary, Nic::Secondary]) {
+                    segment.plug_main_device(nic, socket.has_carrier());
+                }
+            }
             replies.release(now);
             segment.advance(now);
             between(segment, now);

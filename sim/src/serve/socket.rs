@@ -130,6 +130,27 @@ impl RawSocket {
         Err(ServeError::Gone(self.nic.to_string_lossy().into_owned()))
     }
 
+    /// Returns true unless the interface has lost its link.
+    pub(super) fn has_carrier(&self) -> bool {
+        // SAFETY: all-zero is a valid ifreq.
+        let mut request: libc::ifreq = unsafe { mem::zeroed() };
+        let name = self.nic.as_bytes_with_nul();
+        for (to, from) in request.ifr_name.iter_mut().zip(name) {
+            *to = from.cast_signed() as libc::c_char;
+        }
+        // SAFETY: the request lives through the call, and the kernel writes into it only.
+        let read = unsafe {
+            libc::ioctl(
+                self.fd.as_raw_fd(),
+                libc::SIOCGIFFLAGS as _,
+                &raw mut request,
+            )
+        };
+        // SAFETY: after success, the flags are valid.
+        let flags = i32::from(unsafe { request.ifr_ifru.ifru_flags });
+        read < 0 || flags & libc::IFF_RUNNING != 0
+    }
+
     fn set<T>(&self, level: i32, name: i32, value: &T) -> io::Result<()> {
         // SAFETY: the value lives through the call and the length is its size.
         let result = unsafe {

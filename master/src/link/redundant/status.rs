@@ -1,6 +1,6 @@
 //! What the copies of the last frames have shown of the ring.
 
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 
 use super::End;
 
@@ -74,6 +74,7 @@ impl RingState {
 pub struct RingStatus {
     /// Of each interface's copy: [`ARRIVED`], [`RETURNED`] and the number of devices.
     copies: [AtomicU64; 2],
+    swapped: AtomicBool,
 }
 
 const ARRIVED: u64 = 1 << 16;
@@ -95,6 +96,30 @@ impl RingStatus {
         let word = self.copies[from as usize].load(Relaxed);
         let same = word & ARRIVED != 0 && (word & RETURNED != 0) == returned;
         same.then_some((word & 0xffff) as u16)
+    }
+
+    /// Returns how many devices the copy of the first interface passes; the maximum if that is unknown.
+    pub(super) fn before(&self) -> u16 {
+        match self.get() {
+            RingState::Silent => u16::MAX,
+            RingState::Closed | RingState::Broken { .. } => {
+                (self.copies[0].load(Relaxed) & 0xffff) as u16
+            }
+        }
+    }
+
+    /// Exchanges the interfaces: the first one is that at the IN port of the first device.
+    pub(super) fn swap(&self) {
+        self.swapped.fetch_xor(true, Relaxed);
+        for copy in &self.copies {
+            copy.store(0, Relaxed);
+        }
+    }
+
+    /// Returns true if the cables of both interfaces are exchanged.
+    #[must_use]
+    pub fn swapped(&self) -> bool {
+        self.swapped.load(Relaxed)
     }
 
     #[must_use]

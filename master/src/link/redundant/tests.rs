@@ -81,7 +81,7 @@ fn through_ring(sent: &[u8], split: Option<u16>) -> Vec<u8> {
     let mut answer = sent.to_vec();
     for from in End::BOTH {
         let mut copy = sent.to_vec();
-        address(&mut copy, from, split);
+        address(&mut copy, from, split.unwrap_or(DEVICES));
         let devices = match (from, split) {
             (End::First, _) => 0..split.unwrap_or(DEVICES),
             (End::Second, _) => split.unwrap_or(DEVICES)..DEVICES,
@@ -309,17 +309,17 @@ fn ring_recognises_breaks_and_repairs_by_the_paths_of_the_copies() {
 #[test]
 fn positions_are_asked_on_the_side_of_their_device() {
     let sent = frame(1, &[(Command::APRD, 0_u16.wrapping_sub(4), vec![0; 2])]);
-    for (split, [first, second]) in [
-        (None, [(1, -4_i16), (0, -4)]),
-        (Some(3), [(0, -4), (1, -1)]),
-        (Some(5), [(1, -4), (0, -4)]),
-        (Some(0), [(0, -4), (1, -4)]),
+    for (before, [first, second]) in [
+        (u16::MAX, [(1, -4_i16), (0, -4)]),
+        (3, [(0, -4), (1, -1)]),
+        (5, [(1, -4), (0, -4)]),
+        (0, [(0, -4), (1, -4)]),
     ] {
         for (from, expected) in [(End::First, first), (End::Second, second)] {
             let mut copy = sent.clone();
-            address(&mut copy, from, split);
+            address(&mut copy, from, before);
             let position = i16::from_le_bytes([copy[18], copy[19]]);
-            assert_eq!((copy[16], position), expected, "{split:?} {from:?}");
+            assert_eq!((copy[16], position), expected, "{before} {from:?}");
         }
     }
 }

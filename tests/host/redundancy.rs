@@ -1,0 +1,56 @@
+//! A ring of simulated SubDevices between two veth pairs. Requires root.
+
+use std::process::Stdio;
+use std::time::Duration;
+
+use ecaxis_test_support::host::over_a_pair;
+use ecaxis_test_support::program::{self, ProgramOutput};
+use ecaxis_test_support::tolerant_demo;
+use ecaxis_tools::bench::veth::VethPair;
+
+/// Each interface goes down and comes up again while the axes move.
+#[test]
+fn a_ring_outlasts_each_of_its_interfaces() {
+    over_a_pair(|first| {
+        let second = VethPair::new().expect("a second pair");
+        let file = tempfile::Builder::new().suffix(".toml").tempfile();
+        let file = file.expect("a temporary file");
+        let bus = format!("[bus]\nredundant = \"{}\"\n", second.b);
+        let text = tolerant_demo().replacen("[bus]", &bus, 1);
+        std::fs::write(file.path(), text).expect("written");
+        let path = file.path().to_str().expect("a path in UTF-8");
+        let ring = ["sim", path, "--nic", &first.a, "--nic2", &second.a];
+        let mut bus = ProgramOutput::start(program::command().args(ring).stdout(Stdio::null()));
+        bus.says("answer");
+        let run = [
+            "run",
+            path,
+            "--nic",
+            &first.b,
+            "--no-fault-report",
+            "--repeat",
+            "100",
+        ];
+        let mut run = ProgramOutput::start(program::command().args(run).stdout(Stdio::piped()));
+        run.says("the ring is closed");
+        run.says("Operation enabled");
+        for (pair, place) in [
+            (&first, "between the first interface (`nic`) and `x`"),
+            (
+                &second,
+                "between `y` and the second interface (`redundant`)",
+            ),
+        ] {
+            pair.set(&pair.b, false).expect("down");
+            run.says(place);
+            std::thread::sleep(Duration::from_millis(300));
+            pair.set(&pair.b, true).expect("up");
+            run.says("the ring is closed");
+        }
+        run.interrupt();
+        let output = run.end();
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(130), "{errors}");
+        println!("{}", String::from_utf8_lossy(&output.stdout));
+    });
+}
