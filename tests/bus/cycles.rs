@@ -2,7 +2,7 @@
 
 use ecaxis_master::config::Machine;
 use ecaxis_test_support::bench::Bench;
-use ecaxis_test_support::{axes, machine, run_badly, run_well, virtual_time};
+use ecaxis_test_support::{axes, faults, machine, run, run_badly, run_well, virtual_time};
 
 /// Returns the machine of `axes` with another cycle.
 fn at(cycle: &str) -> String {
@@ -76,4 +76,25 @@ fn a_cycle_shorter_than_its_frames_is_reported_as_lost_bus() {
         "{error}"
     );
     assert!(summary.is_some_and(|s| s.counters.cycles > 0));
+}
+
+/// Limits of a drive looked like a wrong machine file when the computer had missed some cycles.
+#[test]
+fn a_limit_of_the_drive_names_lost_frames_as_its_cause() {
+    let limits = |script: &str| {
+        let (outcome, heard) = run(machine(&axes(1)), faults(script));
+        assert!(outcome.result.is_ok(), "{outcome:?}");
+        let mut limits = heard.warnings();
+        limits.retain(|text| text.contains("internal limit active"));
+        limits
+    };
+    assert_eq!(limits(""), [""; 0]);
+    let two = "[[fault]]\nkind = \"frame-loss\"\ncount = 2\nat = ";
+    let script = (8..16).map(|tenth| format!("{two}\"{tenth}00ms\"\n"));
+    let caught_up = limits(&script.collect::<String>());
+    assert_eq!(caught_up.len(), 1, "{caught_up:?}");
+    assert!(
+        caught_up[0].contains("to catch up after late or lost frames"),
+        "{caught_up:?}"
+    );
 }

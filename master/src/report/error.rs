@@ -139,7 +139,12 @@ pub enum Cause {
     #[error(
         "scanning: {found}{} {}; missing: {}",
         if found < expected { format!(" of {expected}") } else { String::new() },
-        if *found == 1 { "SubDevice answers" } else { "SubDevices answer" }, few(missing)
+        match (*found, found < expected) {
+            (1, true) => "SubDevices answers",
+            (1, false) => "SubDevice answers",
+            _ => "SubDevices answer",
+        },
+        few(missing)
     )]
     Missing {
         expected: usize,

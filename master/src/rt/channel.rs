@@ -105,6 +105,8 @@ pub enum Event {
 pub struct Snapshot {
     pub time: Nanos,
     pub counters: Counters,
+    /// Wake-ups later than a quarter of the cycle: the drives may miss the target of that cycle.
+    pub late_wake_ups: u64,
     /// `None` without distributed clocks.
     pub phase: Option<PhaseStatus>,
     pub inputs_fresh: bool,

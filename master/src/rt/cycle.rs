@@ -69,6 +69,8 @@ pub struct Engine {
     clocks_off: IndexVec<DeviceIndex, bool>,
     guard: BusMonitor,
     guarding: bool,
+    /// Wake-ups later than a quarter of the cycle.
+    late_wake_ups: u64,
     supervisor: heartbeat::Watch,
     stats: Stats,
     history: FlightRecorder,
@@ -176,6 +178,7 @@ impl Engine {
             clocks_off,
             guard: BusMonitor::new(config.lost_frames, &groups),
             guarding: false,
+            late_wake_ups: 0,
             supervisor: heartbeat::Watch::default(),
             stats: Stats::default(),
             history,
@@ -238,7 +241,9 @@ impl Engine {
         let lateness = woke.saturating_sub(self.next);
         self.stats.lateness.record(lateness);
         self.stats.counters.cycles += 1;
-        if self.guarding && lateness > self.config.cycle_ns / 4 {
+        let is_late = lateness > self.config.cycle_ns / 4;
+        self.late_wake_ups += u64::from(is_late);
+        if self.guarding && is_late {
             self.log(LogEntryKind::WokeLate(lateness));
         }
 
@@ -401,6 +406,7 @@ impl Engine {
         for (to, slot) in snapshot.generators.iter_mut().zip(&self.axes) {
             *to = slot.generator.state();
         }
+        snapshot.late_wake_ups = self.late_wake_ups;
         snapshot.finished = self.finished;
         snapshot.inputs.copy_from_slice(&self.inputs);
         for (to, diagnosis) in snapshot.diagnoses.iter_mut().zip(self.exchange.diagnoses()) {
@@ -505,6 +511,7 @@ pub fn first_snapshot(
         axes: axes.iter().map(|slot| slot.axis.status()).collect(),
         generators: vec![GeneratorState::None; axes.len()].into(),
         inputs: vec![0.0; signals.inputs.len()],
+        late_wake_ups: 0,
         finished: false,
         diagnoses: vec![SubDeviceDiagnostics::default(); devices].into(),
         stopping: None,

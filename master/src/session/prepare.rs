@@ -31,7 +31,7 @@ use crate::rt::cycle::{EngineConfig, Signals, first_snapshot};
 use crate::rt::exchange::{Exchange, ExchangeDevice};
 use crate::rt::image::{self, AxisBits, BitField, DeviceRegion, ImagePlan, NotMapped, SignalBits};
 use crate::rt::phase::Phase;
-use crate::supervise::{RingWatch, Supervisor};
+use crate::supervise::{MissedTargets, ReportedLimits, RingWatch, Supervisor};
 
 /// A segment in SafeOp with everything that the cycle needs.
 #[derive(Debug)]
@@ -165,7 +165,8 @@ impl RunBuilder<'_> {
                     operator,
                     attendance: None,
                     seen: Vec::new(),
-                    limited: vec![false; machine.axes.len()].into(),
+                    limited: vec![ReportedLimits::default(); machine.axes.len()].into(),
+                    missed: MissedTargets::default(),
                     commands_sent: 0,
                     refused: VecDeque::new(),
                     captures: Vec::new(),

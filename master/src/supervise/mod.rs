@@ -32,6 +32,7 @@ use crate::rt::channel::{COMMANDS_PER_CYCLE, Event, HostEndpoint, RtCommand, Sna
 use crate::rt::exchange::{BusStatus, DiagnosticRegister, SubDeviceDiagnostics};
 use clock_tree::ClockTree;
 use groups::StoppedGroup;
+pub(crate) use limits::{MissedTargets, ReportedLimits};
 use returns::ReturnPort;
 pub(crate) use ring::RingWatch;
 
@@ -40,6 +41,7 @@ mod coordinated;
 pub(crate) mod diagnosis_history;
 mod explain;
 mod groups;
+mod limits;
 pub mod operator;
 mod program;
 mod returns;
@@ -92,8 +94,10 @@ pub struct Supervisor {
     pub captures: Vec<ProbeCapture>,
     /// The stops of groups during which the machine continued, in the order of their reports.
     pub stopped: Vec<StoppedGroup>,
-    /// `true` for axes whose drive has reported an internal limit.
-    pub limited: IndexVec<AxisIndex, bool>,
+    /// What has been reported of the internal limits of each axis.
+    pub limited: IndexVec<AxisIndex, ReportedLimits>,
+    /// The frames that did not bring a target in time.
+    pub missed: MissedTargets,
     /// The time of the last status report.
     pub last_status: Nanos,
     /// The state of the bus at the failure.
@@ -418,19 +422,6 @@ impl Supervisor {
         }
         self.attend(&snapshot).await?;
         Ok(snapshot)
-    }
-
-    /// Reports Statusword bit 11 (internal limit active) once for each axis.
-    fn report_limits(&mut self, snapshot: &Snapshot) {
-        for (axis, status) in snapshot.axes.enumerate() {
-            if status.internal_limit && status.enabled && !self.limited[axis] {
-                self.limited[axis] = true;
-                let device = self.device_of(axis);
-                self.report(Progress::Warning(format!(
-                    "{device}: the drive limits what it is commanded (Statusword bit 11, internal limit active)"
-                )));
-            }
-        }
     }
 
     fn pass_events_on(&mut self) {
