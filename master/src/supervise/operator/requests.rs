@@ -458,6 +458,8 @@ impl RequestController {
             let ill = status.is_some_and(|s| s.fault.is_some() || s.trip.is_some());
             let with_it =
                 group != GroupIndex::MACHINE && scene.group(other) == group && (ill || stopped);
+            // A reset of all axes names each of them, and each resets the others with it.
+            let with_it = with_it && hand.doing != Activity::Resetting;
             if other == axis || with_it {
                 hand.preempt(Activity::Resetting, other, out);
                 hand.begin(Activity::Resetting, scene.now);

@@ -1,0 +1,178 @@
+"""A connection to the socket of the server: requests, answers and events."""
+
+from __future__ import annotations
+
+import array
+import itertools
+import json
+import os
+import queue
+import socket
+import threading
+from typing import Any, Callable, Dict, List, Mapping, Optional
+
+from ._errors import ConnectionLost, EcaxisError, TimedOut, of_answer
+
+Event = Dict[str, Any]
+Answer = Dict[str, Any]
+
+# Outcomes that came before the answer that names their request.
+_KEPT = 1024
+_OUTCOMES = frozenset({"done", "failed", "refused", "replaced", "let_go"})
+
+
+class Outcome:
+    """The outcome of a command, once its event has come."""
+
+    def __init__(self) -> None:
+        self.event: Optional[Event] = None
+        self.lost: Optional[EcaxisError] = None
+        self.known = threading.Event()
+
+    def set(self, event: Optional[Event], lost: Optional[EcaxisError] = None) -> None:
+        if not self.known.is_set():
+            self.event, self.lost = event, lost
+            self.known.set()
+
+
+class Connection:
+    """Sends requests and receives answers and events. Threads may share it."""
+
+    def __init__(self, path: "str | os.PathLike[str]", timeout: float = 10.0) -> None:
+        self._socket = socket.socket(socket.AF_UNIX)
+        try:
+            self._socket.connect(os.fspath(path))
+        except OSError as error:
+            self._socket.close()
+            raise ConnectionLost(f"cannot connect to {os.fspath(path)}: {error.strerror}") from error
+        self.timeout = timeout
+        self._numbers = itertools.count(1)
+        self._lock = threading.Lock()
+        self._answers: Dict[int, "queue.SimpleQueue[Answer]"] = {}
+        self._outcomes: Dict[int, Outcome] = {}
+        self._descriptors: List[int] = []
+        self._listeners: List[Callable[[Event], None]] = []
+        self._lost: Optional[ConnectionLost] = None
+        self._reader = threading.Thread(target=self._read, name="ecaxis", daemon=True)
+        self._reader.start()
+
+    def close(self) -> None:
+        """Closes the connection. Its lease ends, and what it moved stops."""
+        try:
+            self._socket.shutdown(socket.SHUT_RDWR)
+        except OSError:
+            pass
+        if threading.current_thread() is not self._reader:
+            self._reader.join()
+        self._socket.close()
+
+    def request(self, op: str, timeout: Optional[float] = None, **keys: Any) -> Answer:
+        """Sends a request and returns its answer. Keys that are None are left out.
+
+        Raises the exception of the answer; `TimedOut` and `ConnectionLost` without one."""
+        number = next(self._numbers)
+        answers: "queue.SimpleQueue[Answer]" = queue.SimpleQueue()
+        given = {name: value for name, value in keys.items() if value is not None}
+        line = json.dumps({"id": number, "op": op, **given}, allow_nan=False)
+        with self._lock:
+            if self._lost:
+                raise self._lost
+            self._answers[number] = answers
+            try:
+                self._socket.sendall(line.encode() + b"\n")
+            except OSError as error:
+                raise ConnectionLost(f"the connection is lost: {error.strerror}") from error
+        wait = self.timeout if timeout is None else timeout
+        try:
+            answer = answers.get(timeout=wait)
+        except queue.Empty:
+            raise TimedOut(f"no answer to `{op}` within {wait:g} s", "timeout") from None
+        finally:
+            with self._lock:
+                self._answers.pop(number, None)
+        if not answer:
+            raise self._lost or ConnectionLost("the connection is closed")
+        if not answer["ok"]:
+            raise of_answer(answer["error"])
+        return answer
+
+    def command(self, op: str, **keys: Any) -> Outcome:
+        """Sends a command. Returns its outcome, which comes later."""
+        return self.outcome(int(self.request(op, **keys)["request"]))
+
+    def outcome(self, request: int) -> Outcome:
+        with self._lock:
+            outcome = self._outcomes.setdefault(request, Outcome())
+            if self._lost:
+                outcome.set(None, self._lost)
+            return outcome
+
+    def descriptors(self, count: int) -> List[int]:
+        """Returns the file descriptors that have come with the last answer."""
+        with self._lock:
+            taken, self._descriptors = self._descriptors[:count], self._descriptors[count:]
+        if len(taken) < count:
+            raise EcaxisError("the server has sent no file descriptors")
+        return taken
+
+    def listen(self, listener: Callable[[Event], None]) -> None:
+        """Calls a function with each event, in the thread of the connection. It must not block."""
+        with self._lock:
+            self._listeners.append(listener)
+
+    def forget(self, listener: Callable[[Event], None]) -> None:
+        with self._lock:
+            self._listeners = [other for other in self._listeners if other is not listener]
+
+    def _read(self) -> None:
+        rest = b""
+        reason = "the server has closed the connection"
+        try:
+            while True:
+                more, control, _, _ = self._socket.recvmsg(1 << 16, socket.CMSG_SPACE(64))
+                if not more:
+                    break
+                for level, kind, data in control:
+                    if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
+                        received = array.array("i")
+                        received.frombytes(data[: len(data) - len(data) % received.itemsize])
+                        with self._lock:
+                            self._descriptors.extend(received)
+                *lines, rest = (rest + more).split(b"\n")
+                for line in lines:
+                    self._take(json.loads(line))
+        except (OSError, ValueError) as error:
+            reason = f"the connection is lost: {error}"
+        lost = ConnectionLost(reason)
+        with self._lock:
+            self._lost = lost
+            waiting, outcomes = list(self._answers.values()), list(self._outcomes.values())
+            left, self._descriptors = self._descriptors, []
+        for descriptor in left:
+            os.close(descriptor)
+        for answers in waiting:
+            answers.put({})
+        for outcome in outcomes:
+            outcome.set(None, lost)
+        self._notify({"event": "lost", "text": reason})
+
+    def _take(self, message: Mapping[str, Any]) -> None:
+        if "ok" in message:
+            with self._lock:
+                answers = self._answers.get(message.get("id", 0))
+            if answers:
+                answers.put(dict(message))
+            return
+        if message.get("event") in _OUTCOMES and "request" in message:
+            with self._lock:
+                outcome = self._outcomes.setdefault(int(message["request"]), Outcome())
+                while len(self._outcomes) > _KEPT:
+                    self._outcomes.pop(next(iter(self._outcomes)))
+            outcome.set(dict(message))
+        self._notify(dict(message))
+
+    def _notify(self, event: Event) -> None:
+        with self._lock:
+            listeners = list(self._listeners)
+        for listener in listeners:
+            listener(event)
