@@ -20,6 +20,8 @@ pub const FEATURES: u16 = 0x0008;
 pub const STATION_ADDRESS: u16 = 0x0010;
 /// DL control: forwarding rule, temporary use, and the loop of each port.
 pub const DL_CONTROL: u16 = 0x0100;
+/// DL control, second byte: two bits for the loop of each port.
+pub const DL_CONTROL_LOOPS: u16 = 0x0101;
 /// DL status: links and loops of the ports.
 pub const DL_STATUS: u16 = 0x0110;
 /// AL control: the state that the MainDevice requests.

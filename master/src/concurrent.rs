@@ -1,7 +1,7 @@
 //! Runs the same work on many devices at the same time, in one task.
 
 use std::future::{Future, poll_fn};
-use std::pin::Pin;
+use std::pin::{Pin, pin};
 use std::task::Poll;
 
 /// Runs futures at the same time until all complete or one fails. Returns their outputs in order, or
@@ -37,10 +37,47 @@ where
     Ok(outputs.into_iter().flatten().collect())
 }
 
+/// Futures that run while other work runs.
+#[derive(Debug)]
+pub struct Background<F> {
+    running: Vec<Pin<Box<F>>>,
+}
+
+impl<F: Future> Background<F> {
+    #[must_use]
+    pub const fn new() -> Self {
+        Self {
+            running: Vec::new(),
+        }
+    }
+
+    pub fn add(&mut self, future: F) {
+        self.running.push(Box::pin(future));
+    }
+
+    /// Runs the futures until `work` completes. Returns its output, and the outputs of the futures
+    /// that have completed meanwhile.
+    pub async fn run_during<W: Future>(&mut self, work: W) -> (W::Output, Vec<F::Output>) {
+        let mut work = pin!(work);
+        let mut outputs = Vec::new();
+        let done = poll_fn(|context| {
+            self.running
+                .retain_mut(|future| match future.as_mut().poll(context) {
+                    Poll::Ready(output) => {
+                        outputs.push(output);
+                        false
+                    }
+                    Poll::Pending => true,
+                });
+            work.as_mut().poll(context)
+        });
+        (done.await, outputs)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use std::cell::RefCell;
-    use std::pin::pin;
     use std::task::{Context, Waker};
 
     use super::*;
@@ -99,5 +136,20 @@ mod tests {
             });
         assert_eq!(run(try_join_all(each)), Err('b'));
         assert_eq!(ended.into_inner(), 2);
+    }
+
+    #[test]
+    fn background_futures_run_on_during_later_work() {
+        let mut background = Background::new();
+        for times in [1, 5, 3] {
+            background.add(async move {
+                pause(times).await;
+                times
+            });
+        }
+        let outputs = |run: ((), Vec<u32>)| run.1;
+        assert_eq!(outputs(run(background.run_during(pause(3)))), [1, 3]);
+        assert!(outputs(run(background.run_during(pause(0)))).is_empty());
+        assert_eq!(outputs(run(background.run_during(pause(9)))), [5]);
     }
 }

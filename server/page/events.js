@@ -6,7 +6,7 @@ const KINDS = {
   client: "Clients",
   fault: "Faults and trips", emergency: "Emergency messages", fault_report: "Fault reports", bus: "Bus", lease: "Control", request: "Commands", program: "Program", group: "Groups", stream: "Streams and cyclic area", captured: "Captured positions", warning: "Warnings",
 };
-const kindOf = (event) => ({ done: "request", failed: "request", refused: "request", replaced: "request", let_go: "request", group_stopped: "group", group_released: "group", area: "stream" })[event] ?? event;
+const kindOf = (event) => ({ done: "request", failed: "request", refused: "request", replaced: "request", let_go: "request", group_stopped: "group", group_released: "group", group_waits: "group", area: "stream" })[event] ?? event;
 const BAD = new Set(["fault", "fault_report", "failed", "refused", "group_stopped", "emergency"]);
 const MAX_ROWS = 500;
 
@@ -21,6 +21,7 @@ function textOf(event) {
     case "failed": case "refused": case "replaced": case "let_go": return `${event.what ?? "command"}: ${event.event.replace("_", " ")}${why}`;
     case "program": return event.step !== undefined && event.step !== null ? `step ${event.step}${event.run ? `, run ${event.run}` : ""}: ${event.what ?? ""}` : `program ${event.ok ? "ended" : "failed"}${why}`;
     case "group_stopped": return `group ${event.group} stops${why}`;
+    case "group_waits": return `group ${event.group} waits for its optional devices`;
     case "group_released": return `group ${event.group} is released${why}`;
     case "fault": return event.why ?? "fault";
     case "fault_report": return event.headline ?? "";
@@ -29,7 +30,7 @@ function textOf(event) {
     case "stream": return `stream: ${event.state}${why}`;
     case "client": return `client ${event.client} ${event.connected ? "connected" : "disconnected"}${event.pid ? ` (process ${event.pid}, user ${event.uid})` : ""}`;
     case "area": return `cyclic area${why}`;
-    case "warning": return event.text ?? "";
+    case "unknown_device": case "warning": return event.text ?? "";
     default: return JSON.stringify({ ...event, event: undefined, number: undefined, time_ns: undefined });
   }
 }

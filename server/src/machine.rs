@@ -138,16 +138,36 @@ impl Observer for Reporter<'_> {
             Progress::GroupReleased { group } => {
                 hub.event(json!({"event": "group_released", "group": group}));
             }
+            Progress::DeviceLost { device, parent } => {
+                let parent = parent.as_ref();
+                hub.event(json!({
+                    "event": "device_lost", "device": device.name,
+                    "parent": parent.map(|(name, _)| name), "port": parent.map(|(_, port)| port),
+                }));
+            }
             Progress::DeviceReturned {
                 device,
                 after_ns,
                 restarted,
+                first,
             } => hub.event(json!({
                 "event": "device_returned", "device": device.name, "after_s": *after_ns as f64 * 1e-9,
-                "restarted": restarted,
+                "restarted": restarted, "first": first,
             })),
             Progress::Ring { text, broken } => {
                 hub.event(json!({"event": "ring", "broken": broken, "text": text}));
+            }
+            Progress::GroupWaits { group } => {
+                hub.event(json!({"event": "group_waits", "group": group}));
+            }
+            Progress::UnknownDevice(device) => {
+                let parent = device.parent.as_ref();
+                hub.event(json!({
+                    "event": "unknown_device", "text": device.to_string(),
+                    "identity": device.identity, "serial": device.serial,
+                    "parent": parent.map(|(name, _)| name), "port": parent.map(|(_, port)| port),
+                    "closed": device.closed,
+                }));
             }
             Progress::Warning(text) => warning(hub, text),
             Progress::Denied(denied) => warning(hub, &denied.to_string()),

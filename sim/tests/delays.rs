@@ -157,7 +157,13 @@ fn delays_match_behind_a_coupler() {
 
 #[test]
 fn delays_match_in_a_tree() {
-    let request = |after, port| Some(PortRequest { after, port });
+    let request = |after, port| {
+        Some(PortRequest {
+            after,
+            port,
+            shared: false,
+        })
+    };
     let star = [
         None,
         request(0, Some(3)),

@@ -77,7 +77,13 @@ fn frames_reach_devices_in_processing_order() {
     // Star of a four-port device: branches at ports 3, 1 and 2, the first of them two devices deep.
     let devices = ["YYYY", "YY", "YY", "YY", "YY"].map(with_physics);
     let media = media(&devices);
-    let request = |after, port| Some(ecaxis_sim::PortRequest { after, port });
+    let request = |after, port| {
+        Some(ecaxis_sim::PortRequest {
+            after,
+            port,
+            shared: false,
+        })
+    };
     let requests = [
         None,
         request(0, Some(3)),

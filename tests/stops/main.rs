@@ -8,5 +8,7 @@ mod causes;
 mod failures;
 mod groups;
 mod limits;
+mod optional;
 mod redundancy;
 mod returns;
+mod unknown;

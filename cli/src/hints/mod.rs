@@ -163,6 +163,9 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         }
         Cause::BusLost { answered: true, wkc, .. } => fault_report::working_counter(*wkc).to_owned(),
         Cause::LeftOp { code, .. } => al_status(*code).to_owned(),
+        Cause::Absent => "connect the device, or take its axes out of the program".to_owned(),
+        Cause::HeldOutput { .. } => "leave it out of `pdo.rx`: an optional device cannot keep its own value".to_owned(),
+        Cause::OtherUnits => "give the axis its units in the machine file: `encoder`, `velocity_unit`, `acceleration_unit`".to_owned(),
         Cause::Gone => "check the device's power and the cable to it".to_owned(),
         Cause::LeftOpBriefly { .. } => "look for loose connectors and supply dips".to_owned(),
         Cause::NotReached { .. } => {

@@ -152,7 +152,8 @@ impl Observer for ProgressPrinter {
                 note(&format!("warning: {text}"));
             }
             Progress::Emergency(report) => note(&format!("warning: {report}")),
-            Progress::Topology(_) | Progress::Mailboxes(_) => {}
+            // The stop of the group is reported.
+            Progress::DeviceLost { .. } | Progress::Topology(_) | Progress::Mailboxes(_) => {}
             Progress::GroupStopped { group, cause } => {
                 note(&format!(
                     "warning: the group `{group}` stops, the rest goes on: {cause}"
@@ -170,7 +171,17 @@ impl Observer for ProgressPrinter {
                 device,
                 after_ns,
                 restarted,
-            } => note(&device_returned(device, *after_ns, *restarted)),
+                first,
+            } => note(&match first {
+                true => device_appeared(device),
+                false => device_returned(device, *after_ns, *restarted),
+            }),
+            Progress::GroupWaits { group } => {
+                note(&format!(
+                    "the group `{group}` waits for its optional devices"
+                ));
+            }
+            Progress::UnknownDevice(device) => note(&format!("warning: {device}")),
             Progress::BringUpTimes(steps) if self.times => {
                 note(bring_up_times(steps).trim_end());
             }
@@ -266,6 +277,11 @@ fn axis_text(axis: &AxisLine) -> String {
         _ => format!("{name} {position:.3} {unit}"),
     }
 }
+/// Describes an optional device that was absent.
+pub fn device_appeared(device: &DeviceRef) -> String {
+    format!("{device} has appeared and is in Op; reset its axes, then enable them")
+}
+
 /// Describes a device that is in Op again.
 pub fn device_returned(device: &DeviceRef, after_ns: Nanos, restarted: bool) -> String {
     let after = after_ns as f64 * 1e-9;

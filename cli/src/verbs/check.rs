@@ -116,8 +116,9 @@ fn summary(machine: &Machine) -> Document {
         );
         let (at, back) = (&device.at, selection.layout.tx_bytes());
         out.line(format!(
-            "{} at {at}: {name}, {mode}, {bytes} out, {back} in",
-            device.name
+            "{} at {at}: {name}, {mode}, {bytes} out, {back} in{}",
+            device.name,
+            if device.optional { "; optional" } else { "" }
         ));
         for note in &selection.notes {
             let (lead, note) = note_of(note);

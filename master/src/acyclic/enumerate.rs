@@ -1,6 +1,7 @@
 //! Enumerates the SubDevices of a segment and assigns station addresses.
 
 use crate::acyclic::{AlState, DeviceRef};
+use crate::concurrent::try_join_all;
 use crate::config::Locator;
 use crate::datagram::DatagramClient;
 use crate::mailbox::DatagramError;
@@ -178,6 +179,23 @@ pub async fn at<const N: usize>(
         Ok(1) => Ok(bytes),
         answer => Err(no_answer(position, step, answer)),
     }
+}
+
+/// Reads a register of all devices at once, in the order of the segment.
+///
+/// # Errors
+/// [`Cause::Silent`] if a device does not answer.
+pub(crate) async fn words(
+    wire: &DatagramClient,
+    count: u16,
+    step: &'static str,
+    register: u16,
+) -> Result<Vec<u16>, Error> {
+    let word = async |position| {
+        let bytes = at(wire, position, step, register).await?;
+        Ok::<_, Error>(u16::from_le_bytes(bytes))
+    };
+    try_join_all((0..count).map(word)).await
 }
 
 /// Returns the error of a device that should have answered.

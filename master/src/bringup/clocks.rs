@@ -63,6 +63,7 @@ pub(super) async fn configure(
         .devices
         .iter()
         .zip(&*devices)
+        .filter(|(_, device)| device.present)
         .filter_map(|(config, device)| Some((config.selection.dc.as_ref()?, device)))
         .collect();
     if let Some((_, device)) = wanting.iter().find(|(_, device)| !device.dc) {

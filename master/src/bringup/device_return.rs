@@ -79,6 +79,17 @@ pub(crate) async fn bring_back(
     let times = StepTimes::default();
     let subject = (index, config, &mut *device);
     configure(wire, machine, subject, (region, status), progress, &times).await?;
+    if let (false, Some((index, sub, _))) = (device.present, device.held.first()) {
+        let (index, sub) = (*index, *sub);
+        return Err(Cause::HeldOutput { index, sub }.with_device(&device.at));
+    }
+    for (axis, adopted) in &device.adopted {
+        let mut other = Machine::clone(machine);
+        other.adopt(*axis, adopted);
+        if other.axes[*axis].config != machine.axes[*axis].config {
+            return Err(Cause::OtherUnits.with_device(&device.at));
+        }
+    }
     if let Some(dc) = &config.selection.dc {
         let running = bus.sync;
         let running = running.ok_or_else(|| Cause::NoStart.with_device(&device.at))?;

@@ -241,7 +241,7 @@ pub(super) async fn assign(
     group: &Group,
     machine: &Machine,
     progress: &dyn Fn(Step),
-) -> Result<Vec<u16>, report::Error> {
+) -> Result<Vec<Option<u16>>, report::Error> {
     let mut found = Vec::with_capacity(group.len());
     for sub_device in group.iter(main_device) {
         found.push(ScannedDevice {
@@ -254,12 +254,11 @@ pub(super) async fn assign(
 
     let mut order = Vec::with_capacity(machine.devices.len());
     let mut elsewhere = Vec::new();
+    let mut optional = Vec::new();
     let mut missing = false;
     for config in &machine.devices {
         let position = match config.at {
-            Locator::Position(position) => {
-                (usize::from(position) < found.len()).then_some(usize::from(position))
-            }
+            Locator::Position(_) => None,
             Locator::Alias(alias) => found.iter().position(|f| f.alias == alias),
             Locator::Id(id) => {
                 let stations = found.iter().map(|f| {
@@ -269,26 +268,28 @@ pub(super) async fn assign(
                 al::find_explicit_id(wire, stations, id).await
             }
         };
-        match position {
-            Some(position) => {
-                let position = u16::try_from(position).unwrap_or(u16::MAX);
-                order.push(position);
-                if !matches!(config.at, Locator::Position(_)) {
-                    elsewhere.push(position);
-                }
-            }
-            None => match config.at {
-                Locator::Position(_) => missing = true,
-                Locator::Alias(alias) => {
-                    return Err(not_located(&config.name, format!("alias {alias}")));
-                }
-                Locator::Id(id) => {
-                    return Err(not_located(
-                        &config.name,
-                        format!("device identification {id}"),
-                    ));
-                }
-            },
+        let position = position.map(|position| u16::try_from(position).unwrap_or(u16::MAX));
+        elsewhere.extend(position);
+        optional.extend(position.filter(|_| config.optional));
+        order.push(position);
+        let locator = match config.at {
+            Locator::Alias(alias) => format!("alias {alias}"),
+            Locator::Id(id) => format!("device identification {id}"),
+            Locator::Position(_) => continue,
+        };
+        if position.is_none() && !config.optional {
+            return Err(not_located(&config.name, locator));
+        }
+    }
+    // Positions do not count optional devices.
+    let steady = (0_u16..)
+        .take(found.len())
+        .filter(|at| !optional.contains(at));
+    let steady: Vec<_> = steady.collect();
+    for (config, order) in machine.devices.iter().zip(&mut order) {
+        if let Locator::Position(position) = config.at {
+            *order = steady.get(usize::from(position)).copied();
+            missing |= order.is_none();
         }
     }
     // The products at the positions that the file does not locate otherwise.
@@ -302,7 +303,9 @@ pub(super) async fn assign(
         return Err(devices_missing(machine, found.len(), missing));
     }
 
-    for (config, &position) in machine.devices.iter().zip(&order) {
+    let located = machine.devices.iter().zip(&order);
+    for (config, position) in located.filter_map(|(config, position)| Some((config, (*position)?)))
+    {
         let &ScannedDevice {
             identity,
             serial,
@@ -333,7 +336,7 @@ pub(super) async fn assign(
     }
     for (position, ScannedDevice { identity, .. }) in found.iter().enumerate() {
         let position = u16::try_from(position).unwrap_or(u16::MAX);
-        if !order.contains(&position) {
+        if !order.contains(&Some(position)) {
             let identity = known(machine, *identity);
             return Err(Cause::Unexpected { position, identity }.into());
         }
@@ -449,7 +452,7 @@ fn identity(from: SubDeviceIdentity) -> Identity {
 }
 
 /// Returns an identity with the name from one of the machine's ESI files.
-fn known(machine: &Machine, identity: Identity) -> String {
+pub(crate) fn known(machine: &Machine, identity: Identity) -> String {
     machine
         .devices
         .iter()

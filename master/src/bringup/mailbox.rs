@@ -120,6 +120,21 @@ pub(super) async fn open(
     }))
 }
 
+/// Returns the mailbox that a device has by its ESI; `None` without CoE.
+pub(super) fn expected(config: &DeviceConfig, device: &DeviceRef) -> Option<MailboxLayout> {
+    config.device.mailbox.as_ref()?.coe.as_ref()?;
+    let esi = EsiMailbox::of(config)?;
+    Some(MailboxLayout {
+        station: device.station,
+        out_address: esi.out.1.start_address,
+        out_len: esi.out.1.default_size,
+        in_address: esi.inp.1.start_address,
+        in_len: esi.inp.1.default_size,
+        out_sm: esi.out.0,
+        in_sm: esi.inp.0,
+    })
+}
+
 /// Address and length of both mailboxes, out and in.
 type Areas = ((u16, u16), (u16, u16));
 

@@ -48,7 +48,7 @@ mod mailbox;
 mod mapping;
 mod output_defaults;
 mod times;
-pub(crate) use identify::{compare as compare_identity, name_at};
+pub(crate) use identify::{compare as compare_identity, known as known_identity, name_at};
 mod watchdog;
 
 pub use crate::report::bring_up::{Step, StepTime};
@@ -81,6 +81,8 @@ pub struct BusDevice {
     pub adopted: Vec<(AxisIndex, AdoptedUnits)>,
     /// For a drive: its own limits that the machine file exceeds.
     pub limits: Vec<(AxisIndex, LimitConflict)>,
+    /// False if it is optional and was absent.
+    pub present: bool,
     /// The serial number in its EEPROM.
     pub serial: u32,
     /// Propagation delay from the reference clock in ns.
@@ -115,7 +117,11 @@ impl Bus {
     /// Returns the place of each device.
     #[must_use]
     pub fn places(&self) -> IndexVec<DeviceIndex, DevicePlace> {
-        let mut order: Vec<_> = self.devices.enumerate().collect();
+        let mut order: Vec<_> = self
+            .devices
+            .enumerate()
+            .filter(|(_, d)| d.present)
+            .collect();
         order.sort_by_key(|(_, device)| device.at.position);
         let parents = topology::parents(order.iter().map(|(_, device)| device.dl_status));
         let place = |(index, device): (DeviceIndex, &BusDevice)| {
@@ -183,16 +189,23 @@ pub async fn bring_up(
     };
     let order = times.measure("identification", None, assign).await?;
     progress(Step::Found {
-        devices: order.len(),
+        devices: order.iter().flatten().count(),
     });
 
     let found = machine
         .devices
         .iter()
         .zip(&order)
-        .map(|(config, &position)| {
-            let device = describe(&wire, main_device, &group, config, position, progress);
-            times.measure("mailbox", Some(&config.name), device)
+        .zip(0..)
+        .map(|((config, &position), index)| {
+            let (wire, group, times) = (&wire, &group, &times);
+            async move {
+                let Some(position) = position else {
+                    return Ok(absent(config, index));
+                };
+                let device = describe(wire, main_device, group, config, position, progress);
+                times.measure("mailbox", Some(&config.name), device).await
+            }
         });
     let found = try_join_all(found).await?;
     // From here on, ethercrab only carries datagrams; see docs/decisions/0001.
@@ -223,6 +236,12 @@ pub async fn bring_up(
         device.report(listener);
     }
     let (image, dc, clocks_settled) = set_up?;
+    for (config, device) in machine.devices.iter().zip(&mut devices) {
+        if !device.present {
+            device.dc = config.selection.dc.is_some();
+            device.follows = device.dc && dc.is_some();
+        }
+    }
     let devices = devices.into();
     Ok(Bus {
         devices,
@@ -306,11 +325,40 @@ async fn describe(
         limits: Vec::new(),
         dc,
         follows: false,
+        present: true,
         serial: sub_device.identity().serial,
         propagation_delay,
         dl_status: topology::in_line(position, dl_status, wire.ring()),
         op_only: Vec::new(),
     })
+}
+
+/// Returns an optional device that is absent, with its future station address.
+fn absent(config: &DeviceConfig, index: u16) -> BusDevice {
+    /// Devices that are present have lower addresses.
+    const FIRST_ABSENT: u16 = 0x2000;
+    let info = &config.device.info;
+    let at = DeviceRef {
+        name: config.name.clone(),
+        position: u16::MAX,
+        station: FIRST_ABSENT + index,
+    };
+    let coe = mailbox::expected(config, &at);
+    BusDevice {
+        coe: coe.map(|layout| CoeClient::new(layout).with_timeouts(mailbox_timeouts(info))),
+        timeouts: StateTimeouts::new(info),
+        at,
+        held: Vec::new(),
+        adopted: Vec::new(),
+        limits: Vec::new(),
+        dc: false,
+        follows: false,
+        present: false,
+        serial: 0,
+        propagation_delay: 0,
+        dl_status: 0,
+        op_only: Vec::new(),
+    }
 }
 
 /// Takes the segment from PreOp to SafeOp. Devices are configured at the same time, and their clocks
@@ -331,6 +379,7 @@ async fn set_up(
         .zip(&mut *devices)
         .zip(&image.regions);
     let each = (0..).map(DeviceIndex).zip(each);
+    let each = each.filter(|(_, ((_, device), _))| device.present);
     let each = each.map(async |(index, ((config, device), region))| {
         let status = image.mailboxes.as_ref().and_then(|m| m.logical_of(index));
         configure(
@@ -358,6 +407,7 @@ async fn set_up(
     let dc = times.measure("SYNC0", None, dc).await?;
 
     let each = machine.devices.iter().zip(&*devices);
+    let each = each.filter(|(_, device)| device.present);
     let changes = each.map(|(config, device)| {
         let change = async {
             let transition = [device.transition(AlState::SafeOp, false)];
@@ -376,6 +426,7 @@ async fn set_up(
     try_join_all(changes).await?;
     progress(Step::State(AlState::SafeOp));
     let last = machine.devices.iter().zip(devices);
+    let last = last.filter(|(_, device)| device.present);
     let last = last.map(|(config, device)| {
         let sdos = device::start_up(wire, config, device, StartupPhase::InSafeOp, progress);
         times.measure("start-up SDOs in SafeOp", Some(&config.name), sdos)
@@ -453,9 +504,12 @@ async fn without_lrw(
     devices: &[BusDevice],
 ) -> Result<Option<ImagePlan>, Error> {
     const NO_LRW: u16 = 1 << 9;
-    let features = devices.iter().map(|device| {
+    let features = devices.iter().map(async |device| {
         let step = "reading what its controller can do";
-        device::read(wire, &device.at, step, registers::FEATURES)
+        match device.present {
+            true => device::read(wire, &device.at, step, registers::FEATURES).await,
+            false => Ok([0; 2]),
+        }
     });
     let features = try_join_all(features).await?;
     let mut config = machine.rt_config();

@@ -10,6 +10,7 @@ use super::copy::{self, OutputWriter};
 use super::device::{self, CheckedDevice, EsiFiles};
 use super::duration::show;
 use super::fields::KeyExt;
+use super::optional::OptionalPlaces;
 use super::problem::{Problems, Span};
 use super::raw::{RawBus, RawDevice, RawMachine};
 use super::sim;
@@ -43,6 +44,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         .filter_map(|d| Some(d.name.as_ref()?.get_ref().clone()))
         .collect();
     let connections = sim::Places::of(&raw.devices);
+    let optional = OptionalPlaces::of(&raw.devices);
     for (raw, at) in raw.devices.into_iter().zip(places) {
         checked.push(device::check(raw, at, &mut files, &all, p));
     }
@@ -119,6 +121,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
     }
     let devices: IndexVec<_, _> = devices.into();
     connections.check(&devices, p);
+    optional.check(&devices, &program, p);
     Some(Machine {
         path: path.to_owned(),
         sha256: FileDigest::of_machine(file, &p.files.files),
@@ -260,6 +263,7 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
         sync_timeout_ns: raw.sync_timeout.value().unwrap_or(defaults.sync_timeout_ns),
         exchange: raw.exchange.value().unwrap_or(defaults.exchange),
         link: raw.link.value().unwrap_or(defaults.link),
+        unknown_devices: raw.unknown_devices.value().unwrap_or_default(),
         written: raw.written.keys,
     })
 }

@@ -91,6 +91,7 @@ pub(crate) fn check(
             startup,
             identity: identity?,
             serial: raw.serial.value(),
+            optional: raw.optional.value().unwrap_or(false),
             sim: sim.unwrap_or_default(),
             line: p.line(&raw.span),
         })

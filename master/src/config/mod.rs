@@ -10,6 +10,7 @@
 //! | `check.rs` | raw → [`Machine`]: bus, names, positions |
 //! | `copy.rs` | inputs that are copied to outputs |
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
+//! | `optional.rs` | devices that may be absent |
 //! | `sdo.rs` | values of start-up SDOs as bytes |
 //! | `startup.rs` | which start-up SDOs are verified or skipped |
 //! | `axis.rs` | limits; units in `axis/scale.rs`, loops and homing in `axis/control.rs` |
@@ -41,6 +42,7 @@ pub mod duration;
 #[macro_use]
 mod fields;
 mod gateway;
+mod optional;
 mod problem;
 mod program;
 mod raw;
@@ -159,6 +161,8 @@ pub struct Bus {
     pub exchange: ExchangeMode,
     /// The way frames are exchanged with the network interface.
     pub link: SocketKind,
+    /// What happens to devices that are not in the file and appear during the run.
+    pub unknown_devices: UnknownDeviceRule,
     /// Keys present in the file, each with its line; all others have defaults.
     pub written: Vec<(&'static str, u32)>,
 }
@@ -197,6 +201,7 @@ impl Default for Bus {
             sync_timeout_ns: 5_000_000_000,
             exchange: ExchangeMode::SameCycle,
             link: SocketKind::default(),
+            unknown_devices: UnknownDeviceRule::default(),
             written: Vec::new(),
         }
     }
@@ -229,6 +234,8 @@ pub struct DeviceConfig {
     pub identity: RevisionMatch,
     /// The required serial number.
     pub serial: Option<u32>,
+    /// `true` if the device may be absent.
+    pub optional: bool,
     pub sim: sim::SimSetup,
     /// The line of its `[[device]]` in the machine file.
     pub line: u32,
@@ -246,6 +253,16 @@ impl DeviceConfig {
     fn is_op_only(&self, sms: &[esi::layout::SmLayout]) -> bool {
         !sms.is_empty() && sms.iter().all(|sm| self.device.op_only(sm).fmmu)
     }
+}
+
+/// What happens to a device that is not in the machine file and appears during the run.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum UnknownDeviceRule {
+    /// It is reported, and the port that leads to it is closed.
+    #[default]
+    Close,
+    /// It is reported only.
+    Report,
 }
 
 /// The source of a device's mailbox addresses and sizes if its ESI and its EEPROM differ.
@@ -405,6 +422,16 @@ impl Machine {
         let mut groups = self.stop.groups.iter();
         let named = groups.position(|group| group.devices.contains(&device));
         named.map_or(GroupIndex::MACHINE, |index| GroupIndex(index + 1))
+    }
+
+    /// Returns true if all devices of a group are optional.
+    #[must_use]
+    pub fn is_optional(&self, group: GroupIndex) -> bool {
+        let mut own = self
+            .devices
+            .enumerate()
+            .filter(|(d, _)| self.group_of(*d) == group);
+        group != GroupIndex::MACHINE && own.all(|(_, device)| device.optional)
     }
 
     /// Returns the group of an axis: that of its device.

@@ -122,6 +122,7 @@ pub fn topology(devices: &[DeviceConfig]) -> Result<Topology, Vec<TopologyError>
             Some(PortRequest {
                 after: order.iter().position(|d| d.name == *name)?,
                 port: device.sim.port,
+                shared: device.optional,
             })
         })
         .collect();

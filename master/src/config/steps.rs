@@ -162,7 +162,7 @@ impl ProgramChecker<'_> {
         } = raw;
         Some(match action {
             RawAction::Enable(axes) => Action::Enable {
-                axes: self.axes(axes, p)?,
+                axes: self.steady_axes(axes, p)?,
             },
             RawAction::Disable(axes) => Action::Disable {
                 axes: self.axes(axes, p)?,
@@ -172,7 +172,7 @@ impl ProgramChecker<'_> {
             },
             RawAction::Home(axes) => self.home(axes, &span, p)?,
             RawAction::Stop(axes) => Action::Stop {
-                axes: self.axes(axes, p)?,
+                axes: self.steady_axes(axes, p)?,
             },
             RawAction::Move {
                 relative,
@@ -273,6 +273,18 @@ impl ProgramChecker<'_> {
         let own = self.axes[index].setup.map(|axis| axis.config.mode);
         let switched = self.switched.iter().filter(|(axis, _)| *axis == index);
         switched.map(|(_, mode)| *mode).chain(own).any(so)
+    }
+
+    /// Returns the named axes of the machine; `None`: all whose device is not optional.
+    fn steady_axes(&self, names: RawAxes, p: &mut Problems<'_>) -> Option<Vec<AxisIndex>> {
+        let all = names.is_none();
+        let mut axes = self.axes(names, p)?;
+        let is_optional = |axis: &AxisIndex| {
+            let device = self.devices[self.axes[*axis].device].device;
+            device.is_some_and(|device| device.optional)
+        };
+        axes.retain(|axis| !(all && is_optional(axis)));
+        Some(axes)
     }
 
     /// Returns the named axes of the machine; `None`: all.

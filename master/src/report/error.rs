@@ -103,6 +103,14 @@ pub enum Cause {
     Axis(ecaxis_axis::ConfigError),
     #[error("no SubDevice answers")]
     NoAnswer,
+    #[error("the units of the drive are not those with which the machine has started")]
+    OtherUnits,
+    #[error(
+        "output 0x{index:04x}:{sub:02x} limits motions, and no axis drives it: it would stay zero"
+    )]
+    HeldOutput { index: u16, sub: u8 },
+    #[error("an optional device of the group is absent")]
+    Absent,
     #[error("the SubDevice at position {position} stopped answering while {action}")]
     Silent { position: u16, action: &'static str },
     #[error(transparent)]

@@ -128,6 +128,7 @@ fn describe_cause<'m>(cause: StopCause, axis: &impl Fn(AxisIndex) -> &'m str) ->
         StopCause::Controller => "stop: the controller panicked".to_owned(),
         StopCause::Panicked => "stop: the cycle panicked".to_owned(),
         StopCause::Unsupervised => "stop: the supervisor thread does not run".to_owned(),
+        StopCause::Absent => "an optional device is absent".to_owned(),
         StopCause::LeftOp { al_status } => {
             format!("stop: a SubDevice has left Op, AL status 0x{al_status:02x}")
         }

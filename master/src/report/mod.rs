@@ -9,6 +9,7 @@
 pub mod bring_up;
 mod cause_text;
 mod device_error;
+mod device_log;
 mod diagnosis_message;
 mod emergencies;
 mod error;
@@ -18,9 +19,12 @@ pub(crate) mod summary;
 
 pub(crate) use device_error::EEPROM_TIMEOUT;
 pub use device_error::{DeviceRef, EepromError, StateError};
+pub use device_log::DeviceLog;
 pub use diagnosis_message::{DiagnosisKind, DiagnosisMessage};
 pub use emergencies::{EmergencyLine, EmergencyLog, EmergencyReport};
 pub use error::{Cause, DriveReport, Error, FailedStep, Location};
 pub use events::EventLine;
-pub use progress::{AxisLine, DevicePlace, Observer, ProbeCapture, Progress, Status, StepRef};
+pub use progress::{
+    AxisLine, DevicePlace, Observer, ProbeCapture, Progress, Status, StepRef, UnknownDevice,
+};
 pub use summary::{AxisSummary, DeviceErrors, GroupStop, Summary, ThreadSummary};

@@ -78,9 +78,19 @@ pub enum Progress {
         group: String,
         cause: Arc<Error>,
     },
+    /// The optional devices of a group are absent. Its axes had no power.
+    GroupWaits {
+        group: String,
+    },
     /// A stopped group has been reset and can be enabled again.
     GroupReleased {
         group: String,
+    },
+    /// A device of a stopped group does not answer or is not in Op.
+    DeviceLost {
+        device: DeviceRef,
+        /// The device and the port that lead to it.
+        parent: Option<(String, u8)>,
     },
     /// A lost device is in Op again. Its axes have no power.
     DeviceReturned {
@@ -89,15 +99,49 @@ pub enum Progress {
         after_ns: Nanos,
         /// It had no power: the position of an incremental encoder is lost.
         restarted: bool,
+        /// It is optional and was absent until now.
+        first: bool,
     },
     /// A cable of the ring is broken, or the ring is closed again.
     Ring {
         text: String,
         broken: bool,
     },
+    /// A device that is not in the machine file has appeared.
+    UnknownDevice(UnknownDevice),
     /// The status of the machine, five times a second of machine time.
     Status(Status),
     Stopping,
+}
+
+/// A device that is not in the machine file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct UnknownDevice {
+    /// Its identity with its name; `None` if it was not read.
+    pub identity: Option<String>,
+    pub serial: Option<u32>,
+    /// The device and the port that lead to it; `None`: it is in front of the first device.
+    pub parent: Option<(String, u8)>,
+    /// That port is closed.
+    pub closed: bool,
+}
+
+impl std::fmt::Display for UnknownDevice {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match &self.parent {
+            Some((device, port)) => write!(f, "a device at port {port} of `{device}`")?,
+            None => f.write_str("a device in front of the first one")?,
+        }
+        f.write_str(" is not in the machine file: ")?;
+        match (&self.identity, self.serial) {
+            (Some(identity), Some(serial)) => write!(f, "{identity}, serial number {serial}")?,
+            _ => f.write_str("its identity cannot be read")?,
+        }
+        f.write_str(match self.closed {
+            true => ". The port is closed until it has left",
+            false => ". It is not used",
+        })
+    }
 }
 
 /// The place of a device in the segment.

@@ -3,16 +3,13 @@
 use ecaxis_ecat::al_state::AlState;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 
-use super::exchange::{CycleResult, DeviceAnswer, GroupResult};
+use super::exchange::{AlStatusPolls, CycleResult, DeviceAnswer, GroupResult};
 
 /// AL status that every SubDevice must show while the machine runs.
 pub const OP: u8 = AlState::Op.code();
 /// Cycles for which the AL status may differ before the machine stops: one lost broadcast is not a
 /// fault.
 const AL_CYCLES: u32 = 2;
-
-/// The longest search, in cycles, for the device that left Op.
-const MAX_SEARCH: u32 = 200;
 
 /// The cause of a stop.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -46,6 +43,8 @@ pub enum StopCause {
     Powered { axis: AxisIndex },
     /// At least one SubDevice is no longer in Op.
     LeftOp { al_status: u8 },
+    /// An optional device was absent as the machine started.
+    Absent,
 }
 
 impl StopCause {
@@ -124,11 +123,10 @@ impl BusMonitor {
             judges_each: false,
             al_cycles: match count {
                 1 => AL_CYCLES,
-                // Each device is asked once, one every other cycle; answers take two cycles. With more
-                // devices than the longest search allows, the machine may stop before.
+                // Each device is asked once, one every other cycle; answers take two cycles.
                 _ => {
                     let devices = u32::try_from(groups.len()).unwrap_or(u32::MAX);
-                    AL_CYCLES + devices.saturating_mul(2).saturating_add(2).min(MAX_SEARCH)
+                    devices.saturating_mul(2).saturating_add(2 + AL_CYCLES)
                 }
             },
         }
@@ -138,6 +136,16 @@ impl BusMonitor {
     #[must_use]
     pub fn judges_each(&self) -> bool {
         self.judges_each && self.al_status != OP
+    }
+
+    /// Returns how often AL status of each device must be read.
+    #[must_use]
+    pub fn al_status_polls(&self) -> AlStatusPolls {
+        match (self.judges_each(), self.al) {
+            (false, _) => AlStatusPolls::InTurn,
+            (true, 0) => AlStatusPolls::EveryOther,
+            (true, _) => AlStatusPolls::Only,
+        }
     }
 
     /// Evaluates each device's own AL status (`None`: unknown), unless its group has stopped. RT:
@@ -386,6 +394,31 @@ mod tests {
             }
             assert!(guard.left_op().is_some(), "all should be in Op again");
         }
+    }
+
+    /// A search that ended after 200 cycles stopped the whole machine if it had more than about 100
+    /// devices.
+    #[test]
+    fn device_of_a_large_machine_stops_its_group_alone() {
+        let groups: Vec<_> = (0..300).map(GroupIndex).collect();
+        let mut guard = BusMonitor::new(3, &groups);
+        let results = [GOOD; 300];
+        for cycle in 0..600 {
+            guard.update(&answer(Some((0x0c, 300))), &results, &[], false);
+            assert_eq!(guard.al_status_polls(), AlStatusPolls::Only);
+            let read = |device| {
+                if device == 299 && cycle == 599 {
+                    0x04
+                } else {
+                    OP
+                }
+            };
+            guard.update_each(|_| false, (0..300).map(|device| Some(read(device))));
+            assert_eq!(guard.left_op(), None, "cycle {cycle}");
+        }
+        let left = Some(StopCause::LeftOp { al_status: 0x04 });
+        assert_eq!(guard.lost(GroupIndex(299)), left);
+        assert!((0..299).all(|group| guard.lost(GroupIndex(group)).is_none()));
     }
 
     #[test]

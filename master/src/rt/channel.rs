@@ -42,6 +42,10 @@ pub enum RtCommand {
     },
     /// Starts the bus monitor: from now on too many bad cycles stop the machine.
     StartBusMonitor,
+    /// Stops a group that waits for an optional device.
+    Absent {
+        group: GroupIndex,
+    },
     /// Stops the bus monitor: the segment is about to leave Op, so wrong working counters are
     /// expected.
     StopBusMonitor,

@@ -297,10 +297,12 @@ impl Engine {
                     .map(|found| found.answers.then_some(found.al_status)),
             );
         }
-        self.exchange.poll_al_status_only(each);
+        self.exchange.poll_al_status(self.guard.al_status_polls());
         let groups = &self.groups;
-        self.exchange
-            .publish_presence(|group| groups.get(group).is_some_and(stopped));
+        if let Some((_, answering)) = self.answer.al_status {
+            self.exchange
+                .publish_presence(answering, |group| groups.get(group).is_some_and(stopped));
+        }
         if any_stopped {
             self.forget_homes();
         }

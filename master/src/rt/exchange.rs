@@ -43,7 +43,7 @@ use frame::{
     frame_tag, new_frames, same_datagram, write_header, write_station,
 };
 use frame_set::FrameSet;
-pub use poll_schedule::MAX_POLL_DATAGRAM;
+pub use poll_schedule::{AlStatusPolls, MAX_POLL_DATAGRAM};
 use poll_schedule::{PollSchedule, PollTarget};
 use reference::ReferenceClock;
 pub use result::{CycleResult, DeviceAnswer, ExchangeDevice, GroupResult, Received};

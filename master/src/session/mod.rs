@@ -283,6 +283,7 @@ fn run_on_link_thread(
     let wire = supervisor.wire;
     let places = fault_evidence::places(&supervisor.bus);
     let log = supervisor.log.clone();
+    let device_log = supervisor.device_log.clone();
     let machine = &Arc::clone(&supervisor.machine);
     let CycleRun {
         remains,
@@ -324,7 +325,8 @@ fn run_on_link_thread(
         ),
     };
     let thread = used.map(|(used, wall_ns)| ThreadSummary::new(used, wall_ns, spin_ns, &stats));
-    let events = events::lines(&stats.journal, started, machine);
+    let mut events = events::lines(&stats.journal, started, machine);
+    device_log.add_to(&mut events, started, machine.bus.cycle_ns);
     let (unreleased, then) = ended.left.take().unzip();
     let failed = result.as_ref().err().or(unreleased.as_deref());
     let witnessed = ended.witnessed.take().or(then).unwrap_or_default();

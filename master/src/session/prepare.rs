@@ -24,7 +24,7 @@ use crate::mailbox::Mailboxes;
 use crate::mailbox::worker::{self, EmergencySink, MailboxWorker, WorkerConfig};
 use crate::post_mortem::DeviceSnapshot;
 use crate::post_mortem::snapshot::{self, Depth};
-use crate::report::FailedStep;
+use crate::report::{DeviceLog, FailedStep};
 use crate::rt::axis::RtAxis;
 use crate::rt::channel::channel;
 use crate::rt::cycle::{EngineConfig, Signals, first_snapshot};
@@ -122,6 +122,9 @@ impl RunBuilder<'_> {
                 preset_outputs(machine, &bus, &mut exchange);
                 exchange.stage();
                 let bus_status = exchange.bus_status();
+                for (device, _) in bus.devices.enumerate().filter(|(_, d)| !d.present) {
+                    bus_status.set_presence(device, false, true);
+                }
                 log.set_bus_status(Arc::clone(&bus_status));
                 let (mailboxes, workers) =
                     mailbox_workers(&mut bus, wire, &exchange, machine.bus.cycle_ns, &log);
@@ -177,6 +180,7 @@ impl RunBuilder<'_> {
                     clock_tree: None,
                     returns: None,
                     ring: RingWatch::default(),
+                    device_log: DeviceLog::default(),
                 };
                 Ok(Prepared { parts, supervisor })
             }

@@ -124,31 +124,43 @@ async fn follow(delays: &Delays, mut changes: watch::Receiver<ClockTree>) {
         }
         let reference = changes.borrow().reference;
         let still_valid = || !changes.has_changed().unwrap_or(true);
-        if let Some(reference) = reference
-            && let Err(error) = delays.update(reference, still_valid).await
-        {
+        let Some(reference) = reference else {
+            continue;
+        };
+        match delays.update(reference, still_valid).await {
+            Ok(true) => {}
+            // A port may have changed and changed back between two reads of the cycle.
+            Ok(false) => changes.mark_changed(),
             // The next change starts another update.
-            tracing::info!("{error}");
+            Err(error) => tracing::info!("{error}"),
         }
     }
 }
 
 impl Delays {
-    /// Determines all delays and writes those that have changed.
+    /// Determines all delays and writes those that have changed. Returns false, and writes nothing
+    /// more, if the ports of a device have changed meanwhile: a plug bounces, and the delays belong
+    /// to no topology.
     pub(super) async fn update(
         &self,
         reference: DeviceIndex,
         still_valid: impl Fn() -> bool,
-    ) -> Result<(), Error> {
+    ) -> Result<bool, Error> {
         let Some(&(reference, _)) = self.clocks.get(reference) else {
-            return Ok(());
+            return Ok(true);
         };
         let wire = &self.wire;
         let (stations, measured) = match &self.ring {
             None => {
-                let (stations, devices) = delays::devices(wire).await?;
-                let _held = self.latch.lock().await;
-                (stations, delays::measure(wire, &devices).await?)
+                let before = delays::devices(wire).await?;
+                let measured = {
+                    let _held = self.latch.lock().await;
+                    delays::measure(wire, &before.1).await?
+                };
+                if delays::devices(wire).await? != before {
+                    return Ok(false);
+                }
+                (before.0, measured)
             }
             Some(ring) => {
                 let station = |device| self.clocks.get(device).map_or(0, |(station, _)| *station);
@@ -164,7 +176,7 @@ impl Delays {
         let measured = || stations.iter().copied().zip(&measured);
         let find = |wanted| measured().find(|(station, _)| *station == wanted);
         let Some((_, Some(first))) = find(reference) else {
-            return Ok(());
+            return Ok(true);
         };
         for (station, delay) in measured() {
             let follows = self.clocks.contains(&(station, true));
@@ -182,7 +194,7 @@ impl Delays {
             }
             // A later change may have moved the devices.
             if !still_valid() {
-                return Ok(());
+                return Ok(false);
             }
             tracing::info!(
                 "station 0x{station:04x}: propagation delay {written} ns, now {delay} ns"
@@ -190,6 +202,6 @@ impl Delays {
             let write = wire.write(station, register, &delay.to_le_bytes()).await;
             write.map_err(failed)?;
         }
-        Ok(())
+        Ok(true)
     }
 }

@@ -54,6 +54,7 @@ impl Supervisor {
                     _ => None,
                 },
             },
+            StopCause::Absent => Cause::Absent,
             StopCause::Controller => Cause::Controller,
             StopCause::Panicked => Cause::Panicked("the cycle".to_owned()),
             StopCause::Unsupervised => Cause::Unsupervised,

@@ -23,6 +23,8 @@ pub struct StoppedGroup {
     pub cause: Arc<Error>,
     pub witnessed: Witnessed,
     pub released: bool,
+    /// All devices of the group are optional, and no axis had power: no failure.
+    pub idle: bool,
 }
 
 impl Supervisor {
@@ -67,6 +69,7 @@ impl Supervisor {
             if let Some(cause) = now.stopped
                 && now.stops != reported
             {
+                let idle = self.machine.is_optional(group) && !now.powered;
                 let cause = self.explain_stop(cause, Some(group), snapshot).await;
                 let cause = Arc::new(cause);
                 let witnessed = Witnessed {
@@ -79,16 +82,20 @@ impl Supervisor {
                     cause: Arc::clone(&cause),
                     witnessed,
                     released: false,
+                    idle,
                 });
                 let group = self.group_name(group);
-                self.report(Progress::GroupStopped { group, cause });
+                self.report(match idle {
+                    true => Progress::GroupWaits { group },
+                    false => Progress::GroupStopped { group, cause },
+                });
             }
         }
     }
 
     /// Returns the stops for the summary.
     pub(super) fn group_stops(&self) -> Vec<GroupStop> {
-        let stops = self.stopped.iter();
+        let stops = self.stopped.iter().filter(|stop| !stop.idle);
         stops
             .map(|stop| GroupStop {
                 group: self.group_name(stop.group),

@@ -2,7 +2,7 @@
 //! of the program, and the error after a stop. MAY BLOCK AND ALLOCATE; communicates with the cycle
 //! only through `rt::channel`.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::convert::Infallible;
 use std::future::poll_fn;
 use std::pin::pin;
@@ -26,7 +26,9 @@ use crate::mailbox::worker::{MailboxWorker, run_with_workers};
 use crate::mailbox::{DatagramError, Mailboxes};
 use crate::post_mortem::Witnessed;
 use crate::report::events::{clock_off, reference_replaced};
-use crate::report::{Cause, EmergencyLog, Error, GroupStop, ProbeCapture, Progress, Status};
+use crate::report::{
+    Cause, DeviceLog, EmergencyLog, Error, GroupStop, ProbeCapture, Progress, Status,
+};
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::{COMMANDS_PER_CYCLE, Event, HostEndpoint, RtCommand, Snapshot};
 use crate::rt::exchange::{BusStatus, DiagnosticRegister, SubDeviceDiagnostics};
@@ -106,6 +108,8 @@ pub struct Supervisor {
     pub(crate) clock_tree: Option<watch::Sender<ClockTree>>,
     /// What the cycle shows to other threads.
     pub bus_status: Arc<BusStatus>,
+    /// The devices that were lost, returned or appeared.
+    pub device_log: DeviceLog,
     /// The end of the task that brings devices back.
     pub(crate) returns: Option<ReturnPort>,
     /// What was reported of the ring, with cable redundancy.
@@ -177,7 +181,10 @@ impl Supervisor {
         self.send(RtCommand::Halt).await;
         ended.captures = std::mem::take(&mut self.captures);
         ended.witnessed = self.witnessed.take();
-        let left = self.stopped.into_iter().find(|stop| !stop.released);
+        let left = self
+            .stopped
+            .into_iter()
+            .find(|stop| !stop.released && !stop.idle);
         ended.left = left.map(|stop| (stop.cause, stop.witnessed));
         (ended, result)
     }
@@ -187,7 +194,7 @@ impl Supervisor {
         self.await_phase().await?;
         self.bus.times.add("phase lock", None, waited, clock::now());
         let requested = clock::now();
-        for device in self.bus.devices.iter() {
+        for device in self.bus.devices.iter().filter(|device| device.present) {
             enable_op_only(&self.wire, device, true).await?;
         }
         self.change_to_op().await?;
@@ -195,6 +202,12 @@ impl Supervisor {
         self.report(Progress::BringUpTimes(self.bus.times.steps()));
         self.report(Progress::Step(crate::bringup::Step::State(AlState::Op)));
         self.send(RtCommand::StartBusMonitor).await;
+        let devices = self.bus.devices.enumerate();
+        let absent = devices.filter(|(_, device)| !device.present);
+        let absent: BTreeSet<_> = absent.map(|(d, _)| self.machine.group_of(d)).collect();
+        for group in absent {
+            self.send(RtCommand::Absent { group }).await;
+        }
         if !self.enable {
             return self.hold(clock::now()).await;
         }
@@ -205,8 +218,13 @@ impl Supervisor {
             return self.follow_controller(ended).await;
         }
         if !enables(&self.machine.steps) {
-            let all: Vec<_> = self.machine.axes.indices().collect();
-            self.enable_axes(None, &all).await?;
+            let axes = self.machine.axes.indices();
+            let steady = axes.filter(|axis| {
+                let device = self.machine.axes[*axis].device;
+                !self.machine.devices[device].optional
+            });
+            let steady: Vec<_> = steady.collect();
+            self.enable_axes(None, &steady).await?;
         }
         self.run_program(ended).await
     }
@@ -246,7 +264,8 @@ impl Supervisor {
 
     fn transitions_to_op(&self) -> Vec<Transition<'_>> {
         let timeout = self.machine.bus.op_timeout_ns.map(Duration::from_nanos);
-        let transitions = self.bus.devices.iter().map(|device| {
+        let present = self.bus.devices.iter().filter(|device| device.present);
+        let transitions = present.map(|device| {
             let own = device.transition(AlState::Op, false);
             Transition {
                 timeout: timeout.unwrap_or(own.timeout),
@@ -258,8 +277,9 @@ impl Supervisor {
 
     /// True if the last broadcast read found every device in this state, without an error.
     fn is_everywhere(&self, state: AlState, snapshot: &Snapshot) -> bool {
+        let lost = self.bus_status.lost().count();
         snapshot.al_status.is_some_and(|(status, devices)| {
-            usize::from(devices) == self.bus.devices.len() && status == state.code()
+            usize::from(devices) == self.bus.devices.len() - lost && status == state.code()
         })
     }
 
@@ -276,10 +296,11 @@ impl Supervisor {
         loop {
             let snapshot = self.poll_and_query().await?;
             let clocks_known = self.bus.clocks_settled || self.clocks_read(&snapshot);
+            let inputs_fresh = self.inputs_fresh(&snapshot);
             let looked_at_all = snapshot.counters.cycles > FIRST_CYCLES && clocks_known;
             let locked = snapshot.phase.is_none_or(|phase| phase.locked);
             let unsettled = self.unsettled_clock(&snapshot);
-            if looked_at_all && snapshot.inputs_fresh && locked && unsettled.is_none() {
+            if looked_at_all && inputs_fresh && locked && unsettled.is_none() {
                 if snapshot.phase.is_some() {
                     self.report(Progress::PhaseLocked);
                 }
@@ -287,10 +308,10 @@ impl Supervisor {
             }
             if clock::now().saturating_sub(start) > timeout {
                 let cause = match (snapshot.phase, unsettled) {
-                    (_, Some((device, difference_ns))) if snapshot.inputs_fresh => {
+                    (_, Some((device, difference_ns))) if inputs_fresh => {
                         return Err(Cause::ClockNotSettled { difference_ns }.with_device(device));
                     }
-                    (Some(phase), None) if snapshot.inputs_fresh => Cause::PhaseNotLocked {
+                    (Some(phase), None) if inputs_fresh => Cause::PhaseNotLocked {
                         error_ns: phase.error_ns,
                     },
                     _ => Cause::NoProcessData {
@@ -300,6 +321,16 @@ impl Supervisor {
                 return Err(cause.into());
             }
         }
+    }
+
+    /// True if the process data of all groups is fresh, except those with an absent device.
+    fn inputs_fresh(&self, snapshot: &Snapshot) -> bool {
+        let absent = |group| {
+            let mut devices = self.bus.devices.enumerate();
+            devices.any(|(d, device)| !device.present && self.machine.group_of(d) == group)
+        };
+        let mut groups = snapshot.groups.enumerate();
+        groups.all(|(group, status)| status.fresh || absent(group))
     }
 
     /// Returns the devices that must follow the reference clock before Op, because they use
@@ -313,7 +344,8 @@ impl Supervisor {
         let devices = self.machine.devices.iter().zip(&self.bus.devices);
         let devices = (0..).map(DeviceIndex).zip(devices.zip(&snapshot.diagnoses));
         devices.filter_map(move |(index, ((config, device), found))| {
-            let uses = config.selection.activates_sync() && Some(index) != reference;
+            let uses =
+                config.selection.activates_sync() && device.present && Some(index) != reference;
             uses.then_some((device, found))
         })
     }

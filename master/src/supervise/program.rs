@@ -175,6 +175,7 @@ impl Supervisor {
                 self.command(axes.iter().map(|&axis| (axis, Command::ResetFault)))
                     .await;
                 let of = self.groups();
+                let machine = std::sync::Arc::clone(&self.machine);
                 // A stopped group first comes to rest, then returns, unless faults of its other
                 // axes prevent this.
                 let coming = |s: &Snapshot, group: GroupIndex| {
@@ -182,7 +183,9 @@ impl Supervisor {
                     let mut own = s.axes.iter().zip(&of).filter(|(_, of)| **of == group);
                     let state = &s.groups[group];
                     let kept = !state.powered && !own.all(|(axis, _)| sound(axis));
-                    state.stopped.is_some() && state.fresh && !kept
+                    // An optional device is waited for.
+                    let there = state.fresh || machine.is_optional(group);
+                    state.stopped.is_some() && there && !kept
                 };
                 let done = |s: &Snapshot, axis: AxisIndex| {
                     let group = of[axis];

@@ -11,31 +11,36 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
-use ecaxis_ecat::registers;
-use ecaxis_esi::Identity;
 use tokio::sync::{Mutex, oneshot};
 
 use super::Supervisor;
 use super::clock_tree::Delays;
-use crate::acyclic::eeprom::{EepromAccess, with_eeprom};
-use crate::acyclic::topology::{in_line, parents};
-use crate::acyclic::{AlState, DeviceRef, StateError, al, enumerate};
-use crate::bringup::device_return::{RunningBus, RunningSync, bring_back, reset};
-use crate::bringup::{BusDevice, Step, compare_identity, enable_op_only};
+use crate::acyclic::{AlState, DeviceRef, StateError, al};
+use crate::bringup::BusDevice;
 use crate::clock::{self, Nanos};
-use crate::concurrent::try_join_all;
-use crate::config::{Locator, Machine};
+use crate::concurrent::Background;
+use crate::config::Machine;
 use crate::datagram::DatagramClient;
-use crate::mailbox::{MailboxTransport, Mailboxes};
-use crate::report::{Cause, DevicePlace, Error, Progress};
+use crate::mailbox::Mailboxes;
+use crate::report::{Cause, DeviceLog, DevicePlace, Error, Progress};
 use crate::rt::exchange::BusStatus;
 use crate::rt::image::ImagePlan;
+
+use unknown::UnknownDevices;
+
+mod attempt;
+mod identify;
+mod survey;
+mod unknown;
 
 const STEP: &str = "looking for devices that return";
 /// The pause between two searches.
 const PERIOD: Duration = Duration::from_millis(50);
 /// The pause after a device has refused to return.
 const RETRY: Nanos = 1_000_000_000;
+/// The time in ns after which a device returns even though the delays cannot be measured, because the
+/// ports of the segment still change.
+const MAX_BOUNCE: Nanos = 1_000_000_000;
 /// The station address of a device until its identity is known. Devices of the machine have 0x1000
 /// and above.
 const TEMPORARY_STATION: u16 = 0x0fff;
@@ -52,18 +57,30 @@ impl Supervisor {
         let (mut end, port) = oneshot::channel();
         self.returns = Some(port);
         let devices = self.bus.devices.iter();
-        let task = ReturnTask {
+        let places = self.bus.places();
+        let searches = devices.clone().zip(&places).map(|(device, place)| Search {
+            serial: device.serial,
+            place: device.present.then_some(*place),
+            absent: !device.present,
+            ..Search::default()
+        });
+        let searches = searches.collect();
+        let segment = RunningSegment {
             wire: self.wire,
             machine: Arc::clone(&self.machine),
             image: self.bus.image.clone(),
             devices: devices.map(BusDevice::without_mailbox).collect(),
-            places: self.bus.places(),
             mailboxes: self.mailboxes.clone(),
             bus_status: Arc::clone(&self.bus_status),
             progress: self.progress.clone(),
-            searches: vec![Search::default(); self.bus.devices.len()].into(),
+            log: self.device_log.clone(),
             delays: self.delays(Arc::clone(&latch)),
             latch,
+        };
+        let mut task = ReturnTask {
+            segment,
+            searches,
+            unknown: UnknownDevices::default(),
         };
         async move {
             tokio::select! {
@@ -71,6 +88,7 @@ impl Supervisor {
                 () = end.closed() => {}
                 never = task.run() => match never {},
             }
+            task.unknown.open_ports(&task.segment).await;
         }
     }
 }
@@ -86,65 +104,106 @@ struct Search {
     warned: Option<String>,
     /// It had no power, and has not been in Op since.
     restarted: bool,
+    /// An attempt to bring it back runs.
+    attempted: bool,
+    /// The serial number of the device that was there last.
+    serial: u32,
+    /// It is optional and was absent until now.
+    absent: bool,
+    /// Where it was last.
+    place: Option<DevicePlace>,
 }
 
-struct ReturnTask {
+/// The segment during the run.
+struct RunningSegment {
     wire: DatagramClient,
     machine: Arc<Machine>,
     image: ImagePlan,
     devices: IndexVec<DeviceIndex, BusDevice>,
-    places: IndexVec<DeviceIndex, DevicePlace>,
     mailboxes: Mailboxes,
     bus_status: Arc<BusStatus>,
     progress: std::sync::mpsc::Sender<Progress>,
-    searches: IndexVec<DeviceIndex, Search>,
+    log: DeviceLog,
     delays: Delays,
     latch: Arc<Mutex<()>>,
 }
 
+struct ReturnTask {
+    segment: RunningSegment,
+    searches: IndexVec<DeviceIndex, Search>,
+    unknown: UnknownDevices,
+}
+
 impl ReturnTask {
-    async fn run(mut self) -> Infallible {
+    /// Searches on while devices are brought back: a slow one delays no other.
+    async fn run(&mut self) -> Infallible {
+        let Self {
+            segment,
+            searches,
+            unknown,
+        } = self;
+        let segment = &*segment;
+        let mut attempts = Background::new();
         loop {
-            clock::delay(PERIOD).await;
-            let lost = self.lost();
-            for (device, search) in self.searches.enumerate_mut() {
-                if !lost.contains(&device) {
-                    *search = Search {
-                        restarted: search.restarted,
-                        ..Search::default()
-                    };
-                } else if search.since.is_none() {
-                    search.since = Some(clock::now());
-                }
+            let search = async {
+                clock::delay(PERIOD).await;
+                segment.search(searches, unknown).await
+            };
+            let (found, ended) = attempts.run_during(search).await;
+            for (device, done) in ended {
+                segment.end_attempt(device, &mut searches[device], done);
             }
-            if !lost.is_empty()
-                && let Err(error) = self.search(&lost).await
-            {
+            let found = found.unwrap_or_else(|error| {
                 tracing::debug!("{error}");
+                Vec::new()
+            });
+            for device in found {
+                let search = &mut searches[device];
+                search.attempted = true;
+                let what = (search.restarted, search.absent);
+                attempts.add(segment.attempt(device, search.since, what));
             }
         }
     }
+}
 
-    /// Returns the lost devices in the order of the segment.
-    fn lost(&self) -> Vec<DeviceIndex> {
-        let mut lost: Vec<_> = self.bus_status.lost().collect();
-        lost.sort_by_key(|device| self.places.get(*device).map(|place| place.position));
-        lost
-    }
-
-    /// Searches all lost devices once and brings back those that are there, at the same time.
-    async fn search(&mut self, lost: &[DeviceIndex]) -> Result<(), Error> {
+impl RunningSegment {
+    /// Searches the lost devices once. Returns those that are there and may return.
+    async fn search(
+        &self,
+        searches: &mut IndexVec<DeviceIndex, Search>,
+        unknown: &mut UnknownDevices,
+    ) -> Result<Vec<DeviceIndex>, Error> {
+        let lost = self.lost(searches);
+        for (device, search) in searches.enumerate_mut() {
+            if !lost.contains(&device) && !search.attempted {
+                *search = Search {
+                    restarted: search.restarted,
+                    serial: search.serial,
+                    place: search.place,
+                    absent: search.absent,
+                    ..Search::default()
+                };
+            } else if search.since.is_none() {
+                search.since = Some(clock::now());
+                if let Some(place) = search.place {
+                    self.report(Progress::DeviceLost {
+                        device: self.devices[device].at.clone(),
+                        parent: self.name_port(place.parent),
+                    });
+                }
+            }
+        }
         let mut present = Vec::new();
         let mut without_address = Vec::new();
-        let due = |search: &Search| clock::now() >= search.not_before;
-        let lost_now: Vec<_> = lost
-            .iter()
-            .copied()
-            .filter(|d| due(&self.searches[*d]))
-            .collect();
-        for device in lost_now {
-            if let Err(error) = self.check_permitted(device) {
-                self.refuse(device, &error);
+        let due = |search: &Search| !search.attempted && clock::now() >= search.not_before;
+        for &device in &lost {
+            let search = &mut searches[device];
+            if !due(search) {
+                continue;
+            }
+            if let Err(error) = self.check_permitted(device, &lost) {
+                self.refuse(device, search, &error);
                 continue;
             }
             let station = self.devices[device].at.station;
@@ -152,180 +211,88 @@ impl ReturnTask {
             match status.map_err(failed)? {
                 // The last diagnosis is older.
                 Some((status, _)) if status == AlState::Op.code() => {}
-                Some(_) if self.still_stops(device) => {}
+                Some(_) if self.still_stops(device, search) => {}
                 Some(_) => {
                     let at = self.devices[device].at.clone();
-                    match self.check_identity(device, &at, true).await {
+                    match self.check_identity(device, search, &at).await {
                         Ok(()) => present.push(device),
-                        Err(error) => self.refuse(device, &error),
+                        Err(error) => self.refuse(device, search, &error),
                     }
                 }
                 None => without_address.push(device),
             }
         }
-        if !without_address.is_empty() {
-            let found = self.find(&without_address, lost.len()).await?;
-            // Some have been connected since they were asked: the next search asks them again.
-            if found.iter().any(|(_, position)| position.is_none()) {
-                return Ok(());
-            }
-            for (device, position) in found.into_iter().filter_map(|(d, at)| Some((d, at?))) {
-                match self.identify(device, position).await {
-                    Ok(()) => {
-                        self.searches[device].restarted = true;
-                        present.push(device);
-                    }
-                    Err(error) => self.refuse(device, &error),
-                }
-            }
+        unknown.reopen_ports(self, &lost).await?;
+        if !without_address.is_empty() || unknown.look_again(self, &lost) {
+            let found = self
+                .survey((&without_address, lost.len()), searches, unknown)
+                .await?;
+            present.extend(found);
         }
-        let reference = self.bus_status.reference();
-        if let (Some(reference), false) = (reference, present.is_empty()) {
-            let updated = self.delays.update(reference, || true);
-            if let Err(error) = updated.await {
-                // The clock then settles later, or the attempt fails.
-                tracing::debug!("{error}");
-            }
+        if !present.is_empty() && !self.update_delays().await {
+            // The next search finds them again.
+            let bounces = |search: &Search| {
+                let since = search.since.unwrap_or_else(clock::now);
+                clock::now() < since.saturating_add(MAX_BOUNCE)
+            };
+            present.retain(|device| !bounces(&searches[*device]));
         }
-        let attempts = present.into_iter().map(|device| {
-            let attempt = Box::pin(self.attempt(device));
-            async move { Ok::<_, Infallible>((device, attempt.await)) }
-        });
-        let Ok(ended) = try_join_all(attempts).await;
-        for (device, done) in ended {
-            match done {
-                // The next diagnosis shows it in Op.
-                Ok(()) => {
-                    self.searches[device] = Search {
-                        not_before: clock::now() + RETRY,
-                        ..Search::default()
-                    };
-                }
-                Err(error) => self.refuse(device, &error),
-            }
-        }
-        Ok(())
+        Ok(present)
     }
 
-    /// Returns the lost devices that are there: those without a known address by the place of a lost
-    /// one, with their position, and those that have been connected since they were asked.
-    async fn find(
-        &self,
-        lost: &[DeviceIndex],
-        all_lost: usize,
-    ) -> Result<Vec<(DeviceIndex, Option<u16>)>, Error> {
-        let count = enumerate::count(&self.wire).await?;
-        let present = self.devices.len().saturating_sub(all_lost);
-        if usize::from(count) <= present {
-            return Ok(Vec::new());
-        }
-        let words = async |register| {
-            let word = async |position| {
-                let bytes = enumerate::at(&self.wire, position, STEP, register).await?;
-                Ok::<_, Error>(u16::from_le_bytes(bytes))
-            };
-            try_join_all((0..count).map(word)).await
+    fn report(&self, progress: Progress) {
+        self.log.add(clock::now(), &progress);
+        let _ = self.progress.send(progress);
+    }
+
+    /// Returns the name of the device with a port.
+    fn name_port(&self, place: Option<(DeviceIndex, u8)>) -> Option<(String, u8)> {
+        let (device, port) = place?;
+        Some((self.devices.get(device)?.at.name.clone(), port))
+    }
+
+    /// Measures the propagation delays. Returns false if the topology changed meanwhile.
+    async fn update_delays(&self) -> bool {
+        let Some(reference) = self.bus_status.reference() else {
+            return true;
         };
-        let stations = words(registers::STATION_ADDRESS).await?;
-        let status = words(registers::DL_STATUS).await?.into_iter();
-        let ring = self.wire.ring();
-        let status = (0..)
-            .zip(status)
-            .map(|(at, status)| in_line(at, status, ring));
-        let mut identified: Vec<Option<DeviceIndex>> = Vec::new();
-        let mut found = Vec::new();
-        for ((position, station), parent) in (0..).zip(stations).zip(parents(status)) {
-            let known = self
-                .devices
-                .enumerate()
-                .find(|(_, d)| d.at.station == station);
-            let parent = parent.map(|parent| {
-                let device = identified
-                    .get(usize::from(parent.device))
-                    .copied()
-                    .flatten();
-                (device, parent.port)
-            });
-            let at_place = |device: &&DeviceIndex| {
-                let before = self.places.get(**device).and_then(|place| place.parent);
-                before.map(|(device, port)| (Some(device), port)) == parent
-            };
-            let device = match known {
-                Some((device, _)) => Some(device),
-                None => lost.iter().find(at_place).copied(),
-            };
-            identified.push(device);
-            if let Some(device) = device.filter(|device| lost.contains(device)) {
-                found.push((device, known.is_none().then_some(position)));
+        let updated = self.delays.update(reference, || true).await;
+        updated.unwrap_or_else(|error| {
+            tracing::debug!("{error}");
+            false
+        })
+    }
+
+    fn end_attempt(&self, device: DeviceIndex, search: &mut Search, done: Result<(), Error>) {
+        search.attempted = false;
+        match done {
+            // The next diagnosis shows it in Op.
+            Ok(()) => {
+                *search = Search {
+                    not_before: clock::now() + RETRY,
+                    serial: search.serial,
+                    place: search.place,
+                    ..Search::default()
+                };
             }
-        }
-        Ok(found)
-    }
-
-    /// Gives a device its station address if its identity is that of the machine file.
-    async fn identify(&mut self, index: DeviceIndex, position: u16) -> Result<(), Error> {
-        let device = &self.devices[index];
-        let own = device.at.station;
-        let temporary = DeviceRef {
-            position,
-            station: TEMPORARY_STATION,
-            ..device.at.clone()
-        };
-        // A device that kept this address from an earlier attempt must not answer as well.
-        self.clear_temporary().await?;
-        self.check_is_new(position).await?;
-        let address = TEMPORARY_STATION.to_le_bytes();
-        let register = registers::STATION_ADDRESS;
-        let written = self.wire.write_at(position, register, &address).await;
-        if written.map_err(failed)? != 1 {
-            return Err(gone(&temporary));
-        }
-        let checked = self.check_identity(index, &temporary, false).await;
-        if checked.is_err() {
-            self.clear_temporary().await?;
-            return checked;
-        }
-        let written = self
-            .wire
-            .write(TEMPORARY_STATION, register, &own.to_le_bytes())
-            .await;
-        match written.map_err(failed)? {
-            1 => Ok(()),
-            _ => {
-                let _ = self.wire.write(own, register, &[0, 0]).await;
-                Err(gone(&temporary))
-            }
+            Err(error) => self.refuse(device, search, &error),
         }
     }
 
-    /// Fails unless the device at a position is in Init and has no address of the machine: devices may
-    /// have come since the search, and positions then name others.
-    async fn check_is_new(&self, position: u16) -> Result<(), Error> {
-        let found = enumerate::read_device(&self.wire, position).await?;
-        let known = self
-            .devices
-            .iter()
-            .any(|device| device.at.station == found.station);
-        if known || found.state != AlState::Init {
-            return Err(gone(&found.named(format!("device {position}"))));
-        }
-        Ok(())
-    }
-
-    /// Takes the temporary address from whichever device has it.
-    async fn clear_temporary(&self) -> Result<(), Error> {
-        let register = registers::STATION_ADDRESS;
-        let written = self.wire.write(TEMPORARY_STATION, register, &[0, 0]).await;
-        written.map_err(failed).map(drop)
+    /// Returns the lost devices in the order of the segment.
+    fn lost(&self, searches: &IndexVec<DeviceIndex, Search>) -> Vec<DeviceIndex> {
+        let mut lost: Vec<_> = self.bus_status.lost().collect();
+        lost.sort_by_key(|device| searches[*device].place.map(|place| place.position));
+        lost
     }
 
     /// Fails for devices that must not return by themselves. Nothing is written to them.
-    fn check_permitted(&self, index: DeviceIndex) -> Result<(), Error> {
+    fn check_permitted(&self, index: DeviceIndex, lost: &[DeviceIndex]) -> Result<(), Error> {
         let machine = &self.machine;
         let why = if machine.outputs.iter().any(|signal| signal.device == index) {
             "its outputs would be switched on without a command; restart the bus"
         } else if machine.devices[index].selection.dc.is_some()
-            && self.running_sync(index).is_none()
+            && self.running_sync(index, lost).is_none()
         {
             "no other device in Op has SYNC0, whose pulses it could join; restart the bus"
         } else {
@@ -335,167 +302,19 @@ impl ReturnTask {
     }
 
     /// Returns true while a drive that kept its power may still stop by its own reaction.
-    fn still_stops(&self, index: DeviceIndex) -> bool {
+    fn still_stops(&self, index: DeviceIndex, search: &Search) -> bool {
         let times = self.machine.axes_of(index).map(|(_, setup)| {
             let config = &setup.config;
             config.stop_time_s(config.mode, config.limits.velocity)
         });
         // At most an hour; the cast saturates.
         let longest = (times.fold(0.0, f64::max) * 1e9) as Nanos;
-        let since = self.searches[index].since.unwrap_or_else(clock::now);
+        let since = search.since.unwrap_or_else(clock::now);
         clock::now() < since.saturating_add(longest)
     }
 
-    /// Compares the EEPROM of a device with the machine file. `kept`: it answers at the address of the
-    /// lost device, and must be that device.
-    async fn check_identity(
-        &mut self,
-        index: DeviceIndex,
-        at: &DeviceRef,
-        kept: bool,
-    ) -> Result<(), Error> {
-        let config = &self.machine.devices[index];
-        let device = &mut self.devices[index];
-        // The station alias is word 4; vendor, product, revision and serial number begin at word 8.
-        let mut words = [0; 24];
-        let access = EepromAccess::Force;
-        with_eeprom(&self.wire, at, STEP, access, async |eeprom| {
-            eeprom.read(4, &mut words).await
-        })
-        .await?;
-        let word =
-            |at: usize| u32::from_le_bytes(*words[2 * at - 8..].first_chunk().unwrap_or(&[0; 4]));
-        let identity = Identity {
-            vendor: word(8),
-            product: word(10),
-            revision: word(12),
-        };
-        let (serial, alias) = (word(14), u16::from_le_bytes([words[0], words[1]]));
-        compare_identity(&self.machine, config, (identity, serial), at)?;
-        if kept && serial != device.serial {
-            let (expected, found) = (device.serial, serial);
-            return Err(Cause::Serial { expected, found }.with_device(at));
-        }
-        let located = match config.at {
-            Locator::Position(_) => true,
-            Locator::Id(_) if kept => true,
-            Locator::Alias(wanted) => alias == wanted,
-            Locator::Id(id) => {
-                let timeout = al::IDENTIFICATION_TIMEOUT;
-                al::read_explicit_id(&self.wire, at.station, timeout).await == Ok(Some(id))
-            }
-        };
-        if !located {
-            let locator = config.at.to_string();
-            return Err(Cause::NotLocated { locator }.with_device(at));
-        }
-        if serial != device.serial && config.serial.is_none() {
-            let warning = format!(
-                "{}: the device has the serial number {}, before it was {}: it is another one of the same kind. \
-                 Parameters and home are its own",
-                device.at, serial, device.serial
-            );
-            device.serial = serial;
-            let _ = self.progress.send(Progress::Warning(warning));
-        }
-        Ok(())
-    }
-
-    /// Brings a device back that answers at its station address.
-    async fn attempt(&self, index: DeviceIndex) -> Result<(), Error> {
-        let done = self.bring_to_op(index).await;
-        if done.is_err() {
-            self.leave_in_init(index).await;
-            return done;
-        }
-        let since = self.searches[index].since.unwrap_or_else(clock::now);
-        let _ = self.progress.send(Progress::DeviceReturned {
-            device: self.devices[index].at.clone(),
-            after_ns: clock::now().saturating_sub(since),
-            restarted: self.searches[index].restarted,
-        });
-        Ok(())
-    }
-
-    async fn bring_to_op(&self, index: DeviceIndex) -> Result<(), Error> {
-        let reference = self.bus_status.reference().filter(|r| *r != index);
-        let reference = reference
-            .and_then(|r| self.devices.get(r))
-            .map(|d| d.at.clone());
-        let loan = self.mailboxes.borrow(index).await;
-        let mut device = self.devices[index].without_mailbox();
-        let (coe, give_back) = loan.unzip();
-        device.coe = coe;
-        let progress = &self.progress;
-        let report = |step| {
-            if let Step::Warning(text) = step {
-                let _ = progress.send(Progress::Warning(text));
-            }
-        };
-        let bus = RunningBus {
-            wire: &self.wire,
-            machine: &self.machine,
-            image: &self.image,
-            reference: reference.as_ref(),
-            sync: self.running_sync(index),
-            latch: &self.latch,
-        };
-        let returned = bring_back(bus, index, &mut device, &report).await;
-        if let (Some(coe), Some(give_back)) = (device.coe.take(), give_back) {
-            let _ = give_back.send(coe);
-        }
-        returned?;
-        if self.searches[index].restarted {
-            // The axes need the positions of SafeOp, and their group is not released before Op.
-            self.settle().await;
-            self.bus_status.set_restarted(index);
-            self.settle().await;
-        }
-        enable_op_only(&self.wire, &device, true).await?;
-        let op = [device.transition(AlState::Op, false)];
-        al::change_states(&self.wire, &op, AlState::Op).await
-    }
-
-    /// Waits for some cycles.
-    async fn settle(&self) {
-        const CYCLES: u64 = 5;
-        clock::delay(Duration::from_nanos(CYCLES * self.machine.bus.cycle_ns)).await;
-    }
-
-    /// Returns a device in Op with SYNC0; one with the same cycle if there is one.
-    fn running_sync(&self, returns: DeviceIndex) -> Option<RunningSync<'_>> {
-        let lost = self.lost();
-        let cycle = |device: DeviceIndex| {
-            let dc = self.machine.devices.get(device)?.selection.dc.as_ref()?;
-            Some((dc, dc.sync0_cycle_ns))
-        };
-        let own = cycle(returns).map(|(_, cycle)| cycle);
-        let runs = |device: &DeviceIndex| !lost.contains(device);
-        let others = self
-            .devices
-            .enumerate()
-            .filter(|(d, _)| *d != returns && runs(d));
-        let running = others.filter_map(|(index, device)| {
-            let (dc, _) = cycle(index).filter(|(_, cycle)| *cycle > 0)?;
-            Some(RunningSync { at: &device.at, dc })
-        });
-        running.min_by_key(|sync| Some(sync.dc.sync0_cycle_ns) != own)
-    }
-
-    /// Takes a device that did not return out of the process data, so that its group stays stopped.
-    async fn leave_in_init(&self, index: DeviceIndex) {
-        let device = &self.devices[index];
-        let init = [device.transition(AlState::Init, true)];
-        let left = al::change_states(&self.wire, &init, AlState::Init).await;
-        let left = left.and(reset(&self.wire, &device.at).await);
-        if let Err(error) = left {
-            tracing::debug!("{error}");
-        }
-    }
-
     /// Reports why a device does not return, once.
-    fn refuse(&mut self, index: DeviceIndex, error: &Error) {
-        let search = &mut self.searches[index];
+    fn refuse(&self, index: DeviceIndex, search: &mut Search, error: &Error) {
         search.not_before = clock::now() + RETRY;
         let text = format!(
             "`{}` does not return: {error}",

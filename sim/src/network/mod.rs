@@ -337,6 +337,7 @@ impl Segment {
             }
         }
         let faults = &self.faults;
+        let mut linked = Vec::new();
         for cable in &mut self.wiring.cables {
             let cut = cable.ends.iter().any(|end| match *end {
                 End::MainDevice(nic) => nic == Nic::Primary && faults.is_silent(),
@@ -346,13 +347,18 @@ impl Segment {
                 End::MainDevice(_) => true,
                 End::Port { device, .. } => self.devices.get(device).is_some_and(|d| d.powered),
             });
-            cable.up = powered && !cut && !cable.pulled;
-            for end in cable.ends {
-                if let End::Port { device, port } = end
-                    && let Some(device) = self.devices.get_mut(device)
-                {
-                    device.esc.set_link(port, cable.up);
-                }
+            // At a shared port, the first of the devices has the link.
+            let taken = cable.ends.iter().any(|end| linked.contains(end));
+            cable.up = powered && !cut && !cable.pulled && !taken;
+            if cable.up {
+                linked.extend(cable.ends);
+            }
+        }
+        for end in self.wiring.cables.iter().flat_map(|cable| cable.ends) {
+            if let End::Port { device, port } = end
+                && let Some(device) = self.devices.get_mut(device)
+            {
+                device.esc.set_link(port, linked.contains(&end));
             }
         }
         self.reroute();

@@ -28,6 +28,8 @@ pub struct PortRequest {
     pub after: usize,
     /// The port of that device.
     pub port: Option<u8>,
+    /// Other devices may be connected to the same port, one at a time.
+    pub shared: bool,
 }
 
 /// A port that leads away from the MainDevice.
@@ -256,6 +258,16 @@ impl Topology {
         let mut open = FreePorts::default();
         for device in 0..media.len() {
             let request = requests.get(device).copied().flatten();
+            let shared = request
+                .filter(|request| request.shared)
+                .and_then(|request| {
+                    let (device, port) = (request.after, request.port?);
+                    Some(Uplink { device, port })
+                });
+            if shared.is_some() && uplinks.contains(&shared) {
+                uplinks.push(shared);
+                continue;
+            }
             let granted = match request {
                 Some(request) => grant(device, request, media, &uplinks, &open)
                     .map_err(|error| errors.push(error))
@@ -534,7 +546,7 @@ mod tests {
         let bus = list(&["YKY", "KK", "YY", "KK", "YY"]);
         let request = |device: usize, after: usize, port: Option<u8>| {
             let mut requests = vec![None; 5];
-            requests[device] = Some(PortRequest { after, port });
+            requests[device] = Some(PortRequest { after, port, shared: false });
             Topology::connect(&bus, &requests)
         };
         assert_eq!(uplinks(&request(2, 0, Some(2)).unwrap())[1], (0, 2));
@@ -557,9 +569,10 @@ mod tests {
     }
 
     #[test]
+    #[rustfmt::skip] // one row a request
     fn connect_returns_every_invalid_request() {
         let bus = list(&["YY", "YY", "YY"]);
-        let request = |after, port| Some(PortRequest { after, port });
+        let request = |after, port| Some(PortRequest { after, port, shared: false });
         let errors =
             Topology::connect(&bus, &[None, request(0, Some(2)), request(0, Some(0))]).unwrap_err();
         assert_eq!(errors.len(), 2);

@@ -46,8 +46,8 @@ pub(super) struct Cable {
 #[derive(Debug)]
 pub(super) struct Wiring {
     pub(super) cables: Vec<Cable>,
-    /// The cable at each port of each device.
-    at: Vec<[Option<usize>; PORTS]>,
+    /// The cables at each port of each device; several at a shared port.
+    at: Vec<[Vec<usize>; PORTS]>,
     nics: [Option<usize>; 2],
     pub(super) second: SecondPort,
 }
@@ -59,7 +59,7 @@ impl Wiring {
     pub(super) fn new(topology: &Topology, devices: &[SimDevice], cable_ns: u64) -> Self {
         let mut wiring = Self {
             cables: Vec::new(),
-            at: vec![[None; PORTS]; devices.len()],
+            at: vec![Default::default(); devices.len()],
             nics: [None; 2],
             second: SecondPort::Listens,
         };
@@ -113,18 +113,22 @@ impl Wiring {
                         .get_mut(device)
                         .and_then(|ports| ports.get_mut(usize::from(port)))
                     {
-                        *at = Some(n);
+                        at.push(n);
                     }
                 }
             }
         }
     }
 
-    /// Returns the number of the cable at an end.
+    /// Returns the number of the cable at an end. Of several at a shared port, the one with a link.
     pub(super) fn cable(&self, end: End) -> Option<usize> {
         match end {
             End::MainDevice(nic) => self.nics[nic as usize],
-            End::Port { device, port } => *self.at.get(device)?.get(usize::from(port))?,
+            End::Port { device, port } => {
+                let at = self.at.get(device)?.get(usize::from(port))?;
+                let up = |n: &&usize| self.cables.get(**n).is_some_and(|cable| cable.up);
+                at.iter().find(up).or(at.first()).copied()
+            }
         }
     }
 

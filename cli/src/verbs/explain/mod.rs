@@ -196,6 +196,9 @@ fn device(machine: &Machine, index: DeviceIndex, out: &mut Document) {
         origin(device, device.device.position)
     ));
     out.line(selection.identity.to_string());
+    if device.optional {
+        out.line("optional: may be absent, and appear at any port".to_owned());
+    }
     if let Some(mode) = selection.mode {
         out.line(format!("mode {mode} (0x6060 = {})", mode.code()));
     }

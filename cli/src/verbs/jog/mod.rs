@@ -41,7 +41,7 @@ use crate::hints::Failure;
 use crate::render::fault_report::{self, ReportDestination};
 use crate::render::note;
 use crate::render::print;
-use crate::render::progress::device_returned;
+use crate::render::progress::{device_appeared, device_returned};
 use crate::render::report;
 use crate::render::style;
 use draw::Screen;
@@ -405,8 +405,11 @@ impl Observer for Listener {
                 device,
                 after_ns,
                 restarted,
+                first: false,
             } => (device_returned(device, *after_ns, *restarted), false),
             Progress::Ring { text, broken } => (text.clone(), *broken),
+            Progress::DeviceReturned { device, .. } => (device_appeared(device), false),
+            Progress::UnknownDevice(device) => (device.to_string(), true),
             Progress::GroupReleased { group } => {
                 let text = format!("the group `{group}` has been reset: e enables");
                 (text, false)

@@ -11,7 +11,7 @@ use super::gateway::RawNode;
 use super::problem::{Problems, Span};
 use super::schema::{self, Schema, any_of};
 use super::travel::RawTrack;
-use super::{ExchangeMode, GroupStopScope, MailboxSource, SocketKind, Spin};
+use super::{ExchangeMode, GroupStopScope, MailboxSource, SocketKind, Spin, UnknownDeviceRule};
 
 mod axis;
 mod step;
@@ -66,6 +66,10 @@ const LINKS: [(&str, SocketKind); 2] = [
     (SocketKind::Ring.name(), SocketKind::Ring),
     (SocketKind::Packet.name(), SocketKind::Packet),
 ];
+const UNKNOWN_DEVICES: [(&str, UnknownDeviceRule); 2] = [
+    ("close", UnknownDeviceRule::Close),
+    ("report", UnknownDeviceRule::Report),
+];
 
 const MAILBOXES: [(&str, MailboxSource); 2] = [
     ("esi", MailboxSource::Esi),
@@ -117,6 +121,9 @@ table! { "[bus]",
         exchange: Key<ExchangeMode> [EXCHANGES],
         /// How frames are read from the interface (`"ring"`, `"packet"`; default `"ring"`)
         link: Key<SocketKind> [LINKS],
+        /// What happens to a device that is not in the file and appears during the run, see below
+        /// (`"close"`, `"report"`; default `"close"`)
+        unknown_devices: Key<UnknownDeviceRule> [UNKNOWN_DEVICES],
     }
 }
 
@@ -158,6 +165,9 @@ table! { "[[device]]",
         alias: Key<u16> [1..=u16::MAX],
         /// Explicit device identification (1 to 65535)
         id: Key<u16> [1..=u16::MAX],
+        /// The device may be absent, and appear during the run at any port; needs `alias` or `id`
+        /// (`true`, `false`; default `false`)
+        optional: Key<bool>,
         /// Type or name, if the ESI describes several devices (text)
         type_name: Key<String> as "type",
         /// Selects a device likewise; only with a folder (number)

@@ -58,6 +58,7 @@ impl Engine {
                 self.guarding = true;
                 self.exchange.expect_op(true);
             }
+            RtCommand::Absent { group } => self.stop(Some(group), StopCause::Absent),
             RtCommand::StopBusMonitor => {
                 self.guarding = false;
                 self.exchange.expect_op(false);

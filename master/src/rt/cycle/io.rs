@@ -6,6 +6,7 @@ use crate::link::LinkError;
 use crate::rt::channel::Event;
 use crate::rt::event_log::LogEntryKind;
 use crate::rt::exchange::{ExchangeMode, Received};
+use crate::rt::reaction_group::ReactionGroup;
 
 /// Frames received in a row without reading the clock; more than one cycle and one mailbox ever
 /// bring.
@@ -110,6 +111,13 @@ impl Engine {
         let Some((device, difference_ns)) = self.exchange.clock_read() else {
             return;
         };
+        // The clock of a lost device is set as it returns.
+        let group = self.config.devices.get(device).map(|data| data.group);
+        let group = group.and_then(|group| self.groups.get(group));
+        let stop = group.and_then(ReactionGroup::stop);
+        if stop.is_some_and(|stop| stop.cause.is_failure()) {
+            return;
+        }
         let Some(off) = self.clocks_off.get_mut(device) else {
             return;
         };

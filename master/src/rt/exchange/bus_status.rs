@@ -1,11 +1,13 @@
 //! The status of mailboxes and the bus time as the cycle sees them, for other threads. Atomics keep
 //! the cost of reading them away from the cycle.
 
-use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU8, AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{
+    AtomicBool, AtomicI64, AtomicU8, AtomicU16, AtomicU64, AtomicUsize, Ordering,
+};
 
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 
-use super::Exchange;
+use super::{AlStatusPolls, Exchange};
 use crate::clock::Nanos;
 
 /// Bit 3 of a SyncManager's status.
@@ -35,6 +37,8 @@ pub struct BusStatus {
     restarted: IndexVec<DeviceIndex, AtomicBool>,
     /// The member that is the reference clock; `usize::MAX`: none.
     reference: AtomicUsize,
+    /// The number of devices that answered the last broadcast.
+    answering: AtomicU16,
 }
 
 /// The member belongs to a stopped group.
@@ -56,6 +60,7 @@ impl BusStatus {
             presence: (0..members).map(|_| AtomicU8::new(0)).collect(),
             restarted: (0..members).map(|_| AtomicBool::new(false)).collect(),
             reference: AtomicUsize::new(usize::MAX),
+            answering: AtomicU16::new(0),
         }
     }
 
@@ -77,7 +82,7 @@ impl BusStatus {
     }
 
     /// Stores whether a member is in Op and whether its group has stopped. RT: O(1).
-    pub(super) fn set_presence(&self, member: DeviceIndex, in_op: bool, stopped: bool) {
+    pub fn set_presence(&self, member: DeviceIndex, in_op: bool, stopped: bool) {
         if let Some(seen) = self.presence.get(member) {
             let bits = (u8::from(stopped) * STOPPED) | (u8::from(!in_op) * OUT_OF_OP);
             seen.store(bits, Ordering::Relaxed);
@@ -102,6 +107,12 @@ impl BusStatus {
     pub(super) fn set_reference(&self, member: Option<DeviceIndex>) {
         let index = member.map_or(usize::MAX, |member| member.0);
         self.reference.store(index, Ordering::Relaxed);
+    }
+
+    /// Returns the number of devices that answered the last broadcast, in the machine file or not.
+    #[must_use]
+    pub fn answering(&self) -> u16 {
+        self.answering.load(Ordering::Relaxed)
     }
 
     /// Returns the members of stopped groups that do not answer or are not in Op.
@@ -138,9 +149,9 @@ impl BusStatus {
 }
 
 impl Exchange {
-    /// Sets whether the diagnostic slot reads AL status only: it then visits each device sooner.
-    pub fn poll_al_status_only(&mut self, only: bool) {
-        self.schedule.al_status_only = only;
+    /// Sets how often the diagnostic slot reads AL status.
+    pub fn poll_al_status(&mut self, polls: AlStatusPolls) {
+        self.schedule.al_status_polls = polls;
     }
 
     /// Returns true once after a member has restarted. RT: O(1).
@@ -148,8 +159,11 @@ impl Exchange {
         self.bus_status.take_restarted(member)
     }
 
-    /// Publishes which members are in Op, for the other threads. RT: O(members).
-    pub fn publish_presence(&self, stopped: impl Fn(GroupIndex) -> bool) {
+    /// Publishes how many devices answer and which members are in Op, for the other threads. RT:
+    /// O(members).
+    pub fn publish_presence(&self, answering: u16, stopped: impl Fn(GroupIndex) -> bool) {
+        let seen = &self.bus_status.answering;
+        seen.store(answering, Ordering::Relaxed);
         for ((member, found), group) in self.diagnoses.enumerate().zip(&self.groups) {
             self.bus_status
                 .set_presence(member, found.is_in_op(), stopped(*group));

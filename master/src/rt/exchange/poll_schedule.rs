@@ -36,6 +36,18 @@ pub(super) struct PollDatagram {
     pub len: usize,
 }
 
+/// The share of AL status in the diagnosis reads.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum AlStatusPolls {
+    /// Each register block in turn.
+    #[default]
+    InTurn,
+    /// Every other read, because devices are judged by their own AL status.
+    EveryOther,
+    /// Every read, because a device that left Op is searched.
+    Only,
+}
+
 /// The sequence of reads.
 #[derive(Debug)]
 pub(super) struct PollSchedule {
@@ -43,12 +55,14 @@ pub(super) struct PollSchedule {
     mailboxes: Box<[PollDatagram]>,
     /// The devices whose status the mailbox reads contain, in order.
     pub mailbox_devices: Box<[DeviceIndex]>,
-    /// The next diagnosis read and the next mailbox read.
-    next: (usize, usize),
+    /// The next diagnosis read, the next mailbox read and the next read of AL status between the
+    /// others.
+    next: (usize, usize, usize),
     mailbox_is_next: bool,
+    al_status_is_next: bool,
     /// The number of members: the first diagnosis reads are those of AL status.
     members: usize,
-    pub al_status_only: bool,
+    pub al_status_polls: AlStatusPolls,
 }
 
 impl PollSchedule {
@@ -107,10 +121,11 @@ impl PollSchedule {
             diagnosis: diagnosis.collect(),
             mailboxes: mailboxes.into(),
             mailbox_devices: mailbox_devices.into(),
-            next: (0, 0),
+            next: (0, 0, 0),
             mailbox_is_next: false,
+            al_status_is_next: false,
             members: members.len(),
-            al_status_only: false,
+            al_status_polls: AlStatusPolls::InTurn,
         }
     }
 
@@ -118,11 +133,20 @@ impl PollSchedule {
     pub fn next(&mut self) -> Option<PollDatagram> {
         let mailbox = self.mailbox_is_next && !self.mailboxes.is_empty();
         self.mailbox_is_next = !mailbox;
+        let al_status = !mailbox
+            && match self.al_status_polls {
+                AlStatusPolls::InTurn => false,
+                AlStatusPolls::EveryOther => {
+                    self.al_status_is_next = !self.al_status_is_next;
+                    self.al_status_is_next
+                }
+                AlStatusPolls::Only => true,
+            };
         let (polls, next) = if mailbox {
             (&self.mailboxes[..], &mut self.next.1)
-        } else if self.al_status_only {
+        } else if al_status {
             let al_status = self.diagnosis.get(..self.members);
-            (al_status.unwrap_or_default(), &mut self.next.0)
+            (al_status.unwrap_or_default(), &mut self.next.2)
         } else {
             (&self.diagnosis[..], &mut self.next.0)
         };
@@ -218,8 +242,10 @@ mod tests {
         assert_eq!(schedule.mailbox_devices[11], DeviceIndex(4));
     }
 
+    /// A refused device that stayed outside Op made the slot read AL status alone: error counters
+    /// and clock differences were not read any more.
     #[test]
-    fn poll_schedule_visits_all_members_with_al_status_alone() {
+    fn poll_schedule_reads_al_status_alone_or_between_the_others() {
         let members = members(&[None; 3]);
         let mut schedule = PollSchedule::new(&members, None);
         let blocks = |schedule: &mut PollSchedule, count| -> Vec<_> {
@@ -230,16 +256,23 @@ mod tests {
             });
             blocks.collect()
         };
+        let status = |device| (DiagnosticRegister::AlStatus, device);
         blocks(&mut schedule, 8);
-        schedule.al_status_only = true;
-        let expected = [0, 1, 2, 0, 1].map(|device| (DiagnosticRegister::AlStatus, device));
-        assert_eq!(blocks(&mut schedule, 5), expected);
-        schedule.al_status_only = false;
-        let next = [
-            (DiagnosticRegister::AlStatus, 2),
-            (DiagnosticRegister::DlStatus, 0),
-        ];
-        assert_eq!(blocks(&mut schedule, 2), next);
+        schedule.al_status_polls = AlStatusPolls::Only;
+        assert_eq!(blocks(&mut schedule, 5), [0, 1, 2, 0, 1].map(status));
+        schedule.al_status_polls = AlStatusPolls::EveryOther;
+        let all = blocks(&mut schedule, 36);
+        let each: Vec<_> = all.iter().copied().step_by(2).collect();
+        assert_eq!(each[..4], [2, 0, 1, 2].map(status));
+        for block in DiagnosticRegister::ALL {
+            let read = all.iter().skip(1).step_by(2).filter(|p| p.0 == block);
+            assert_eq!(read.count(), 3, "{block:?}");
+        }
+        schedule.al_status_polls = AlStatusPolls::InTurn;
+        assert_eq!(
+            blocks(&mut schedule, 1),
+            [(DiagnosticRegister::ClockDifference, 2)]
+        );
     }
 
     #[test]

@@ -1,0 +1,146 @@
+//! Compares the devices that answer with those of the machine file.
+
+use std::collections::HashMap;
+
+use ecaxis_ecat::index::{DeviceIndex, IndexVec};
+use ecaxis_ecat::registers;
+
+use super::unknown::UnknownDevices;
+use super::{RunningSegment, STEP, Search};
+use crate::acyclic::enumerate;
+use crate::acyclic::topology::{ParentPort, in_line, parents};
+use crate::config::Locator;
+use crate::report::{Cause, DevicePlace, Error};
+
+/// A device that answers.
+#[derive(Debug, Clone, Copy)]
+struct Answering {
+    /// The device of the machine file with its station address.
+    device: Option<DeviceIndex>,
+    parent: Option<ParentPort>,
+}
+
+impl RunningSegment {
+    /// Reads the segment. Identifies devices without an address of the machine, as far as they are
+    /// behind one of the machine. Returns those of `wanted` that are there. `lost`: the number of missing devices. Others are reported.
+    pub(super) async fn survey(
+        &self,
+        (wanted, lost): (&[DeviceIndex], usize),
+        searches: &mut IndexVec<DeviceIndex, Search>,
+        unknown: &mut UnknownDevices,
+    ) -> Result<Vec<DeviceIndex>, Error> {
+        let count = enumerate::count(&self.wire).await?;
+        unknown.begin_survey(count);
+        if usize::from(count) <= self.devices.len().saturating_sub(lost) {
+            unknown.end_survey();
+            return Ok(Vec::new());
+        }
+        let words = async |register| enumerate::words(&self.wire, count, STEP, register).await;
+        let stations = words(registers::STATION_ADDRESS).await?;
+        let status = words(registers::DL_STATUS).await?.into_iter().zip(0..);
+        let ring = self.wire.ring();
+        let status = status.map(|(status, at)| in_line(at, status, ring));
+        let own: HashMap<_, _> = self
+            .devices
+            .enumerate()
+            .map(|(d, at)| (at.at.station, d))
+            .collect();
+        let answering = stations.iter().zip(parents(status));
+        let mut answering: Vec<_> = answering
+            .map(|(station, parent)| Answering {
+                device: own.get(station).copied(),
+                parent,
+            })
+            .collect();
+        // Some have been connected since they were asked: the next search asks them again.
+        let connected = |seen: &Answering| seen.device.is_some_and(|d| wanted.contains(&d));
+        if answering.iter().any(connected) {
+            return Ok(Vec::new());
+        }
+        let mut found = Vec::new();
+        for (position, index) in (0..count).zip(0..) {
+            let Some(&Answering {
+                device: None,
+                parent,
+            }) = answering.get(index)
+            else {
+                continue;
+            };
+            let before = parent.map(|port| {
+                let device = answering.get(usize::from(port.device));
+                (device.and_then(|seen| seen.device), port.port)
+            });
+            // Behind a device that is unknown itself: that one is reported.
+            let place = match before {
+                None => None,
+                Some((Some(device), port)) => Some((device, port)),
+                Some((None, _)) => continue,
+            };
+            let here = |index: &DeviceIndex| {
+                searches[*index].place.is_some_and(|before| match place {
+                    None => before.parent.is_none() && before.position == position,
+                    place => before.parent == place,
+                })
+            };
+            // The device that was here comes first. Others are found by alias or identification.
+            let expected = wanted.iter().copied().find(here);
+            let moved = wanted.iter().copied().filter(|index| {
+                let by_position = matches!(self.machine.devices[*index].at, Locator::Position(_));
+                !by_position && Some(*index) != expected
+            });
+            let candidates: Vec<_> = expected.into_iter().chain(moved).collect();
+            if expected.is_none() && !unknown.is_due(place) {
+                continue;
+            }
+            match self.identify(&candidates, searches, position).await {
+                Ok(Ok(device)) => {
+                    let search = &mut searches[device];
+                    search.restarted = true;
+                    search.place = Some(DevicePlace {
+                        position,
+                        parent: place,
+                    });
+                    unknown.remove(place);
+                    if let Some(seen) = answering.get_mut(index) {
+                        seen.device = Some(device);
+                    }
+                    found.push(device);
+                }
+                Ok(Err((numbers, error))) => {
+                    if let (Some(device), Some(error)) = (expected, error) {
+                        self.refuse(device, &mut searches[device], &error);
+                    }
+                    // A device of the machine behind it would be cut off.
+                    let leads_on = leads_to_known(&answering, index);
+                    unknown.add(self, place, Some(numbers), leads_on).await?;
+                }
+                Err(error) => match expected {
+                    Some(device) => self.refuse(device, &mut searches[device], &error),
+                    // Not in Init, or its EEPROM is unreadable: it has no identity.
+                    None if matches!(*error.cause, Cause::Datagram(_)) => return Err(error),
+                    None => {
+                        let leads_on = leads_to_known(&answering, index);
+                        unknown.add(self, place, None, leads_on).await?;
+                    }
+                },
+            }
+        }
+        unknown.end_survey();
+        Ok(found)
+    }
+}
+
+/// True if a device of the machine is behind this one.
+fn leads_to_known(answering: &[Answering], index: usize) -> bool {
+    let above = |of: usize| {
+        let parent = answering.get(of).and_then(|seen| seen.parent);
+        parent.map(|port| usize::from(port.device))
+    };
+    let behind =
+        |at: usize| std::iter::successors(above(at), |of| above(*of)).any(|of| of == index);
+    let known = answering
+        .iter()
+        .enumerate()
+        .filter(|(_, seen)| seen.device.is_some());
+    known.map(|(at, _)| at).any(behind)
+}
