@@ -311,6 +311,7 @@ fn programs_of_every_kind_allocate_nothing() {
         "profiles.toml",
         "loops.toml",
         "program.toml",
+        "mixed.toml",
     ] {
         let (counted, _, result) = metered(load(file), &virtual_time(), None, 20_000);
         assert!(matches!(result, Some(Ok(()))), "{file}: {result:?}");

@@ -61,7 +61,7 @@ fn a_coupler_and_terminals_work_next_to_an_axis() {
     assert_eq!(summary.axes[0].final_error_counts, Some(0), "{summary:?}");
 }
 
-/// The MainDevice treats a gateway as bytes; only the simulated bus knows the nodes behind it.
+/// The MainDevice treats a gateway without axes as bytes.
 #[test]
 fn a_gateway_with_nodes_works_next_to_an_axis() {
     let machine = load("gateway.toml");
@@ -69,7 +69,7 @@ fn a_gateway_with_nodes_works_next_to_an_axis() {
         .sim
         .gateway
         .as_ref()
-        .expect("[device.sim]");
+        .expect("[[device.node]]");
     let nodes: Vec<_> = gateway
         .nodes
         .iter()

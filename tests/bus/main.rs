@@ -15,6 +15,7 @@ mod damaged_eeprom;
 mod demo;
 mod eeproms;
 mod fsoe;
+mod gateway_axes;
 mod homing;
 mod long_segment;
 mod lrw;

@@ -13,6 +13,7 @@ use ecaxis_master::acyclic::StateError;
 use ecaxis_master::config::{ConfigError, LimitConflict, Nic, UnitProblem};
 use ecaxis_master::mailbox::{CoeCause, SdoError};
 use ecaxis_master::report::{Cause, Error};
+use ecaxis_master::rt::gateway::NodeState;
 use ecaxis_sim::ServeError;
 
 pub(crate) use crate::failure::{FAILED, Failure, INTERRUPTED, WRONG};
@@ -166,6 +167,10 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         Cause::Absent => "connect the device, or take its axes out of the program".to_owned(),
         Cause::HeldOutput { .. } => "leave it out of `pdo.rx`: an optional device cannot keep its own value".to_owned(),
         Cause::OtherUnits => "give the axis its units in the machine file: `encoder`, `velocity_unit`, `acceleration_unit`".to_owned(),
+        Cause::NodeLost { state: NodeState::NoAcknowledgement, .. } => {
+            "check that the gateway is the NMT master of its network and that no other program writes its control word".to_owned()
+        }
+        Cause::NodeLost { .. } => "check the drive's power, the CAN cable and its terminators; a CANopen tool reads the drive's error history (0x1003)".to_owned(),
         Cause::Gone => "check the device's power and the cable to it".to_owned(),
         Cause::LeftOpBriefly { .. } => "look for loose connectors and supply dips".to_owned(),
         Cause::NotReached { .. } => {

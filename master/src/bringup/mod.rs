@@ -451,7 +451,9 @@ async fn configure(
     let step = mapping::compare(wire, config, device);
     times.measure("mapping read back", name, step).await?;
     let step = async {
-        for axis in machine.axes_of(index) {
+        // A gateway passes no SDO on to its nodes.
+        let own = machine.axes_of(index);
+        for axis in own.filter(|(_, axis)| axis.node.is_none()) {
             drive_units::compare(wire, config, axis, device, progress).await?;
             limits::compare(wire, config, axis, device, progress).await?;
         }

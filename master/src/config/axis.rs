@@ -66,6 +66,7 @@ pub(crate) fn setup(
         name: String::new(),
         device: DeviceIndex(0),
         number: 0,
+        node: None,
         config,
         unit: name?,
         mode,

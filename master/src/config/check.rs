@@ -338,7 +338,9 @@ fn unique_names(devices: &[RawDevice], p: &mut Problems<'_>) {
     let mut names: Vec<&Spanned<String>> = Vec::new();
     for device in devices {
         names.extend(&device.name);
-        let axes = device.axes.0.iter().filter_map(|axis| axis.name.as_ref());
+        let nodes = device.node.iter().flat_map(|node| &node.axes.0);
+        let axes = device.axes.0.iter().chain(nodes);
+        let axes = axes.filter_map(|axis| axis.name.as_ref());
         let of_device = device.name.as_ref().filter(|_| device.axes.0.len() == 1);
         names.extend(
             axes.filter(|name| of_device.is_none_or(|device| device.get_ref() != name.get_ref())),

@@ -4,13 +4,13 @@ use std::sync::Arc;
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use ecaxis_esi as esi;
-use ecaxis_esi::Field;
+use ecaxis_esi::{Field, Layout};
 use toml::Spanned;
 
 use super::fields::{Key, KeyExt};
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawDevice, RawEntry};
-use super::{DeviceConfig, Locator, MailboxSource, Startup, sdo, sim};
+use super::{DeviceConfig, Locator, MailboxSource, Startup, gateway, sdo, sim};
 use crate::esi_library::{RevisionMatch, SiiImage};
 use crate::rt::config::ProcessDataCopy;
 
@@ -55,7 +55,7 @@ pub(crate) fn check(
         _ => None,
     };
     let mailbox = raw.mailbox.value().unwrap_or_default();
-    let axes = axes::check(&raw, &numbers, mode.ok().flatten(), chosen.as_mut(), p);
+    let mut axes = axes::check(&raw, &numbers, mode.ok().flatten(), chosen.as_mut(), p);
     if let Some(chosen) = chosen.as_mut() {
         let damage = image.iter().filter_map(|image| image.sii.damage.first());
         let damage = damage.map(|damage| format!("the EEPROM image is damaged: {damage}"));
@@ -71,11 +71,21 @@ pub(crate) fn check(
             None => Err(()),
             Some(axis) => Ok(axis.setup.as_ref()),
         };
-        sim::check(sim, names, device, axis, p)
+        sim::check(sim, names, axis, p)
     });
+    let network = gateway::check(&raw, device, chosen.as_mut(), files.cycle.as_ref(), p);
     let startup = Startup::of(&raw);
     let device = device.map(|d| Arc::new(d.clone()));
     let identity = identity(raw.identity.as_ref(), p);
+    let mut sim = sim.unwrap_or_default();
+    let (gateway, simulated) = match network {
+        Some(network) => {
+            axes.extend(network.axes);
+            (Some(network.setup), Some(network.simulated))
+        }
+        None => (None, None),
+    };
+    sim.gateway = simulated;
     let device = (|| {
         let (esi_path, file) = file?;
         Some(DeviceConfig {
@@ -92,7 +102,8 @@ pub(crate) fn check(
             identity: identity?,
             serial: raw.serial.value(),
             optional: raw.optional.value().unwrap_or(false),
-            sim: sim.unwrap_or_default(),
+            sim,
+            gateway,
             line: p.line(&raw.span),
         })
     })();
@@ -103,7 +114,10 @@ pub(crate) fn check(
 pub(super) fn repeats(devices: &IndexVec<DeviceIndex, DeviceConfig>) -> Vec<ProcessDataCopy> {
     let mut repeats = Vec::new();
     for (index, device) in devices.enumerate() {
-        let fields = device.selection.layout.repeated_outputs();
+        let nodes = device.gateway.iter().flat_map(|gateway| &gateway.nodes);
+        let nodes = nodes.map(|node| &node.selection.layout);
+        let layouts = std::iter::once(&device.selection.layout).chain(nodes);
+        let fields = layouts.flat_map(Layout::repeated_outputs);
         repeats.extend(fields.map(|(first, field)| ProcessDataCopy {
             from: (index, first.bit_offset as usize),
             to: (index, field.bit_offset as usize),

@@ -64,7 +64,7 @@ fn document_lists_every_key() {
 
 /// The tables of the schema that a section of the document describes.
 #[rustfmt::skip] // one row per section
-const SECTIONS: [(&str, &str); 12] = [
+const SECTIONS: [(&str, &str); 14] = [
     ("[bus]", "/properties/bus"),
     ("[[device]]", "/properties/device/items"),
     ("[device.axis]", "/definitions/axis"),
@@ -73,6 +73,8 @@ const SECTIONS: [(&str, &str); 12] = [
     ("Loops", "/definitions/axis"),
     ("Supervision and stopping", "/definitions/axis"),
     ("Homing", "/definitions/axis/properties/homing"),
+    ("[device.can]", "/properties/device/items/properties/can"),
+    ("[[device.node]]", "/properties/device/items/properties/node/items"),
     ("[device.sim]", "/properties/device/items/properties/sim"),
     ("[[copy]]", "/properties/copy/items"),
     ("[stop]", "/properties/stop"),

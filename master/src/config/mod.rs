@@ -19,12 +19,13 @@
 //! | `sim.rs` | settings of the simulated bus: connections, clocks |
 //! | `travel.rs` | switches and ends along a simulated axis |
 //! | `units.rs` | names of position units |
-//! | `gateway.rs` | the network behind a simulated gateway |
+//! | `gateway.rs` | the CAN network behind a gateway, its nodes and their axes |
 //! | `steps.rs` | checks of the program; `[stop]` in `steps/stop.rs` |
 //! | `program.rs` | the program, and its steps as text |
 //!
 //! All mistakes are collected, so that one check reports every mistake of a file.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -64,6 +65,7 @@ pub use copy::{BitRange, CopySetup};
 pub(crate) use device::unused_axis;
 pub use drive_limits::LimitConflict;
 pub use drive_units::{AdoptedUnits, UnitProblem};
+pub use gateway::{GatewaySetup, NodeSetup};
 pub use problem::{ConfigError, Problem, nearest};
 pub use program::{Action, Step, StopGroup, StopSetup, TableFile};
 pub use signal::{NameError, Signal};
@@ -237,11 +239,24 @@ pub struct DeviceConfig {
     /// `true` if the device may be absent.
     pub optional: bool,
     pub sim: sim::SimSetup,
+    /// The CAN network behind a gateway with described nodes.
+    pub gateway: Option<GatewaySetup>,
     /// The line of its `[[device]]` in the machine file.
     pub line: u32,
 }
 
 impl DeviceConfig {
+    /// Returns the selection as that of a drive with this axis alone: the node of an axis behind a
+    /// gateway, otherwise its part of the device.
+    #[must_use]
+    pub fn selection_of(&self, axis: &AxisSetup) -> Cow<'_, esi::Selection> {
+        let node = axis.node.and_then(|n| self.gateway.as_ref()?.nodes.get(n));
+        node.map_or_else(
+            || self.selection.of_axis(axis.number),
+            |node| Cow::Borrowed(&node.selection),
+        )
+    }
+
     /// Returns `true` if an ESI file describes the device, and not its EEPROM image alone.
     #[must_use]
     pub fn has_esi(&self) -> bool {
@@ -303,6 +318,8 @@ pub struct AxisSetup {
     pub device: DeviceIndex,
     /// The number of the axis in its drive, from 0.
     pub number: u16,
+    /// The index in [`GatewaySetup::nodes`] of an axis behind a gateway.
+    pub node: Option<usize>,
     pub config: ecaxis_axis::AxisConfig,
     /// The user's name for the position unit, for example `mm`.
     pub unit: String,

@@ -1,12 +1,10 @@
 //! `[device.sim]`: settings of a device on the simulated bus.
 
-use ecaxis_esi as esi;
 use ecaxis_sim::gateway::GatewayOptions;
 use ecaxis_sim::network::topology::Media;
 use ecaxis_sim::{Medium, PortRequest, Topology, TopologyError};
 
 use super::fields::KeyExt;
-use super::gateway;
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawDevice, RawSim};
 use super::travel::{self, TrackSetup};
@@ -43,7 +41,6 @@ const MOST_DRIFT_PPM: f64 = 1000.0;
 pub(crate) fn check(
     raw: RawSim,
     names: &[String],
-    device: Option<&esi::Device>,
     axis: Result<Option<&AxisSetup>, ()>,
     p: &mut Problems<'_>,
 ) -> SimSetup {
@@ -81,7 +78,7 @@ pub(crate) fn check(
             .and_then(|ns| u32::try_from(ns).ok())
             .unwrap_or(0),
         state_change_ns: raw.state_change.value(),
-        gateway: gateway::setup(&raw, device, p),
+        gateway: None,
         track: raw
             .track
             .and_then(|raw| travel::check(&raw, axis, p))

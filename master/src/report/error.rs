@@ -9,6 +9,7 @@ use ecaxis_axis::{CommandError, Mode, State, Statusword, Trip};
 use crate::config::{LimitConflict, Step, UnitProblem};
 use crate::link::{LinkError, OpenError};
 use crate::mailbox::{DatagramError, InfoError, SdoError};
+use crate::rt::gateway::NodeState;
 use crate::rt::image::{NotMapped, TooLarge};
 use crate::rt::setpoint_generator::GeneratorError;
 use crate::text::rounded;
@@ -298,6 +299,8 @@ pub enum Cause {
         al_status_text(*code)
     )]
     LeftOp { state: AlState, code: u16 },
+    #[error("node {id} on its CAN network is {state}")]
+    NodeLost { id: u8, state: NodeState },
     #[error("no longer answers")]
     Gone,
     #[error("a SubDevice left Op (AL status 0x{al_status:02x}) and was back when it was asked")]
@@ -520,6 +523,7 @@ impl Error {
                 | Cause::DriveFault { .. }
                 | Cause::Trip { .. }
                 | Cause::FollowLost { .. }
+                | Cause::NodeLost { .. }
                 | Cause::EmergencyStop { .. }
                 | Cause::Controller
                 | Cause::NotDisabled { .. }

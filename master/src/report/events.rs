@@ -125,6 +125,9 @@ fn describe_cause<'m>(cause: StopCause, axis: &impl Fn(AxisIndex) -> &'m str) ->
         StopCause::FollowLost { axis: at } => {
             format!("stop: `{}` can follow no longer", axis(at))
         }
+        StopCause::NodeLost { axis: at, state } => {
+            format!("stop: the node of `{}` is {state}", axis(at))
+        }
         StopCause::Controller => "stop: the controller panicked".to_owned(),
         StopCause::Panicked => "stop: the cycle panicked".to_owned(),
         StopCause::Unsupervised => "stop: the supervisor thread does not run".to_owned(),

@@ -3,6 +3,7 @@
 use ecaxis_axis::{Axis, AxisStatus, Command, CommandError, Inputs, Outputs};
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex};
 
+use super::gateway::NodePlace;
 use super::image::{AxisBits, SignalBits};
 use super::setpoint_generator::SetpointGenerator;
 use crate::clock::Nanos;
@@ -13,6 +14,12 @@ pub struct RtAxis {
     pub axis: Axis,
     pub bits: AxisBits,
     pub device: DeviceIndex,
+    /// The node of an axis behind a gateway.
+    pub node: Option<NodePlace>,
+    /// The number of cycles from step to step: 1, or the gateway's SYNC period.
+    pub cycles: u32,
+    /// Fresh inputs, or a late answer, have arrived since the last step.
+    pub(super) arrived: (bool, bool),
     /// The output that opens its brake; it may be on any device.
     pub brake: Option<SignalBits>,
     pub group: GroupIndex,
@@ -37,6 +44,9 @@ impl RtAxis {
             axis,
             bits,
             device,
+            node: None,
+            cycles: 1,
+            arrived: (false, false),
             brake: None,
             group,
             generator: SetpointGenerator::default(),
@@ -47,6 +57,11 @@ impl RtAxis {
             ordered: false,
             acted: false,
         }
+    }
+
+    /// Returns the time from step to step in seconds.
+    pub(super) fn dt_s(&self, cycle_ns: Nanos) -> f64 {
+        cycle_ns as f64 * 1e-9 * f64::from(self.cycles)
     }
 
     /// Clears the armed state after a stop and reset: faults are ignored until the axis is enabled
@@ -83,7 +98,10 @@ impl RtAxis {
             position: bits.position.map(|b| b.get(image) as i32),
             velocity: bits.velocity.map(|b| b.get(image) as i32),
             torque: bits.torque.map(|b| b.get(image) as i16),
-            mode_display: bits.mode_display.map(|b| b.get(image) as i8),
+            mode_display: bits.mode_display.map(|b| {
+                let code = b.get(image) as i8;
+                self.node.map_or(code, |_| epos::standard_mode(code))
+            }),
             error_code: bits.error_code.map(|b| b.get(image) as u16),
             touch_probe_status: bits.touch_probe_status.map(|b| b.get(image) as u16),
             touch_probe_positions: bits
@@ -96,9 +114,12 @@ impl RtAxis {
 
     pub(super) fn write(&self, image: &mut [u8], outputs: &Outputs) {
         let bits = &self.bits;
+        let mode = self
+            .node
+            .map_or(outputs.mode, |_| epos::vendor_mode(outputs.mode));
         bits.controlword.set(image, i64::from(outputs.controlword));
         for (to, value) in [
-            (bits.mode, i64::from(outputs.mode)),
+            (bits.mode, i64::from(mode)),
             (bits.target_position, i64::from(outputs.target_position)),
             (bits.target_velocity, i64::from(outputs.target_velocity)),
             (bits.target_torque, i64::from(outputs.target_torque)),
@@ -125,6 +146,24 @@ impl RtAxis {
         if let Some(brake) = self.brake {
             let open = outputs.brake_open && keeps_power(outputs.controlword);
             brake.set(image, f64::from(u8::from(open)));
+        }
+    }
+}
+
+/// Modes of operation of the EPOS 24/1, 24/5 and 70/10. Their position, velocity and current mode
+/// take a set-point without a profile, as CSP, CSV and CST do.
+mod epos {
+    pub(super) const fn vendor_mode(mode: i8) -> i8 {
+        match mode {
+            8..=10 => 7 - mode,
+            other => other,
+        }
+    }
+
+    pub(super) const fn standard_mode(mode: i8) -> i8 {
+        match mode {
+            -3..=-1 => 7 - mode,
+            other => other,
         }
     }
 }

@@ -4,6 +4,7 @@ use ecaxis_ecat::al_state::AlState;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 
 use super::exchange::{AlStatusPolls, CycleResult, DeviceAnswer, GroupResult};
+use super::gateway::NodeState;
 
 /// AL status that every SubDevice must show while the machine runs.
 pub const OP: u8 = AlState::Op.code();
@@ -31,6 +32,8 @@ pub enum StopCause {
     },
     /// An emergency stop condition of the machine file is true.
     EmergencyStop,
+    /// The node of this axis behind a gateway is not Operational any more.
+    NodeLost { axis: AxisIndex, state: NodeState },
     /// The axis can no longer follow its master or its set-point source.
     FollowLost { axis: AxisIndex },
     /// The user's controller panicked.
@@ -55,6 +58,7 @@ impl StopCause {
             Self::DriveFault { axis }
             | Self::Trip { axis, .. }
             | Self::FollowLost { axis }
+            | Self::NodeLost { axis, .. }
             | Self::Powered { axis } => Some(axis),
             _ => None,
         }

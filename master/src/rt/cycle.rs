@@ -13,6 +13,7 @@ use super::controller::{self, Controller};
 use super::event_log::LogEntryKind;
 use super::exchange::{CycleResult, DeviceAnswer, Exchange, SubDeviceDiagnostics, Window};
 use super::flight_recorder::{self, FlightRecorder};
+use super::gateway::{Gateway, NodeState};
 use super::heartbeat;
 use super::image::SignalBits;
 use super::phase::Phase;
@@ -49,6 +50,7 @@ pub struct Engine {
     port: PduLoop,
     exchange: Exchange,
     axes: IndexVec<AxisIndex, RtAxis>,
+    gateways: Box<[Gateway]>,
     /// The first group is the machine's: all axes without a group.
     groups: IndexVec<GroupIndex, ReactionGroup>,
     signals: Signals,
@@ -106,6 +108,7 @@ pub struct EngineConfig {
     pub port: PduLoop,
     pub exchange: Exchange,
     pub axes: IndexVec<AxisIndex, RtAxis>,
+    pub gateways: Box<[Gateway]>,
     pub signals: Signals,
     pub controller: Option<Box<dyn Controller>>,
     pub samples: Option<SampleWriter>,
@@ -158,6 +161,7 @@ impl Engine {
             link: parts.link,
             port: parts.port,
             axes: parts.axes,
+            gateways: parts.gateways,
             groups: config
                 .groups
                 .iter()
@@ -328,17 +332,29 @@ impl Engine {
     }
 
     fn observe(&mut self) {
-        let dt = self.config.cycle_ns as f64 * 1e-9;
+        self.observe_gateways();
         let image = self.exchange.inputs();
         for slot in &mut self.axes {
             let answer = self.exchange.device_answers().get(slot.device);
-            let fresh = answer == Some(&DeviceAnswer::Fresh);
+            let (due, reachable) = slot.node.map_or((true, true), |at| {
+                let gateway = self.gateways.get(at.gateway);
+                gateway.map_or((true, false), |gateway| {
+                    let state = gateway.state(at.node);
+                    (gateway.is_due(), state == NodeState::Operational)
+                })
+            });
+            let fresh = reachable && answer == Some(&DeviceAnswer::Fresh);
             if fresh {
                 slot.heard = Some(self.next);
             }
-            let inputs = slot.read(image, fresh, self.exchange.came_late(slot.device));
-            slot.axis.observe(&inputs, dt);
-            slot.acted = false;
+            slot.arrived.0 |= fresh;
+            slot.arrived.1 |= self.exchange.came_late(slot.device);
+            slot.acted = !due;
+            if due {
+                let (fresh, late) = std::mem::take(&mut slot.arrived);
+                let inputs = slot.read(image, fresh, late);
+                slot.axis.observe(&inputs, slot.dt_s(self.config.cycle_ns));
+            }
         }
         for (to, signal) in self.inputs.iter_mut().zip(&self.signals.inputs) {
             *to = signal.get(image);

@@ -9,6 +9,7 @@
 //! - [`reaction_group`]: axes that stop together, and their release;
 //! - [`setpoint_generator`]: set-points from lines, tables and other axes;
 //! - [`axis`]: one axis in the cycle;
+//! - [`gateway`]: a CANopen gateway: control word, states of its nodes, phase of SYNC;
 //! - [`stats`]: bounded histograms and counters;
 //! - [`event_log`]: the events of the cycle, in order;
 //! - [`flight_recorder`]: the state of the last cycles;
@@ -39,6 +40,7 @@ pub mod cycle;
 pub mod event_log;
 pub mod exchange;
 pub mod flight_recorder;
+pub mod gateway;
 pub mod heartbeat;
 pub mod image;
 pub mod phase;

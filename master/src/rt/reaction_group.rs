@@ -90,6 +90,7 @@ impl ReactionGroup {
         match cause {
             StopCause::DriveFault { .. }
             | StopCause::Trip { .. }
+            | StopCause::NodeLost { .. }
             | StopCause::FollowLost { .. } => self.config.others,
             _ => StopMethod::Ramp,
         }

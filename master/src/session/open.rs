@@ -277,7 +277,7 @@ fn sim_device(
     }
     let mut plants = vec![PlantParams::default()];
     for axis in machine.axes.iter() {
-        if machine.devices[axis.device].name != device.name {
+        if machine.devices[axis.device].name != device.name || axis.node.is_some() {
             continue;
         }
         let number = usize::from(axis.number);

@@ -29,6 +29,7 @@ use crate::rt::axis::RtAxis;
 use crate::rt::channel::channel;
 use crate::rt::cycle::{EngineConfig, Signals, first_snapshot};
 use crate::rt::exchange::{Exchange, ExchangeDevice};
+use crate::rt::gateway::{Gateway, GatewayConfig, NodePlace};
 use crate::rt::image::{self, AxisBits, BitField, DeviceRegion, ImagePlan, NotMapped, SignalBits};
 use crate::rt::phase::Phase;
 use crate::supervise::{MissedTargets, ReportedLimits, RingWatch, Supervisor};
@@ -89,7 +90,7 @@ impl RunBuilder<'_> {
             progress,
             attachments,
         } = self;
-        let (image, ..) = plan(machine)?;
+        let image = plan(machine)?.image;
         let (main_device, mut port) = main_device(machine.bus.cycle_ns, machine.pre_op_timeout());
         let carried = BringUpIo {
             clock: options.clock,
@@ -101,7 +102,12 @@ impl RunBuilder<'_> {
         match bring_up_catching_panics(machine, main_device, image, carried, &progress, &log) {
             Ok(mut bus) => {
                 let machine = &apply_drive_units(machine, &bus);
-                let (_, slots, signals) = plan(machine)?;
+                let CyclePlan {
+                    axes: slots,
+                    gateways,
+                    signals,
+                    image: _,
+                } = plan(machine)?;
                 let wire = DatagramClient::new(main_device).in_ring(link.ring());
                 let config = machine.rt_config();
                 let clock = options.clock;
@@ -144,6 +150,7 @@ impl RunBuilder<'_> {
                     port,
                     exchange,
                     axes: slots,
+                    gateways,
                     signals,
                     controller,
                     samples,
@@ -242,7 +249,13 @@ fn apply_drive_units(machine: &Machine, bus: &Bus) -> Arc<Machine> {
     Arc::new(machine)
 }
 
-type CyclePlan = (ImagePlan, IndexVec<AxisIndex, RtAxis>, Signals);
+/// The process image, the axes and gateways with their offsets in it, and the signals.
+struct CyclePlan {
+    image: ImagePlan,
+    axes: IndexVec<AxisIndex, RtAxis>,
+    gateways: Box<[Gateway]>,
+    signals: Signals,
+}
 
 /// Returns the process image and the axes with their offsets in it.
 fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
@@ -251,23 +264,34 @@ fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
         let device = error.device;
         Cause::TooLarge(error).with_name(name(device))
     })?;
-    let mut slots = Vec::new();
+    let (mut slots, mut gateways) = (Vec::new(), Vec::new());
     for setup in &*machine.axes {
         let index = setup.device;
-        let layout = machine.devices[index]
-            .selection
-            .layout
-            .of_axis(setup.number);
+        let layout = &machine.devices[index].selection_of(setup).layout;
         // Without process data, nothing is mapped there.
         let region = image.regions[index].unwrap_or(DeviceRegion::EMPTY);
-        let bits = AxisBits::new(&layout, &region)
+        let bits = AxisBits::new(layout, &region)
             .map_err(|error| Cause::NotMapped(error).with_name(&setup.name))?;
         let mut config = setup.config;
         // A feedback value belongs to the set-point of an earlier cycle.
         config.answers_late = machine.bus.exchange.frame_sets() - 1;
         config.dead_time_s += f64::from(config.answers_late) * machine.bus.cycle_ns as f64 * 1e-9;
         let axis = Axis::new(config).map_err(|error| Cause::Axis(error).with_name(&setup.name))?;
-        slots.push(RtAxis::new(axis, bits, index, image.groups[index]));
+        let mut slot = RtAxis::new(axis, bits, index, image.groups[index]);
+        if let Some(node) = setup.node {
+            let gateway = gateways.iter().position(|g: &Gateway| g.device() == index);
+            let number = gateway.unwrap_or(gateways.len());
+            if gateway.is_none() {
+                gateways.push(Gateway::new(gateway_config(machine, index, &region)));
+            }
+            let place = NodePlace {
+                gateway: number,
+                node,
+            };
+            slot.cycles = gateways.get(number).map_or(1, Gateway::sync_cycles);
+            slot.node = Some(place);
+        }
+        slots.push(slot);
     }
     let bits = |signal: &Signal, output: bool| {
         let region = image.regions.get(signal.device)?.as_ref()?;
@@ -296,7 +320,31 @@ fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
     for (slot, setup) in slots.iter_mut().zip(&machine.axes) {
         slot.brake = all(setup.brake_output.as_slice(), true)?.pop();
     }
-    Ok((image, slots.into(), signals))
+    Ok(CyclePlan {
+        image,
+        axes: slots.into(),
+        gateways: gateways.into(),
+        signals,
+    })
+}
+
+/// The time within which a gateway acknowledges a command, in ns. It does so within two of its
+/// cycles of 1 ms.
+const ACKNOWLEDGE_NS: u64 = 50_000_000;
+
+fn gateway_config(machine: &Machine, device: DeviceIndex, region: &DeviceRegion) -> GatewayConfig {
+    let cycle_ns = machine.bus.cycle_ns;
+    let cycles = |ns: u64| u32::try_from(ns / cycle_ns).unwrap_or(u32::MAX);
+    let setup = machine.devices[device].gateway.as_ref();
+    let nodes = setup.map_or(&[][..], |gateway| &gateway.nodes);
+    GatewayConfig {
+        device,
+        inputs: region.offset..region.offset + region.in_len,
+        outputs: region.offset..region.offset + region.out_len,
+        sync_cycles: cycles(setup.map_or(cycle_ns, |gateway| gateway.sync_ns)),
+        nodes: nodes.iter().map(|node| node.id).collect(),
+        timeout_cycles: cycles(ACKNOWLEDGE_NS).max(20),
+    }
 }
 
 /// Sets the outputs that no axis drives to the values that their drives hold.

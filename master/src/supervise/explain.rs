@@ -55,6 +55,10 @@ impl Supervisor {
                 },
             },
             StopCause::Absent => Cause::Absent,
+            StopCause::NodeLost { axis, state } => Cause::NodeLost {
+                id: self.node_id(axis).unwrap_or(0),
+                state,
+            },
             StopCause::Controller => Cause::Controller,
             StopCause::Panicked => Cause::Panicked("the cycle".to_owned()),
             StopCause::Unsupervised => Cause::Unsupervised,
@@ -185,12 +189,20 @@ impl Supervisor {
 
     /// Reads an object of an axis's device. Returns `None` after a timeout.
     async fn upload(&mut self, axis: AxisIndex, index: u16) -> Option<Vec<u8>> {
-        let setup = self.setup(axis)?;
+        // A gateway passes no SDO on to its nodes.
+        let setup = self.setup(axis).filter(|setup| setup.node.is_none())?;
         let index = ecaxis_esi::axis::object(index, setup.number);
         let mailbox = self.mailboxes.urgent(setup.device)?;
         clock::timeout(ASK_TIMEOUT, mailbox.upload(index, 0))
             .await?
             .ok()
+    }
+
+    /// Returns the node-ID of an axis behind a gateway.
+    fn node_id(&self, axis: AxisIndex) -> Option<u8> {
+        let setup = self.setup(axis)?;
+        let gateway = self.machine.devices.get(setup.device)?.gateway.as_ref()?;
+        Some(gateway.nodes.get(setup.node?)?.id)
     }
 
     /// Returns the station addresses in segment order.
@@ -281,7 +293,8 @@ impl Supervisor {
             let device = &self.machine.devices[setup.device];
             let expected = setup.config.mode.code();
             let display = ecaxis_esi::axis::object(MODES_OF_OPERATION_DISPLAY, setup.number);
-            if device.selection.layout.tx_field(display, 0).is_some() {
+            let layout = &device.selection.layout;
+            if setup.node.is_some() || layout.tx_field(display, 0).is_some() {
                 continue;
             }
             if let Some(&[display]) = self

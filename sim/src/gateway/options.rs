@@ -11,6 +11,9 @@ use crate::drive::PlantParams;
 /// A value for one subindex.
 pub(super) type Setting = (u16, u8, Vec<u8>);
 
+/// The time in ms by which a heartbeat may be late.
+const HEARTBEAT_MARGIN_MS: u32 = 20;
+
 /// The bit rates of the gateway's rotary switch, in bit/s.
 pub const BIT_RATES: [u32; 7] = [
     20_000, 50_000, 125_000, 250_000, 500_000, 800_000, 1_000_000,
@@ -61,7 +64,7 @@ impl Default for GatewayOptions {
 pub enum Supervision {
     /// No error control.
     None,
-    /// The node sends a heartbeat with this period, in ms. It may be late by half a period.
+    /// The node sends a heartbeat with this period, in ms. It may be late by 20 ms.
     Heartbeat {
         /// The period in ms.
         period_ms: u16,
@@ -318,7 +321,7 @@ impl GatewayOptions {
             match node.supervision {
                 Supervision::None => {}
                 Supervision::Heartbeat { period_ms } => {
-                    let timeout_ms = u32::from(period_ms) + u32::from(period_ms / 2).max(1);
+                    let timeout_ms = u32::from(period_ms) + HEARTBEAT_MARGIN_MS;
                     let consumer = u32::from(node.id) << 16 | timeout_ms.min(0xffff);
                     gateway.push(u32_(0x1016, n, consumer));
                     dcf.push(u16_(0x1017, 0, period_ms));
@@ -334,6 +337,12 @@ impl GatewayOptions {
             ] {
                 for link in links {
                     link.configure(node.id, way, *used, size, gateway, &mut dcf)?;
+                    if way.gateway == super::pdo::TRANSMIT && !link.synchronous {
+                        // A node that starts later, or a lost frame, must not miss a value.
+                        let ms = self.sync_period_us.saturating_mul(2).div_ceil(1000);
+                        let event_timer = u16::try_from(ms).unwrap_or(u16::MAX);
+                        gateway.push(u16_(way.gateway.0 + *used, 5, event_timer));
+                    }
                     *used += 1;
                 }
             }

@@ -262,3 +262,23 @@ fn sdo_client_of_the_secondary_network_reads_texts_in_segments() {
     text.push(last[1]);
     assert_eq!(text, b"CANopen gateway");
 }
+
+/// With a single node, no third controller acknowledges the frames of either side.
+#[test]
+fn a_gateway_with_one_node_boots_it() {
+    for (id, drive) in [(1, Epos::E24_1), (2, Epos::E24_5), (100, Epos::E70_10)] {
+        let options = GatewayOptions {
+            nodes: vec![NodeOptions::new(id, drive)],
+            ..GatewayOptions::default()
+        };
+        let mut line = Line::new("GW16", options);
+        assert_eq!(line.command(0x01, 0), Some(0x01), "{drive:?}");
+        line.cycles(150);
+        assert_eq!(
+            line.node(id).nmt_state(),
+            NmtState::Operational,
+            "{drive:?}"
+        );
+        assert_eq!(line.command(0x10, id), Some(0x11), "{drive:?}");
+    }
+}

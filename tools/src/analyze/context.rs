@@ -47,7 +47,9 @@ impl Context {
                 .axes
                 .iter()
                 .enumerate()
-                .filter(|(_, axis)| machine.devices[axis.device].name == device.name)
+                .filter(|(_, axis)| {
+                    machine.devices[axis.device].name == device.name && axis.node.is_none()
+                })
                 .map(|(n, axis)| (axis.number, n, (axis.config.scale, axis.unit.clone())))
                 .collect(),
         };

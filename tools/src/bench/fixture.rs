@@ -197,6 +197,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
         port: main_device(cycle_ns, Duration::ZERO).1,
         exchange: Exchange::new(&plan, Some(&clock), &members, exchange),
         axes: slots.into(),
+        gateways: Box::default(),
         signals,
         controller: None,
         samples: None,

@@ -19,6 +19,7 @@ use ecaxis_tools::document::{Document, Table};
 
 mod as_json;
 mod axis;
+mod gateway;
 mod stop;
 
 use crate::access::device::selected;
@@ -221,11 +222,19 @@ fn device(machine: &Machine, index: DeviceIndex, out: &mut Document) {
     let (axes, several) = (machine.axes_of(index), machine.axes_of(index).count() > 1);
     for (_, axis) in axes {
         out.gap();
-        if several || axis.name != device.name {
+        let node = axis
+            .node
+            .and_then(|n| device.gateway.as_ref()?.nodes.get(n));
+        if let Some(node) = node {
+            out.line(format!("axis of node {}: `{}`", node.id, axis.name));
+        } else if several || axis.name != device.name {
             let (name, number) = (&axis.name, axis.number + 1);
             out.line(format!("axis {number} of the drive: `{name}`"));
         }
         out.table(axis::axis(axis));
+    }
+    if let Some(gateway) = &device.gateway {
+        gateway::network(machine, index, gateway, out);
     }
     process_data(&device.device, &selection.layout, out);
     clock(device, out);

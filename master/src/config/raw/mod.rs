@@ -7,7 +7,7 @@ use ecaxis_axis::StopMethod;
 use ecaxis_esi::Address;
 
 use super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Written, unquoted};
-use super::gateway::RawNode;
+use super::gateway::{RawCan, RawNode};
 use super::problem::{Problems, Span};
 use super::schema::{self, Schema, any_of};
 use super::travel::RawTrack;
@@ -199,6 +199,10 @@ table! { "[[device]]",
         /// Units, limits, loops, supervision and homing of a drive's axis; as `[[device.axis]]` for
         /// each axis of a drive with several
         axes: AxisTables as "axis",
+        /// CAN network behind a CANopen gateway (table; default see below)
+        can: RawCan,
+        /// Drives behind a CANopen gateway (tables, `[[device.node]]`; default none)
+        node: Vec<RawNode>,
         /// Settings of the simulated bus
         sim: Option<RawSim>,
     }
@@ -356,12 +360,6 @@ table! { "[device.sim]",
         /// From a request in AL control to the answer in AL status (time, up to 60 s; default 200
         /// µs)
         state_change: Key<Ns> [0..=60 * S],
-        /// Of a gateway's CAN network (bit/s; default 1,000,000)
-        bit_rate: Key<u32>,
-        /// Period of the gateway's SYNC (time; default `"4ms"`)
-        sync: Key<Ns>,
-        /// Drives on the gateway (tables, `[[device.sim.node]]`; default none)
-        node: Vec<RawNode>,
         /// Switches and ends along a simulated axis (table; default no switches or ends)
         track: Option<RawTrack>,
     }

@@ -59,7 +59,7 @@ impl ProgramChecker<'_> {
         let inside = within(value, what, axis, p);
         let (speed, ramp) = (speed?, ramp?);
         if let Some(device) = self.devices[self.axes[index].device].device {
-            mapped(&device.selection.of_axis(axis.number), name, probe, edge, p)?;
+            mapped(&device.selection_of(axis), name, probe, edge, p)?;
         }
         inside.then(|| Action::Probe {
             axis: index,

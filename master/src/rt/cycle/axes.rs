@@ -4,10 +4,45 @@ use ecaxis_axis::StopPhase;
 use ecaxis_ecat::index::AxisIndex;
 
 use super::{Engine, Nanos};
+use crate::rt::axis::RtAxis;
 use crate::rt::bus_monitor::StopCause;
+use crate::rt::exchange::DeviceAnswer;
+use crate::rt::gateway::Gateway;
 use crate::rt::setpoint_generator;
 
 impl Engine {
+    /// Reads the status words of the gateways, stops the groups of lost nodes, and writes the
+    /// control words.
+    pub(super) fn observe_gateways(&mut self) {
+        let has_power = |slot: &RtAxis| slot.axis.status().state.has_power();
+        for (n, gateway) in self.gateways.iter_mut().enumerate() {
+            let own = |slot: &RtAxis| slot.node.is_some_and(|at| at.gateway == n);
+            let powered = self.axes.iter().any(|slot| own(slot) && has_power(slot));
+            let answer = self.exchange.device_answers().get(gateway.device());
+            let fresh = answer == Some(&DeviceAnswer::Fresh);
+            gateway.observe(self.exchange.inputs(), fresh, self.guarding, powered);
+            gateway.write(self.exchange.outputs_mut());
+            for (axis, slot) in self.axes.enumerate_mut() {
+                let own = slot.node.filter(|at| at.gateway == n && slot.armed);
+                let Some(state) = own.and_then(|at| gateway.lost(at.node)) else {
+                    continue;
+                };
+                slot.axis.forget_home();
+                if let Some(group) = self.groups.get_mut(slot.group) {
+                    group.found = group.found.or(Some(StopCause::NodeLost { axis, state }));
+                }
+            }
+        }
+    }
+
+    /// True if the node of an axis behind a gateway is lost.
+    pub(super) fn node_lost(gateways: &[Gateway], slot: &RtAxis) -> bool {
+        slot.node.is_some_and(|at| {
+            let gateway = gateways.get(at.gateway);
+            gateway.is_none_or(|gateway| gateway.lost(at.node).is_some())
+        })
+    }
+
     /// Handles skipped cycles, in which nothing was sent. Drives kept the last output, so the axes
     /// continue from there. This runs before the staged frames are sent, because they date from
     /// before.
@@ -19,7 +54,7 @@ impl Engine {
         }
         let skipped = u32::try_from(silent - 1).unwrap_or(u32::MAX);
         for slot in &mut self.axes {
-            let outputs = slot.axis.skipped(skipped);
+            let outputs = slot.axis.skipped(skipped / slot.cycles.max(1));
             slot.write(self.exchange.outputs_mut(), &outputs);
         }
         self.exchange.refresh_outputs();
@@ -61,7 +96,6 @@ impl Engine {
 
     /// Steps one axis. A cause that must stop its group is stored in the group.
     fn step_axis(&mut self, index: AxisIndex) {
-        let dt_s = self.config.cycle_ns as f64 * 1e-9;
         let master = self.axes.get(index).and_then(|slot| {
             let (master, actual) = slot.generator.master()?;
             let status = self.axes.get(master)?.axis.status();
@@ -74,13 +108,14 @@ impl Engine {
             return;
         };
         slot.acted = true;
+        let dt_s = slot.dt_s(self.config.cycle_ns);
         let lost = slot
             .generator
             .advance(&mut slot.axis, &self.tables, master, dt_s);
         let outputs = slot.axis.act();
         slot.write(self.exchange.outputs_mut(), &outputs);
         let status = slot.axis.status();
-        slot.armed |= slot.ordered && status.fault.is_none();
+        slot.armed |= slot.ordered && status.fault.is_none() && slot.heard.is_some();
         if status.enabled {
             slot.largest_following_error =
                 slot.largest_following_error.max(status.max_following_error);

@@ -193,7 +193,8 @@ impl Engine {
                 .get(slot.group)
                 .and_then(ReactionGroup::stop)
                 .is_some();
-            if stopping && self.guarding && self.guard.device_lost(slot.device) {
+            let lost = self.guard.device_lost(slot.device) || Self::node_lost(&self.gateways, slot);
+            if stopping && self.guarding && lost {
                 slot.axis.stop_by(self.config.bus_lost);
             }
         }

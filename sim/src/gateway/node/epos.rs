@@ -218,7 +218,12 @@ pub(super) fn dictionary(model: Epos, id: u8, serial: u32, bit_rate: u32) -> Dic
         (0x6084, 0, U32, 10_000),
         (0x6085, 0, U32, 10_000),
         (0x6086, 0, I16, 0),
+        (0x607c, 0, I32, 0),
         (0x6098, 0, I8, 35),
+        (0x6099, 0, U8, 2),
+        (0x6099, 1, U32, 100),
+        (0x6099, 2, U32, 10),
+        (0x609a, 0, U32, 1000),
         // Gains in the vendor's units. The simulated loops use their own gains.
         (0x60f6, 1, I16, 400),
         (0x60f6, 2, I16, 80),
@@ -274,7 +279,7 @@ fn contents_of(d: &mut Dictionary, index: u16, n: u16, contents: &[i64; 2]) {
 }
 
 /// Values that dictionary and drive share unchanged: (index and subindex in the drive).
-const COMMANDS: [(u16, u8); 15] = [
+const COMMANDS: [(u16, u8); 19] = [
     (0x6040, 0),
     (0x6065, 0),
     (0x6067, 0),
@@ -287,7 +292,11 @@ const COMMANDS: [(u16, u8); 15] = [
     (0x6084, 0),
     (0x6085, 0),
     (0x6086, 0),
+    (0x607c, 0),
     (0x6098, 0),
+    (0x6099, 1),
+    (0x6099, 2),
+    (0x609a, 0),
     (0x607a, 0),
     (0x60ff, 0),
 ];

@@ -1,0 +1,108 @@
+//! Mistakes in the description of a gateway, and the process data of a node.
+
+use std::path::Path;
+
+use super::super::{ConfigError, load, parse};
+
+/// Returns the problems of an example machine with one text replaced.
+fn broken(file: &str, from: &str, to: &str) -> Vec<(String, String)> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../configs")
+        .join(file);
+    let text = std::fs::read_to_string(&path).unwrap();
+    assert!(text.contains(from), "{from}");
+    match parse(&path, &text.replacen(from, to, 1)) {
+        Err(ConfigError::Problems(problems)) => problems
+            .into_iter()
+            .map(|problem| (problem.message, problem.hint.unwrap_or_default()))
+            .collect(),
+        other => panic!("{from} → {to}: {other:?}"),
+    }
+}
+
+#[test]
+#[rustfmt::skip] // one row per mistake
+fn gateway_rejects_invalid_settings() {
+    for (from, to, message, hint) in [
+        ("\"EPOS 24/1\"", "\"EPOS 24/2\"", "unknown drive `EPOS 24/2`", "did you mean `EPOS 24/1`?"),
+        ("id      = 1", "id = 16", "takes node numbers up to 15", ""),
+        ("id      = 1", "id = 128", "a whole number from 1 to 127", ""),
+        ("id        = 2", "id = 1", "node 1 is there twice", ""),
+        ("drive   = \"EPOS 24/1\"\n", "", "`drive` is missing in [[device.node]]", "EPOS 24/5"),
+        ("at = 8", "at = 600", "a whole number from 2 to 511", ""),
+        ("pdo = 2, at = 24", "pdo = 2, at = 60", "6 bytes at 60 do not lie", ""),
+        ("pdo = 3, at = 18", "pdo = 4, at = 18", "a whole number from 1 to 3", ""),
+        ("\"0x6041\", \"0x6064\"", "\"0x6042\"", "0x6042:00 cannot be mapped", ""),
+        ("\"0x6041\", \"0x6064\"", "\"0x6040\"", "0x6040:00 with 16 bits cannot be mapped", ""),
+        ("bit_rate = 1_000_000", "bit_rate = 9600", "no such bit rate", "500000"),
+        ("heartbeat = \"50ms\"", "heartbeat = \"1ms\"", "10 ms to 65 s", ""),
+        ("mandatory =", "mandatry =", "unknown key `mandatry`", "did you mean `mandatory`?"),
+        ("[device.axis]", "[device.can]\nbit_rate = 1_000_000\n[device.axis]", "`EPOS4` is not a CANopen gateway", "0x2100"),
+    ] {
+        let found = broken("gateway.toml", from, to);
+        let [(said, hinted)] = found.as_slice() else {
+            panic!("{from} → {to}: {found:?}")
+        };
+        assert!(said.contains(message) && hinted.contains(hint), "{said}: {hinted}");
+    }
+}
+
+#[test]
+#[rustfmt::skip] // one row per mistake
+fn axes_behind_a_gateway_reject_what_cannot_work() {
+    for (from, to, message, hint) in [
+        ("at = 11, objects", "at = 10, objects", "bytes 10 to 15 overlap PDO 3 of node 1 at 8 to 10", "`at = 11`"),
+        ("sync     = \"4ms\"", "sync = \"1ms\"", "occupied for 1", "`sync = \"3ms\"`"),
+        ("sync     = \"4ms\"", "sync = \"4500us\"", "not a multiple of the cycle of 1 ms", "`sync` or `cycle`"),
+        ("\"0x2062\"] }, { pdo = 3, at = 8 }", "\"0x607A\"] }, { pdo = 3, at = 8 }", "needs 0x2062:00 (position mode setting value)", "\"csp\""),
+        (", { pdo = 3, at = 8 }]\ninputs", "]\ninputs", "needs 0x6060:00 (modes of operation, in PDO 3) in the `outputs`", "PDO 3"),
+        ("\"0x6064\"] }, { pdo = 3, at = 8 }]", "\"0x606C\"] }, { pdo = 3, at = 8 }]", "needs 0x6064:00", ""),
+        ("name     = \"feed\"\n", "", "the axis of a node needs a `name`", "name = "),
+        ("name     = \"feed\"", "name = \"x\"", "the name \"x\" is taken", ""),
+        ("homing   = { method = 35", "homing = { method = 99", "99", ""),
+    ] {
+        let found = broken("mixed.toml", from, to);
+        // Steps that name the axis may report it as well.
+        let fits = |(said, hinted): &(String, String)| said.contains(message) && hinted.contains(hint);
+        assert!(found.iter().any(fits), "{from} → {to}: {found:?}");
+    }
+}
+
+#[test]
+fn a_node_has_the_objects_of_an_axis_at_offsets_of_the_gateway() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/mixed.toml");
+    let machine = load(&path).unwrap();
+    let lift = machine
+        .axes
+        .iter()
+        .find(|axis| axis.name == "lift")
+        .unwrap();
+    let device = &machine.devices[lift.device];
+    let layout = &device.selection_of(lift).layout;
+    for (output, index, byte, bits) in [
+        (true, 0x6040, 11, 16),
+        (true, 0x607a, 13, 32),
+        (true, 0x6060, 19, 8),
+        (false, 0x6041, 11, 16),
+        (false, 0x6064, 13, 32),
+        (false, 0x6061, 19, 8),
+    ] {
+        let field = match output {
+            true => layout.rx_field(index, 0),
+            false => layout.tx_field(index, 0),
+        };
+        let field = field.unwrap();
+        assert_eq!(
+            (field.bit_offset, field.bit_len),
+            (byte * 8, bits),
+            "{index:04x}"
+        );
+    }
+    assert_eq!((layout.rx_bytes(), layout.tx_bytes()), (64, 64));
+    assert!(!lift.config.follows_bit);
+    assert!(
+        (lift.config.dead_time_s - 4e-3).abs() < 1e-9,
+        "{}",
+        lift.config.dead_time_s
+    );
+}

@@ -1,0 +1,312 @@
+//! A CANopen gateway in the cycle: its control and status word, the states of its nodes, and the
+//! phase of its SYNC.
+//!
+//! An axis behind a gateway is an ordinary axis. Its objects lie at other offsets of the gateway's
+//! process data, it steps once per SYNC, and its inputs are fresh while its node is Operational.
+//!
+//! The control word (Anybus X-gateway, manual §6.2.1) carries a toggle bit, a command and a node.
+//! The gateway echoes toggle bit and command in the status word. The first command starts the
+//! gateway; the commands after it ask for the state of one node after another.
+
+use std::ops::Range;
+
+use ecaxis_ecat::index::DeviceIndex;
+
+/// The set-up of a gateway's part in the cycle.
+#[derive(Debug, Clone)]
+pub struct GatewayConfig {
+    pub device: DeviceIndex,
+    /// The bytes of its inputs and outputs in the image.
+    pub inputs: Range<usize>,
+    pub outputs: Range<usize>,
+    /// The SYNC period in cycles.
+    pub sync_cycles: u32,
+    /// The node-IDs of its axes.
+    pub nodes: Vec<u8>,
+    /// The cycles within which a command must be acknowledged.
+    pub timeout_cycles: u32,
+}
+
+/// The location of an axis behind a gateway.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct NodePlace {
+    /// The index of the gateway in the cycle.
+    pub gateway: usize,
+    /// The index of the node in [`GatewayConfig::nodes`].
+    pub node: usize,
+}
+
+/// The state of a node as the gateway reports it (manual §6.2.2), or why it is not known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum NodeState {
+    PreOperational,
+    Operational,
+    Resetting,
+    Stopped,
+    /// Not monitored, or not heard yet.
+    #[default]
+    Unknown,
+    /// Its heartbeat is missing.
+    Missing,
+    /// The status word names it as the node in error.
+    InError,
+    /// The gateway does not acknowledge commands.
+    NoAcknowledgement,
+    /// A reserved code.
+    Other(u8),
+}
+
+impl NodeState {
+    const fn from_code(code: u8) -> Self {
+        match code {
+            0 => Self::PreOperational,
+            1 => Self::Operational,
+            2 | 3 => Self::Resetting,
+            4 => Self::Stopped,
+            5 => Self::Unknown,
+            6 => Self::Missing,
+            other => Self::Other(other),
+        }
+    }
+}
+
+impl std::fmt::Display for NodeState {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::PreOperational => "PRE-OPERATIONAL",
+            Self::Operational => "OPERATIONAL",
+            Self::Resetting => "in reset",
+            Self::Stopped => "STOPPED",
+            Self::Unknown => "in no known state",
+            Self::Missing => "missing: its heartbeat has failed",
+            Self::InError => "in error: the gateway names it in its status word",
+            Self::NoAcknowledgement => {
+                "unreachable: the gateway does not acknowledge its control word"
+            }
+            Self::Other(code) => return write!(f, "in reserved state {code}"),
+        })
+    }
+}
+
+const TOGGLE: u8 = 0x80;
+const COMMAND: u8 = 0x70;
+/// Set NMT state OPERATIONAL, of the gateway itself. It then starts its nodes.
+const START: [u8; 2] = [0x01, 0];
+const GET_NODE_STATE: u8 = 0x10;
+
+/// A gateway in the cycle. All functions: RT, O(nodes + bytes).
+#[derive(Debug)]
+pub struct Gateway {
+    config: GatewayConfig,
+    /// The control word that waits for its acknowledgement. `None` before the first command.
+    command: Option<[u8; 2]>,
+    /// Cycles since the command was issued.
+    waiting: u32,
+    started: bool,
+    states: Box<[NodeState]>,
+    /// The nodes that have been Operational in this Op.
+    reached: Box<[bool]>,
+    asked: usize,
+    previous: Box<[u8]>,
+    sync: SyncPhase,
+}
+
+impl Gateway {
+    #[must_use]
+    #[allow(
+        clippy::disallowed_methods,
+        clippy::disallowed_macros,
+        reason = "runs before the loop"
+    )]
+    pub fn new(config: GatewayConfig) -> Self {
+        Self {
+            command: None,
+            waiting: 0,
+            started: false,
+            states: vec![NodeState::default(); config.nodes.len()].into(),
+            reached: vec![false; config.nodes.len()].into(),
+            asked: 0,
+            previous: vec![0; config.inputs.len()].into(),
+            sync: SyncPhase::new(config.sync_cycles),
+            config,
+        }
+    }
+
+    #[must_use]
+    pub fn device(&self) -> DeviceIndex {
+        self.config.device
+    }
+
+    #[must_use]
+    pub fn sync_cycles(&self) -> u32 {
+        self.config.sync_cycles
+    }
+
+    /// Returns the state of a node.
+    #[must_use]
+    pub fn state(&self, node: usize) -> NodeState {
+        self.states.get(node).copied().unwrap_or_default()
+    }
+
+    /// Returns the state of a node that was Operational before and is not now.
+    #[must_use]
+    pub fn lost(&self, node: usize) -> Option<NodeState> {
+        let reached = self.reached.get(node).copied().unwrap_or(false);
+        Some(self.state(node)).filter(|state| reached && *state != NodeState::Operational)
+    }
+
+    /// True in the cycle in which the gateway's axes step.
+    #[must_use]
+    pub fn is_due(&self) -> bool {
+        self.sync.is_due()
+    }
+
+    /// Reads the status word and the phase of SYNC. `running`: the bus is in Op. `powered`: an axis
+    /// of the gateway has power, so its steps keep their distance.
+    pub fn observe(&mut self, image: &[u8], fresh: bool, running: bool, powered: bool) {
+        let data = image.get(self.config.inputs.clone()).unwrap_or_default();
+        let own = data.len().min(2);
+        let changed = fresh && data.get(own..) != self.previous.get(own..);
+        if changed && let Some(previous) = self.previous.get_mut(..data.len()) {
+            previous.copy_from_slice(data);
+        }
+        self.sync.step(changed, powered);
+        if !running {
+            (self.command, self.waiting, self.started) = (None, 0, false);
+            self.states.fill(NodeState::Unknown);
+            self.reached.fill(false);
+            return;
+        }
+        self.waiting = self.waiting.saturating_add(1);
+        let Some(&[status, error]) = data.get(..2).filter(|_| fresh) else {
+            return;
+        };
+        self.take_status(status, error);
+    }
+
+    fn take_status(&mut self, status: u8, error: u8) {
+        match self.command {
+            None => self.issue(START, status),
+            Some([byte, _]) if (byte ^ status) & (TOGGLE | COMMAND) == 0 => {
+                if byte & COMMAND == GET_NODE_STATE {
+                    if let Some(state) = self.states.get_mut(self.asked) {
+                        *state = NodeState::from_code(status & 0x0f);
+                    }
+                    self.asked = (self.asked + 1) % self.states.len().max(1);
+                } else {
+                    self.started = true;
+                }
+                if let Some(&node) = self.config.nodes.get(self.asked) {
+                    self.issue([GET_NODE_STATE, node], status);
+                }
+            }
+            Some(_) if self.started && self.waiting > self.config.timeout_cycles => {
+                self.states.fill(NodeState::NoAcknowledgement);
+            }
+            Some(_) => {}
+        }
+        // Faster than the question, but it names the lowest node only.
+        let mut nodes = self.config.nodes.iter();
+        if let Some(node) = nodes.position(|node| *node == error)
+            && let Some(state @ NodeState::Operational) = self.states.get_mut(node)
+        {
+            *state = NodeState::InError;
+        }
+        for (reached, state) in self.reached.iter_mut().zip(&self.states) {
+            *reached |= *state == NodeState::Operational;
+        }
+    }
+
+    /// Issues a command with the toggle bit that differs from the status word's.
+    fn issue(&mut self, [byte, node]: [u8; 2], status: u8) {
+        self.command = Some([byte | !status & TOGGLE, node]);
+        self.waiting = 0;
+    }
+
+    /// Writes the control word; leaves the outputs unchanged before the first command.
+    pub fn write(&self, image: &mut [u8]) {
+        if let Some(command) = self.command
+            && let Some(outputs) = image.get_mut(self.config.outputs.clone())
+            && let Some(to) = outputs.first_chunk_mut()
+        {
+            *to = command;
+        }
+    }
+}
+
+/// The phase of SYNC in the cycle, seen from the inputs that change after it.
+///
+/// The axes step in the cycle that first shows the inputs of a SYNC. A single change at another
+/// time moves nothing, because the clocks of gateway and bus differ and a reading may be a cycle
+/// early or late.
+#[derive(Debug, Clone, Copy)]
+struct SyncPhase {
+    cycles: u32,
+    phase: u32,
+    /// Cycles since the inputs changed.
+    quiet: u32,
+    /// Changes in a row that came late (positive) or early.
+    votes: i32,
+    /// The phase stays for one cycle.
+    hold: bool,
+}
+
+/// The changes in a row that move the phase by one cycle.
+const VOTES: i32 = 3;
+
+impl SyncPhase {
+    const fn new(cycles: u32) -> Self {
+        Self {
+            cycles: if cycles == 0 { 1 } else { cycles },
+            phase: 0,
+            quiet: u32::MAX,
+            votes: 0,
+            hold: false,
+        }
+    }
+
+    const fn is_due(&self) -> bool {
+        self.phase == 0
+    }
+
+    fn step(&mut self, changed: bool, powered: bool) {
+        if !std::mem::take(&mut self.hold) {
+            self.phase = (self.phase + 1) % self.cycles;
+        }
+        self.quiet = self.quiet.saturating_add(1);
+        if !changed {
+            return;
+        }
+        // The nodes answer one SYNC in one or two cycles; the first of them counts.
+        let first = self.quiet > self.cycles / 2;
+        if !first {
+            return;
+        }
+        self.quiet = 0;
+        if self.phase == 0 {
+            self.votes = 0;
+        } else if !powered {
+            self.phase = 0;
+        } else {
+            let late = self.phase <= self.cycles / 2;
+            let vote = if late { 1 } else { -1 };
+            self.votes = if self.votes.signum() == vote {
+                self.votes + vote
+            } else {
+                vote
+            };
+            if self.votes.abs() >= VOTES {
+                self.votes = 0;
+                if late {
+                    self.hold = true;
+                } else {
+                    self.phase = (self.phase + 1) % self.cycles;
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+#[path = "gateway_tests.rs"]
+mod tests;

@@ -1,0 +1,153 @@
+//! Axes of CANopen drives behind a gateway, on the simulated bus.
+
+use ecaxis_axis::State;
+use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_master::config::Machine;
+use ecaxis_master::rt::image;
+use ecaxis_test_support::recordings::process_images;
+use ecaxis_test_support::{
+    assert_contains, faults, load, machine, recorded, root, run_badly, run_well, virtual_time,
+};
+
+const GATEWAY: DeviceIndex = DeviceIndex(2);
+/// The places of the three nodes in the gateway's process data: Controlword and 0x2062, or
+/// Statusword and 0x6064. The Controlword of PDO 3 follows.
+const NODES: [usize; 3] = [2, 11, 20];
+
+fn mixed() -> String {
+    std::fs::read_to_string(root().join("configs/mixed.toml")).expect("our file")
+}
+
+/// Returns the mixed machine with another program.
+fn with_program(program: &str) -> Machine {
+    let text = mixed();
+    let end = text.find("[[step]]").expect("a program");
+    machine(&format!("{}{program}", &text[..end]))
+}
+
+/// The process data of the gateway in one cycle.
+struct Cycle {
+    outputs: Vec<u8>,
+    inputs: Vec<u8>,
+}
+
+impl Cycle {
+    fn target(&self, node: usize) -> i32 {
+        number(&self.outputs[NODES[node] + 2..])
+    }
+
+    fn actual(&self, node: usize) -> i32 {
+        number(&self.inputs[NODES[node] + 2..])
+    }
+
+    /// Returns the Controlword in PDO 1 and in PDO 3.
+    fn controlwords(&self, node: usize) -> [u8; 2] {
+        let at = NODES[node];
+        [self.outputs[at], self.outputs[at + 6]]
+    }
+}
+
+fn number(bytes: &[u8]) -> i32 {
+    i32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]])
+}
+
+/// Returns the gateway's process data of every cycle of a recording.
+fn cycles(machine: &Machine, recording: &std::path::Path) -> Vec<Cycle> {
+    let plan = image::of(&machine.rt_config()).expect("fits");
+    let region = plan.regions[GATEWAY].expect("process data");
+    let images = process_images(recording).into_iter();
+    let images = images.filter(|(sent, _)| sent.len() >= region.offset + region.out_len);
+    images
+        .map(|(sent, back)| Cycle {
+            outputs: sent[region.offset..region.offset + region.out_len].to_vec(),
+            inputs: back[region.offset..region.offset + region.in_len].to_vec(),
+        })
+        .collect()
+}
+
+#[test]
+fn axes_of_both_networks_run_one_program() {
+    let summary = run_well(load("mixed.toml"), virtual_time());
+    assert_eq!(summary.counters.wkc_errors, 0);
+    let names: Vec<&str> = summary.axes.iter().map(|a| a.name.as_str()).collect();
+    assert_eq!(names, ["x", "y", "feed", "lift", "table"]);
+    for axis in &summary.axes {
+        println!("{}: {} at the end", axis.name, axis.final_position);
+        assert!(axis.final_position.abs() < 0.2, "{axis:?}");
+        assert_eq!(axis.final_state, State::SwitchOnDisabled.to_string());
+        assert_eq!((&axis.fault, &axis.trip), (&None, &None));
+    }
+}
+
+/// The drives have no interpolation: every step that they receive is within the limits at the
+/// period of SYNC, and no SYNC sees two steps.
+#[test]
+fn set_points_change_once_per_sync_within_the_limits() {
+    const SYNC: usize = 4;
+    // Of `feed`: 50 mm/s, 250 mm/s², 400 counts a mm, 4 ms.
+    let (step, change) = (50.0 * 400.0 * 4e-3 + 1.0, 250.0 * 400.0 * 16e-6 + 2.0);
+    let folder = tempfile::tempdir().expect("a folder");
+    let (options, path) = recorded(virtual_time(), folder.path());
+    let machine = with_program(
+        "[[step]]\nmove = { feed = 30.0, table = 180.0 }\n[[step]]\nmove = { feed = -20.0 }\nspeed = 0.7\n",
+    );
+    run_well(machine.clone(), options);
+    let cycles = cycles(&machine, &path);
+    let powered = |cycle: &&Cycle| cycle.controlwords(0) == [0x0f, 0x0f];
+    let on: Vec<&Cycle> = cycles.iter().filter(powered).collect();
+    let (mut since, mut last, mut moved, mut checked) = (SYNC, 0, on[0].target(0), 0);
+    for cycle in &on {
+        let target = cycle.target(0);
+        since += 1;
+        if target == moved {
+            continue;
+        }
+        let now = target - moved;
+        assert!(since + 1 >= SYNC, "{since} cycles after the last step");
+        assert!(f64::from(now.abs()) <= step, "a step of {now} counts");
+        // A pause of a whole SYNC is a step of 0.
+        let before = if since <= SYNC + 1 { last } else { 0 };
+        let difference = f64::from((now - before).abs());
+        assert!(difference <= change, "{before} counts, then {now}");
+        (since, last, moved) = (0, now, target);
+        checked += 1;
+    }
+    println!("{checked} steps of `feed`");
+    assert!(checked > 200, "{checked}");
+}
+
+/// Returns the cycles from the last new position of a node to its quick stop.
+fn stop_cycles(cycles: &[Cycle], node: usize) -> usize {
+    let stopped = |cycle: &Cycle| cycle.controlwords(node) == [0x02, 0x02];
+    let stop = cycles.iter().position(stopped).expect("a quick stop");
+    let moves = |pair: &[Cycle]| pair[0].actual(node) != pair[1].actual(node);
+    let last = cycles[..stop].windows(2).rposition(moves);
+    stop - last.expect("a motion")
+}
+
+#[test]
+fn a_lost_node_stops_its_group_within_100_ms() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let silent = "[[fault]]\nkind = \"node-silent\"\ndevice = 2\nnode = 2\nat = \"2s\"\n";
+    let (options, path) = recorded(faults(silent), folder.path());
+    let machine = with_program(
+        "[[step]]\nmove = { feed = 50.0, lift = 50.0, table = 300.0, x = 50.0 }\nspeed = 0.3\n",
+    );
+    let (error, summary) = run_badly(machine.clone(), options);
+    println!("{error}");
+    assert_contains(&error, &["`lift`", "node 2", "in error"]);
+    let cycles = cycles(&machine, &path);
+    let took = stop_cycles(&cycles, 1);
+    println!("quick stop {took} ms after the last position of `lift`");
+    assert!(took <= 100, "{took} ms");
+    // The others come to rest within their limits and lose their power.
+    let summary = summary.expect("the cycle has run");
+    for axis in summary.axes.iter().filter(|axis| axis.name != "lift") {
+        assert_eq!(
+            axis.final_state,
+            State::SwitchOnDisabled.to_string(),
+            "{axis:?}"
+        );
+        assert_eq!((&axis.fault, &axis.trip), (&None, &None));
+    }
+}
