@@ -4,6 +4,7 @@ use ecaxis_axis::State;
 use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_master::config::Machine;
 use ecaxis_master::rt::image;
+use ecaxis_master::session::Options;
 use ecaxis_test_support::recordings::process_images;
 use ecaxis_test_support::{
     assert_contains, faults, load, machine, recorded, root, run_badly, run_well, virtual_time,
@@ -125,29 +126,120 @@ fn stop_cycles(cycles: &[Cycle], node: usize) -> usize {
     stop - last.expect("a motion")
 }
 
+/// One node without power, and all of them, as behind a broken CAN cable.
 #[test]
 fn a_lost_node_stops_its_group_within_100_ms() {
+    lose(&[2], "`lift`", "node 2");
+    lose(&[1, 2, 3], "`feed`", "node 1");
+}
+
+fn lose(nodes: &[u8], axis: &str, node: &str) {
     let folder = tempfile::tempdir().expect("a folder");
-    let silent = "[[fault]]\nkind = \"node-silent\"\ndevice = 2\nnode = 2\nat = \"2s\"\n";
-    let (options, path) = recorded(faults(silent), folder.path());
+    let silent = |node: &u8| {
+        format!("[[fault]]\nkind = \"node-silent\"\ndevice = 2\nnode = {node}\nat = \"2s\"\n")
+    };
+    let silent: String = nodes.iter().map(silent).collect();
+    let (options, path) = recorded(faults(&silent), folder.path());
     let machine = with_program(
         "[[step]]\nmove = { feed = 50.0, lift = 50.0, table = 300.0, x = 50.0 }\nspeed = 0.3\n",
     );
     let (error, summary) = run_badly(machine.clone(), options);
     println!("{error}");
-    assert_contains(&error, &["`lift`", "node 2", "in error"]);
+    assert_contains(&error, &[axis, node, "in error"]);
     let cycles = cycles(&machine, &path);
     let took = stop_cycles(&cycles, 1);
     println!("quick stop {took} ms after the last position of `lift`");
     assert!(took <= 100, "{took} ms");
     // The others come to rest within their limits and lose their power.
     let summary = summary.expect("the cycle has run");
-    for axis in summary.axes.iter().filter(|axis| axis.name != "lift") {
+    let there = |name: &str| !["feed", "lift", "table"].contains(&name) || nodes.len() == 1;
+    let others = summary.axes.iter();
+    for axis in others.filter(|axis| axis.name != "lift" && there(&axis.name)) {
         assert_eq!(
             axis.final_state,
             State::SwitchOnDisabled.to_string(),
             "{axis:?}"
         );
         assert_eq!((&axis.fault, &axis.trip), (&None, &None));
+    }
+}
+
+/// The end of the time limit stops as Ctrl-C does.
+#[test]
+fn a_stop_in_motion_brings_nodes_to_rest_before_their_power_ends() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (options, path) = recorded(virtual_time(), folder.path());
+    let options = Options {
+        limit: Some(2_000_000_000),
+        ..options
+    };
+    let machine = with_program("[[step]]\nmove = { feed = 50.0, table = 350.0 }\nspeed = 0.3\n");
+    run_well(machine.clone(), options);
+    let cycles = cycles(&machine, &path);
+    for (node, step) in [(0, 80), (2, 80)] {
+        let powered = |cycle: &Cycle| cycle.controlwords(node) == [0x0f, 0x0f];
+        let last = cycles.iter().rposition(powered).expect("it had power");
+        let first = cycles.iter().position(powered).expect("it had power");
+        let targets = cycles[first..=last].windows(2);
+        let largest = targets.map(|pair| (pair[1].target(node) - pair[0].target(node)).abs());
+        let largest = largest.max().unwrap_or_default();
+        assert!(0 < largest && largest <= step, "a step of {largest} counts");
+        let end = &cycles[last - 40..=last];
+        let moved = end.iter().map(|cycle| cycle.actual(node));
+        let moved = moved.clone().max().unwrap_or(0) - moved.min().unwrap_or(0);
+        assert!(
+            moved <= 4,
+            "it moved by {moved} counts when it lost its power"
+        );
+        let over = cycles.last().expect("cycles").controlwords(node);
+        assert_eq!(over[0] & 0x08, 0, "{over:x?}");
+    }
+}
+
+/// Returns the mean time in cycles from the computation of a set-point to the cycle that reports
+/// its position, in the middle third of a motion.
+fn measured_dead_time(cycles: &[Cycle]) -> f64 {
+    let pairs = || cycles.windows(2).enumerate();
+    // A set-point that is sent in a cycle was computed in the cycle before.
+    let sent = pairs().filter(|(_, pair)| pair[0].target(0) != pair[1].target(0));
+    let sent: Vec<_> = sent
+        .map(|(n, pair)| (n as f64, pair[1].target(0)))
+        .collect();
+    let seen = pairs().filter(|(_, pair)| pair[0].actual(0) != pair[1].actual(0));
+    let lags: Vec<f64> = seen
+        .filter_map(|(n, pair)| {
+            let at = pair[1].actual(0);
+            let mut steps = sent.windows(2);
+            let step = steps.find(|step| (step[0].1..step[1].1).contains(&at))?;
+            let [(begin, from), (end, to)] = [step[0], step[1]];
+            let part = f64::from(at - from) / f64::from(to - from);
+            Some((n + 1) as f64 - (begin + part * (end - begin)))
+        })
+        .collect();
+    let middle = &lags[lags.len() / 3..2 * lags.len() / 3];
+    middle.iter().sum::<f64>() / middle.len() as f64
+}
+
+#[test]
+fn the_dead_time_is_the_expected_one() {
+    for sync_ms in [2, 3, 4, 5, 10, 20] {
+        let text = mixed();
+        // One node: three would occupy the network for too long at 2 ms.
+        let end = text
+            .find("[[device.node]]\nid      = 2")
+            .expect("a second node");
+        let text = text[..end].replace("\"4ms\"", &format!("\"{sync_ms}ms\""));
+        let machine = machine(&format!("{text}[[step]]\nmove = {{ feed = 50.0 }}\n"));
+        let gateway = machine.devices[GATEWAY]
+            .gateway
+            .as_ref()
+            .expect("a gateway");
+        let expected = gateway.dead_time_ns(machine.bus.cycle_ns) as f64 * 1e-6;
+        let folder = tempfile::tempdir().expect("a folder");
+        let (options, path) = recorded(virtual_time(), folder.path());
+        run_well(machine.clone(), options);
+        let measured = measured_dead_time(&cycles(&machine, &path));
+        println!("SYNC {sync_ms} ms: {measured:.2} ms, expected {expected:.2} ms");
+        assert!((measured - expected).abs() <= 1.0, "SYNC {sync_ms} ms");
     }
 }

@@ -278,21 +278,20 @@ fn load(setup: &GatewaySetup, simulated: &GatewayOptions, sync_ns: u64) -> f64 {
 }
 
 impl GatewaySetup {
-    /// Returns the time from a set-point to the first report that can show it, in whole SYNC
-    /// periods: the cycle that carries the set-point, the gateway's exchange, the CAN frames and the
-    /// drive's control cycle, then the same way back.
+    /// Returns the time from a set-point to the report of its position: it is held for one SYNC
+    /// period; the cycle that carries it, the gateway's exchange, the longest PDO and SYNC add to
+    /// that.
     #[must_use]
     pub fn dead_time_ns(&self, cycle_ns: u64) -> u64 {
         const EXCHANGE_NS: u64 = MS;
-        const CONTROL_NS: u64 = MS;
         let links = self
             .nodes
             .iter()
             .flat_map(|n| n.outputs.iter().chain(&n.inputs));
-        let bits: u64 = links.map(|link| frame_bits(bytes(link).into())).sum();
+        let longest = links.map(|link| frame_bits(bytes(link).into())).max();
+        let bits = frame_bits(0) + longest.unwrap_or(0);
         let frames = bits * 1_000_000_000 / u64::from(self.bit_rate.max(1));
-        let way = cycle_ns + EXCHANGE_NS + frames / 2 + CONTROL_NS;
-        way.div_ceil(self.sync_ns) * self.sync_ns
+        self.sync_ns + cycle_ns + EXCHANGE_NS + frames
     }
 }
 
@@ -428,7 +427,10 @@ impl CheckedNetwork {
         let mut cycles = (cycle_ns..=100 * MS).step_by(usize::try_from(cycle_ns).unwrap_or(1));
         let fits = cycles.find(|sync| load(&self.setup, &self.simulated, *sync) <= MAX_LOAD);
         let hint = match fits {
-            Some(sync) => format!("write `sync = \"{}\"`, or map less", show(sync)),
+            Some(sync) => {
+                let sync = show(sync).replace(' ', "");
+                format!("write `sync = \"{sync}\"`, or map less")
+            }
             None => "raise `bit_rate`, map less, or use a second gateway".to_owned(),
         };
         let message = format!(

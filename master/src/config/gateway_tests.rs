@@ -101,7 +101,7 @@ fn a_node_has_the_objects_of_an_axis_at_offsets_of_the_gateway() {
     assert_eq!((layout.rx_bytes(), layout.tx_bytes()), (64, 64));
     assert!(!lift.config.follows_bit);
     assert!(
-        (lift.config.dead_time_s - 4e-3).abs() < 1e-9,
+        (lift.config.dead_time_s - 6.17e-3).abs() < 1e-9,
         "{}",
         lift.config.dead_time_s
     );

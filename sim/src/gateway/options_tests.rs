@@ -100,7 +100,7 @@ fn pdo_link_configures_gateway_and_node() {
         u32_(0x1600, 1, 0x2101_0108),
         u32_(0x1600, 4, 0x2101_0408),
         u8_(0x1600, 0, 4),
-        u32_(0x1016, 1, 0x1_0096),
+        u32_(0x1016, 1, 0x1_0078),
         u32_(0x1f81, 1, 0x5),
     ] {
         assert!(configuration.gateway.contains(&setting), "{setting:x?}");

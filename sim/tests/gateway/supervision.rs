@@ -10,8 +10,8 @@ fn silent_node_is_reported_after_its_heartbeat_time() {
     assert_eq!(line.status(), [0x81, 0]);
     let position = line.inputs[12..18].to_vec();
     line.gateway_mut().set_node_silent(2, true);
-    // A heartbeat of 100 ms plus half of it as tolerance. The last heartbeat may just have come.
-    line.cycles(45);
+    // A heartbeat of 100 ms plus 20 ms of tolerance. The last heartbeat may just have come.
+    line.cycles(15);
     assert_eq!(line.status()[1], 0);
     line.cycles(110);
     assert_eq!(line.status(), [0x81, 2], "error node");

@@ -9,17 +9,17 @@ import rig
 
 ESI = rig.ROOT / "configs/esi/gateway.xml"
 NODES = """
-[device.sim]
+[device.can]
 bit_rate = 1_000_000
 sync     = "4ms"
 
-[[device.sim.node]]
+[[device.node]]
 id      = 1
 drive   = "EPOS 24/1"
 outputs = [{ pdo = 1, at = 2, objects = ["0x6040", "0x607A"] }]
 inputs  = [{ pdo = 1, at = 2, objects = ["0x6041", "0x6064"] }]
 
-[[device.sim.node]]
+[[device.node]]
 id        = 2
 drive     = "EPOS 24/5"
 heartbeat = "50ms"
