@@ -224,6 +224,12 @@ fn bytes(link: &PdoLink) -> u16 {
     link.contents.iter().map(|c| u16::from(c.2) / 8).sum()
 }
 
+/// Returns the PDOs of a node in one direction.
+type Links = fn(&NodeSetup) -> &[PdoLink];
+
+/// Outputs, then inputs.
+const LINKS: [Links; 2] = [|node| &node.outputs, |node| &node.inputs];
+
 impl NodeSetup {
     fn new(node: &NodeOptions, gateway: &esi::Selection) -> Self {
         let each = |links: &[PdoLink], defaults| -> Vec<PdoLink> {
@@ -368,11 +374,8 @@ impl CheckedNetwork {
     /// Reports PDOs that lie on those of earlier nodes or on each other.
     fn overlaps(&self, raw: &RawNode, node: &NodeSetup, p: &mut Problems<'_>) {
         let nodes = || self.setup.nodes.iter().chain([node]);
-        let ways: [(&[RawLink], &[PdoLink], fn(&NodeSetup) -> &[PdoLink]); 2] = [
-            (&raw.outputs, &node.outputs, |node| &node.outputs),
-            (&raw.inputs, &node.inputs, |node| &node.inputs),
-        ];
-        for (raw, own, all) in ways {
+        for (all, raw) in LINKS.into_iter().zip([&raw.outputs, &raw.inputs]) {
+            let own = all(node);
             for (n, (raw, link)) in raw.iter().zip(own).enumerate() {
                 let earlier = nodes().flat_map(|other| {
                     let count = if other.id == node.id { n } else { usize::MAX };
@@ -400,11 +403,7 @@ impl CheckedNetwork {
 
     /// Notes bytes between PDOs that belong to no PDO.
     fn unused_bytes(&self, notes: &mut Vec<String>) {
-        let ways: [(&str, fn(&NodeSetup) -> &[PdoLink]); 2] = [
-            ("outputs", |node| &node.outputs),
-            ("inputs", |node| &node.inputs),
-        ];
-        for (word, links) in ways {
+        for (word, links) in ["outputs", "inputs"].into_iter().zip(LINKS) {
             let links = self.setup.nodes.iter().flat_map(links);
             let mut spans: Vec<_> = links.map(|l| (l.at, l.at + bytes(l))).collect();
             spans.sort_unstable();
