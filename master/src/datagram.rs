@@ -67,6 +67,19 @@ impl DatagramClient {
         self.ring.map(RingStatus::get)
     }
 
+    /// Exchanges both interfaces of a ring.
+    pub(crate) fn exchange_ends(&self) {
+        if let Some(ring) = self.ring {
+            ring.swap();
+        }
+    }
+
+    /// Returns how often the ring was broken, and behind how many devices the last time.
+    #[must_use]
+    pub fn breaks(&self) -> (u32, u16) {
+        self.ring.map_or((0, 0), RingStatus::breaks)
+    }
+
     /// Returns true if the cables of both interfaces of a ring are exchanged.
     #[must_use]
     pub fn swapped(&self) -> bool {

@@ -8,6 +8,34 @@ use ecaxis_test_support::program::{self, ProgramOutput};
 use ecaxis_test_support::tolerant_demo;
 use ecaxis_tools::bench::veth::VethPair;
 
+/// An interface without a link is a warning at one end of a ring, and an error at both.
+#[test]
+fn a_ring_starts_with_one_interface() {
+    over_a_pair(|first| {
+        let second = VethPair::new().expect("a second pair");
+        let file = tempfile::Builder::new().suffix(".toml").tempfile();
+        let file = file.expect("a temporary file");
+        let bus = format!("[bus]\nredundant = \"{}\"\n", second.b);
+        let text = tolerant_demo().replacen("[bus]", &bus, 1);
+        std::fs::write(file.path(), text).expect("written");
+        let path = file.path().to_str().expect("a path in UTF-8");
+        let ring = ["sim", path, "--nic", &first.a, "--nic2", &second.a];
+        let mut bus = ProgramOutput::start(program::command().args(ring).stdout(Stdio::null()));
+        bus.says("answer");
+        for down in [&first, &second] {
+            down.set(&down.a, false).expect("down");
+            let run = ["run", path, "--nic", &first.b, "--no-fault-report"];
+            let mut run = ProgramOutput::start(program::command().args(run).stdout(Stdio::piped()));
+            run.says("has no link: the ring is open at this end");
+            run.says("the ring is broken between");
+            let output = run.end();
+            let errors = String::from_utf8_lossy(&output.stderr);
+            assert_eq!(output.status.code(), Some(0), "{errors}");
+            down.set(&down.a, true).expect("up");
+        }
+    });
+}
+
 /// Each interface goes down and comes up again while the axes move.
 #[test]
 fn a_ring_outlasts_each_of_its_interfaces() {

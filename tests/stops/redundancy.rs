@@ -373,9 +373,9 @@ impl RingEnds for Exchanged {
     }
 }
 
-#[test]
-fn exchanged_cables_are_reported_and_do_not_matter() {
-    let options = faults(&break_at(3, 2_000_000_000, 500_000_000));
+/// Runs a ring whose cables are exchanged. Returns the target of the drive at each position.
+fn run_exchanged(script: &str) -> (Vec<String>, Vec<String>) {
+    let options = faults(script);
     options.clock.enter();
     let machine = ring();
     let script = options.faults.as_ref();
@@ -384,14 +384,112 @@ fn exchanged_cables_are_reported_and_do_not_matter() {
     let link = Box::new(RedundantLink::new(Box::new(ends), CYCLE_NS / 2));
     let (mut heard, stop) = (Heard::default(), Arc::<CancelToken>::default());
     let outcome = run_on(link, machine, options, stop, &mut heard);
-    let warnings = heard.warnings();
+    let (warnings, reports) = (heard.warnings(), reports(&heard));
     outcome
         .result
         .unwrap_or_else(|error| panic!("{error}; {warnings:?}"));
+    (warnings, reports)
+}
+
+#[test]
+fn exchanged_cables_are_reported_and_do_not_matter() {
+    let (warnings, reports) = run_exchanged(&break_at(3, 2_000_000_000, 500_000_000));
     assert!(
         matches!(&warnings[..], [text] if text.contains("are exchanged")),
         "{warnings:?}"
     );
-    let reports = reports(&heard);
     assert!(reports[0].contains("between `a2` and `a3`"), "{reports:?}");
+    // Positions would begin at the break.
+    for (cable, place) in [
+        (0, "interface (`nic`) and `a0`"),
+        (3, "between `a2` and `a3`"),
+        (DRIVES, "between `a7` and the second interface"),
+    ] {
+        let (warnings, reports) = run_exchanged(&break_at(cable, 0, 2_000_000_000));
+        assert!(
+            warnings.iter().any(|text| text.contains(place)),
+            "{cable}: {warnings:?}"
+        );
+        assert!(
+            warnings.iter().any(|text| text.contains("are exchanged")),
+            "{cable}: {warnings:?}"
+        );
+        assert!(
+            matches!(&reports[..], [text] if text.contains("is closed")),
+            "{cable}: {reports:?}"
+        );
+    }
+}
+
+/// Two drives lose their power together. The second one is reached before the first, and is not
+/// taken for it.
+#[test]
+fn a_drive_behind_a_gap_does_not_return_in_place_of_another() {
+    let steps = "\n[[step]]\nenable = true\n\n[[step]]\nmove = { a0 = 80.0 }\n\n[[step]]\nmove = { a0 = -80.0 }\n";
+    for (order, expected) in [
+        ([2_500, 60_000], &["a3"][..]),
+        ([60_000, 2_500], &[]),
+        ([3_200, 2_500], &["a3", "a4"]),
+    ] {
+        let text = line_text(DRIVES, steps);
+        let text = text.replacen("nic = \"sim\"", "nic = \"sim\"\nredundant = \"sim2\"", 1);
+        let script: String = [3, 4].into_iter().zip(order).map(|(device, back)| {
+            format!("[[fault]]\nkind = \"power-off\"\ndevice = {device}\nat = \"2s\"\nfor = \"{}ms\"\n", back - 2_000)
+        }).collect();
+        let (outcome, heard) = run(machine(&text), faults(&script));
+        let warnings = heard.warnings();
+        assert!(outcome.summary.is_some(), "{warnings:?}");
+        let mut names: Vec<_> = returned(&heard)
+            .into_iter()
+            .map(|(name, ..)| name)
+            .collect();
+        names.sort_unstable();
+        assert_eq!(names, expected, "{order:?}: {warnings:?}");
+        assert!(
+            !warnings.iter().any(|text| text.contains("serial number")),
+            "{warnings:?}"
+        );
+    }
+}
+
+/// A cable breaks at some time of the bring-up and stays out.
+#[test]
+fn a_break_during_the_bring_up_is_reported() {
+    let mut failed = Vec::new();
+    for cable in [0, 4, DRIVES] {
+        for at_ms in (10..70).step_by(4) {
+            let script = break_at(cable, at_ms * 1_000_000, 60_000_000_000);
+            let (outcome, heard) = run(ring(), faults(&script));
+            if let Err(error) = outcome.result {
+                failed.push(format!("cable {cable} at {at_ms} ms: {error}"));
+                continue;
+            }
+            let reports = [reports(&heard), heard.warnings()].concat();
+            assert!(
+                reports
+                    .iter()
+                    .any(|text| text.contains("is broken between")),
+                "cable {cable} at {at_ms} ms: {reports:?}"
+            );
+        }
+    }
+    println!("{failed:#?}");
+    assert!(failed.len() <= 6, "{failed:#?}");
+}
+
+/// A plug that bounces is reported, though each break is short.
+#[test]
+fn short_breaks_are_reported() {
+    let script: String = (0..20)
+        .map(|n| break_at(4, 2_000_000_000 + n * 20_000_000, 5_000_000))
+        .collect();
+    let (seen, heard) = swing(faults(&script), 3_000);
+    assert!(seen.stale.len() <= 20, "{:?}", seen.stale);
+    let warnings = heard.warnings();
+    assert!(
+        warnings
+            .iter()
+            .any(|text| text.contains("broken for short") && text.contains("behind `a3`")),
+        "{warnings:?}"
+    );
 }

@@ -141,9 +141,11 @@ impl Bus {
             } => {
                 let open = |nic: &str| -> Result<Box<dyn Link>, Error> {
                     // Interface settings that only disturb a cycle are irrelevant here.
-                    let (mut link, _) = match alone {
-                        true => link::open_exclusive(nic, back_end)?,
-                        false => link::open(nic, back_end)?,
+                    let (mut link, _) = match (alone, second.is_some()) {
+                        (true, false) => link::open_exclusive(nic, back_end)?,
+                        (true, true) => link::open_end_exclusive(nic, back_end)?,
+                        (false, false) => link::open(nic, back_end)?,
+                        (false, true) => link::open_end(nic, back_end)?,
                     };
                     let frames = link::sniff_foreign_frames(link.as_mut(), Instant::now())
                         .map_err(Cause::Link)?;
@@ -151,9 +153,9 @@ impl Bus {
                     Ok(link)
                 };
                 let first = open(&nic)?;
-                let link = match second {
+                let link = match &second {
                     None => first,
-                    Some(second) => session::ring(first, open(&second)?, COPY_TIMEOUT_NS),
+                    Some(second) => session::ring(first, open(second)?, COPY_TIMEOUT_NS),
                 };
                 // Another ecaxis may drive a machine on this interface.
                 Box::new(link::source_address::PrivateMacLink::new(

@@ -51,7 +51,7 @@ pub(crate) fn concern(concern: &NicWarning) -> Option<String> {
              sudo nmcli device set {nic} managed no"
         )),
         NicWarning::Member { nic, .. } => Some(format!("sudo ip link set {nic} nomaster")),
-        NicWarning::NoRing { .. } => None,
+        NicWarning::NoRing { .. } | NicWarning::NoLink { .. } => None,
     }
 }
 

@@ -63,7 +63,7 @@ pub async fn measure(
     devices: &[MeasuredDevice],
 ) -> Result<Vec<Option<u32>>, Error> {
     match wire.ring() {
-        Some(RingState::Closed) => {
+        Some(RingState::Closed | RingState::OneDirection) => {
             let end = ring_end(devices.iter().map(|device| device.dl_status));
             let Some(end) = end else {
                 return Ok(vec![None; devices.len()]);

@@ -109,6 +109,9 @@ pub struct Bus {
     /// The propagation delays in a closed ring, in the order of the segment; `None` without cable
     /// redundancy.
     pub ring_delays: Option<RingDelays>,
+    /// The state of the ring when the delays were measured, and its breaks until then.
+    pub ring: Option<RingState>,
+    pub ring_breaks: u32,
     /// The durations of the steps so far.
     pub times: StepTimes,
 }
@@ -160,6 +163,9 @@ pub async fn bring_up(
                 Cause::Datagram(_) => error.with_action("scanning"),
                 _ => error,
             })?;
+        if enters_at_last_port(&wire).await? {
+            wire.exchange_ends();
+        }
         al::acknowledge_errors_in_init(&wire).await;
         let ahead = Box::pin(eeproms::read_ahead(&wire, machine, count));
         let mut ahead = times.measure("EEPROMs", None, ahead).await?;
@@ -211,8 +217,9 @@ pub async fn bring_up(
     // From here on, ethercrab only carries datagrams; see docs/decisions/0001.
     drop(group);
     let mut devices = found;
-    let mut ring_delays = None;
-    if let Some(ring) = wire.ring() {
+    let (mut ring_delays, mut ring_breaks) = (None, 0);
+    let ring = wire.ring();
+    if let Some(ring) = ring {
         progress(ring_step(machine, ring));
         if wire.swapped() {
             let text = "the cables of `nic` and `redundant` are exchanged: `redundant` leads to the first device";
@@ -221,6 +228,8 @@ pub async fn bring_up(
         let measure = measure_delays(&wire, ring, &mut devices);
         let measured = times.measure("propagation delays", None, measure).await?;
         ring_delays = Some(measured);
+        // The measurement has opened it.
+        (ring_breaks, _) = wire.breaks();
     }
     let reference = clocks::reference(&devices);
     let set_up = Box::pin(set_up(
@@ -249,8 +258,23 @@ pub async fn bring_up(
         dc,
         clocks_settled,
         ring_delays,
+        ring,
+        ring_breaks,
         times,
     })
+}
+
+/// Returns true if the cables of a broken ring are exchanged at the computer. The first device of
+/// the line of the first interface has its port 0 open. That of the second one has lost the link of
+/// its port 0. In a closed ring the frames show it (`link::redundant`).
+async fn enters_at_last_port(wire: &DatagramClient) -> Result<bool, Error> {
+    const STEP: &str = "looking at the ends of the ring";
+    let Some(RingState::Broken { behind, .. }) = wire.ring() else {
+        return Ok(false);
+    };
+    let status = enumerate::at(wire, 0, STEP, registers::DL_STATUS).await?;
+    let [open, ..] = topology::open_ports(u16::from_le_bytes(status));
+    Ok(open != (behind > 0))
 }
 
 /// Returns the report on the ring at the start.
@@ -258,7 +282,9 @@ fn ring_step(machine: &Machine, ring: RingState) -> Step {
     let text = ring.text(machine.devices.len(), |position| name_at(machine, position));
     match ring {
         RingState::Closed => Step::Ring(text),
-        RingState::Broken { .. } | RingState::Silent => Step::Warning(text),
+        RingState::Broken { .. } | RingState::Silent | RingState::OneDirection => {
+            Step::Warning(text)
+        }
     }
 }
 

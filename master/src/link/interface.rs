@@ -60,6 +60,8 @@ pub enum NicWarning {
     Addresses { nic: String, addresses: Vec<IpAddr> },
     /// The interface is part of a bridge, bond or team.
     Member { nic: String, of: String },
+    /// One end of a ring of SubDevices has no link.
+    NoLink { nic: String },
     /// A plain socket replaces the ring.
     NoRing { nic: String, reason: String },
 }
@@ -80,6 +82,10 @@ impl fmt::Display for NicWarning {
                 f,
                 "the interface `{nic}` is part of `{of}`: what that forwards comes among the frames"
             ),
+            Self::NoLink { nic } => write!(
+                f,
+                "the interface `{nic}` has no link: the ring is open at this end"
+            ),
             Self::NoRing { nic, reason } => write!(
                 f,
                 "no receive ring on `{nic}` ({reason}): a plain socket is used, which costs a system call a look"
@@ -95,13 +101,16 @@ impl fmt::Display for NicWarning {
 /// # Errors
 /// The first unmet requirement.
 pub fn check(nic: &str) -> Result<i32, OpenError> {
-    let Some(index) = packet::interface_index(nic) else {
-        return Err(OpenError::NoSuchInterface {
-            nic: nic.to_owned(),
-        });
-    };
+    let index = index(nic)?;
     SysfsNic::of(Path::new(SYS), nic).check()?;
     Ok(index)
+}
+
+pub(super) fn index(nic: &str) -> Result<i32, OpenError> {
+    let missing = || OpenError::NoSuchInterface {
+        nic: nic.to_owned(),
+    };
+    packet::interface_index(nic).ok_or_else(missing)
 }
 
 /// Returns warnings about a usable interface.

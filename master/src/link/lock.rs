@@ -142,11 +142,28 @@ pub fn open_exclusive(
     nic: &str,
     back_end: SocketKind,
 ) -> Result<(Box<dyn Link>, Vec<NicWarning>), OpenError> {
+    locked(nic, || super::open(nic, back_end))
+}
+
+/// Like [`open_exclusive`], for one end of a ring ([`super::open_end`]).
+///
+/// # Errors
+/// As [`open_exclusive`].
+pub fn open_end_exclusive(
+    nic: &str,
+    back_end: SocketKind,
+) -> Result<(Box<dyn Link>, Vec<NicWarning>), OpenError> {
+    locked(nic, || super::open_end(nic, back_end))
+}
+
+type Opened = Result<(Box<dyn Link>, Vec<NicWarning>), OpenError>;
+
+fn locked(nic: &str, open: impl FnOnce() -> Opened) -> Opened {
     let claim = NicLock::take(nic).map_err(|NicInUse { pid }| OpenError::Taken {
         nic: nic.to_owned(),
         pid,
     })?;
-    let (link, concerns) = super::open(nic, back_end)?;
+    let (link, concerns) = open()?;
     let claimed = LockedLink {
         link,
         _claim: claim,

@@ -35,7 +35,7 @@ pub use crate::clock::Nanos;
 pub use filter::LinkStats;
 pub use frame_queue::FrameQueue;
 pub use interface::{NicWarning, OpenError};
-pub use lock::open_exclusive;
+pub use lock::{open_end_exclusive, open_exclusive};
 use nic::NicLink;
 pub use socket_kind::SocketKind;
 
@@ -100,10 +100,37 @@ pub fn open(
     nic: &str,
     back_end: SocketKind,
 ) -> Result<(Box<dyn Link>, Vec<NicWarning>), OpenError> {
+    open_with(nic, back_end, NicLink::open)
+}
+
+/// Like [`open`], for one end of a ring: an interface without a link is a warning.
+///
+/// # Errors
+/// As [`open`].
+pub fn open_end(
+    nic: &str,
+    back_end: SocketKind,
+) -> Result<(Box<dyn Link>, Vec<NicWarning>), OpenError> {
+    match interface::check(nic) {
+        Err(OpenError::NoCarrier { .. } | OpenError::Down { .. }) => {
+            let (link, mut concerns) = open_with(nic, back_end, NicLink::open_unchecked)?;
+            let nic = nic.to_owned();
+            concerns.push(NicWarning::NoLink { nic });
+            Ok((link, concerns))
+        }
+        _ => open(nic, back_end),
+    }
+}
+
+fn open_with(
+    nic: &str,
+    back_end: SocketKind,
+    open: impl Fn(&str, SocketKind) -> Result<NicLink, OpenError>,
+) -> Result<(Box<dyn Link>, Vec<NicWarning>), OpenError> {
     let mut concerns = interface::concerns(nic);
-    let link = NicLink::open(nic, back_end).or_else(|error| match error {
+    let link = open(nic, back_end).or_else(|error| match error {
         OpenError::NoRing { nic, source } => {
-            let link = NicLink::open(&nic, SocketKind::Packet);
+            let link = open(&nic, SocketKind::Packet);
             let reason = source.to_string();
             concerns.push(NicWarning::NoRing { nic, reason });
             link

@@ -36,7 +36,16 @@ impl NicLink {
     /// # Errors
     /// [`OpenError::NoRing`] if the kernel provides no ring; [`SocketKind::Packet`] may still work.
     pub fn open(nic: &str, kind: SocketKind) -> Result<Self, OpenError> {
-        let index = interface::check(nic)?;
+        interface::check(nic)?;
+        Self::open_unchecked(nic, kind)
+    }
+
+    /// Like [`NicLink::open`], also without a link to a device. Blocks and allocates.
+    ///
+    /// # Errors
+    /// As [`NicLink::open`].
+    pub(super) fn open_unchecked(nic: &str, kind: SocketKind) -> Result<Self, OpenError> {
+        let index = interface::index(nic)?;
         let socket = interface::socket(nic)?;
         let ring = match kind {
             SocketKind::Ring => {

@@ -101,12 +101,19 @@ pub(super) const MARK: u8 = 0x80;
 const PROCESSED_AT: usize = 6;
 /// The last byte of the source address of the cycle's frames. All others are repeated if lost.
 const CYCLIC: u8 = 0x20;
-/// A copy that has been missing so often in a row has no way back.
-const MAX_MISSED: u32 = 8;
+/// A copy that has been missing so often in a row has no way back. Fewer than the attempts of
+/// `enumerate::count`.
+const MAX_MISSED: u32 = 4;
+/// A later copy in ns is dropped: ethercrab uses its indices again.
+const MAX_AGE: Nanos = 20_000_000;
+/// The frames taken in one call; other traffic must not hold the cycle.
+const FRAMES_AT_ONCE: usize = 32;
 
 /// A frame that was sent, and what has come back of it.
 #[derive(Debug)]
 struct Slot {
+    /// The length of the frame that was given, and with a broadcast of our own ([`add_broadcast`]).
+    given: usize,
     len: usize,
     sent: [u8; MAX_FRAME],
     /// The answer so far: the sent frame with the changes of each copy.
@@ -114,7 +121,7 @@ struct Slot {
     sent_at: Nanos,
     /// The path of each copy that has arrived.
     copies: [Option<CopyPath>; 2],
-    /// True once the answer with the work of all devices was delivered.
+    /// True once the answer was delivered that no later copy makes more complete.
     complete: bool,
 }
 
@@ -131,11 +138,10 @@ pub struct RedundantLink {
     copy_timeout: Nanos,
     /// How often each copy has been missing in a row.
     missed: [u32; 2],
-    /// The devices that have processed either copy of the last frame.
+    /// How many devices have met the last frame of which both copies came back.
     all_devices: u16,
     status: &'static RingStatus,
     scratch: Box<[u8; MAX_FRAME]>,
-    spare: Box<[u8; MAX_FRAME]>,
 }
 
 impl RedundantLink {
@@ -145,6 +151,7 @@ impl RedundantLink {
     #[must_use]
     pub fn new(ends: Box<dyn RingEnds>, copy_timeout: Nanos) -> Self {
         let slot = || Slot {
+            given: 0,
             len: 0,
             sent: [0; MAX_FRAME],
             answer: [0; MAX_FRAME],
@@ -162,21 +169,20 @@ impl RedundantLink {
             all_devices: 0,
             status: Box::leak(Box::default()),
             scratch: Box::new([0; MAX_FRAME]),
-            spare: Box::new([0; MAX_FRAME]),
         }
     }
 
-    /// Takes what both interfaces have received. Returns the slot of an answer that is complete.
+    /// Takes what both interfaces have received. Returns the slot of an answer to deliver.
     fn collect(&mut self) -> Result<Option<usize>, LinkError> {
         let mut failures = 0;
         for at in End::BOTH {
-            loop {
+            for _ in 0..FRAMES_AT_ONCE {
                 let interface = at.swapped(self.status.swapped());
                 match self.ends.recv(interface, &mut self.scratch) {
                     Ok(Some(len)) => {
-                        let complete = self.take(at, len);
-                        if complete.is_some() {
-                            return Ok(complete);
+                        let ready = self.take(at, len);
+                        if ready.is_some() {
+                            return Ok(ready);
                         }
                     }
                     Ok(None) => break,
@@ -195,52 +201,63 @@ impl RedundantLink {
     }
 
     /// Adds a copy to its answer. Returns its slot if the answer is complete, or more complete than
-    /// one that was delivered.
+    /// one that was delivered late.
     fn take(&mut self, at: End, len: usize) -> Option<usize> {
+        let now = clock::now();
         let copy = self.scratch.get_mut(..len)?;
         let from = match copy.get(MARK_AT)? & MARK {
             0 => End::First,
             _ => End::Second,
         };
         copy[MARK_AT] &= !MARK;
-        let mut newest_first = (0..self.next)
-            .rev()
-            .take(SLOTS)
-            .map(|number| number % SLOTS);
-        let index = newest_first.find(|index| self.slots[*index].sent_as(copy))?;
+        let slots = &self.slots;
+        let mut newest_first = (0..self.next).rev().take(SLOTS).map(|n| n % SLOTS);
+        let index = newest_first.find(|index| slots[*index].sent_as(copy))?;
         let slot = &mut self.slots[index];
-        let own = &mut slot.copies[from as usize];
-        if own.is_some() {
+        let own = from as usize;
+        if slot.copies[own].is_some() || now > slot.sent_at.saturating_add(MAX_AGE) {
             return None;
         }
         let len = slot.len;
-        let answer = match slot.complete {
-            // A broken ring may have just been closed: the devices have processed both copies.
-            true => &mut self.spare[..len],
-            false => &mut slot.answer[..len],
-        };
-        let devices = merge(&slot.sent[..len], copy, answer);
         let returned = at == from;
-        let path = CopyPath { returned, devices };
-        *own = Some(path);
-        self.missed[from as usize] = 0;
+        let other = slot.copies[1 - own];
+        // A ring that closes under a frame: the copy that crosses has met all devices, and some of
+        // them have processed the one that returns as well.
+        let twice = match from {
+            End::First => !returned && other.is_some_and(|other| other.returned),
+            End::Second => returned && other.is_some_and(|other| !other.returned),
+        };
+        if twice && from == End::First {
+            let (sent, answer) = (&slot.sent[..len], &mut slot.answer[..len]);
+            answer.copy_from_slice(sent);
+        }
+        let devices = match twice && from == End::Second {
+            true => None,
+            false => merge(&slot.sent[..len], copy, &mut slot.answer[..len]),
+        };
+        slot.copies[own] = Some(CopyPath { returned, devices });
+        self.missed[own] = 0;
         if let Some(devices) = devices {
             self.status.set(from, Some((returned, devices)));
         }
-        let both = slot.copies.iter().all(Option::is_some);
-        if let [Some(first), Some(second)] = slot.copies.map(|copy| copy?.devices) {
-            self.all_devices = first.wrapping_add(second);
-            let crossed = slot.copies.iter().flatten().all(|copy| !copy.returned);
-            if crossed && first == 0 && second > 0 {
-                // All devices process the copy that enters at the first device.
-                self.status.swap();
-            }
+        let crossed = |copy: &Option<CopyPath>| copy.is_some_and(|copy| !copy.returned);
+        if slot.copies.iter().all(crossed)
+            && let [Some(0), Some(1..)] = slot.copies.map(|copy| copy?.devices)
+        {
+            // All devices process the copy that enters at the first device.
+            self.status.swap();
         }
-        // Without a broadcast, the last copy on the same path shows how many have processed it.
-        let processed = devices.or_else(|| self.status.devices(from, returned));
-        let all = processed.is_some_and(|count| count > 0 && count == self.all_devices);
+        if let [Some(first), Some(second)] = slot.copies.map(|copy| copy?.devices) {
+            self.all_devices = first.saturating_add(second);
+        }
+        let both = other.is_some();
+        // A copy that crosses without any device shows that the other one can cross as well.
+        let idle = !returned && devices.is_none_or(|devices| devices == 0);
+        let alone = self.missed[1 - own] >= MAX_MISSED && !idle;
+        // In a closed ring, the copy of the second interface carries nothing.
+        let whole = from == End::First && !returned && self.status.second_is_idle();
         let before = slot.complete;
-        slot.complete |= both || all;
+        slot.complete |= both || alone || whole || twice;
         (slot.complete && !before).then_some(index)
     }
 
@@ -257,17 +274,12 @@ impl RedundantLink {
                 let count = &mut self.missed[from as usize];
                 if copy.is_none() {
                     *count = count.saturating_add(1);
-                }
-                if *count == MAX_MISSED {
-                    self.status.set(from, None);
-                    // All that still answer have processed the other copy.
-                    let other = 1 - from as usize;
-                    self.all_devices = slot.copies[other]
-                        .and_then(|copy| copy.devices)
-                        .unwrap_or(self.all_devices);
+                    if *count >= MAX_MISSED {
+                        self.status.set(from, None);
+                    }
                 }
             }
-            if !slot.complete && slot.is_useful() {
+            if !slot.complete && slot.is_useful(self.all_devices) {
                 return Some(index);
             }
         }
@@ -276,51 +288,82 @@ impl RedundantLink {
 
     fn deliver(&self, index: usize, buf: &mut [u8; MAX_FRAME]) -> usize {
         let slot = &self.slots[index];
-        buf[..slot.len].copy_from_slice(&slot.answer[..slot.len]);
-        slot.len
+        let frame = &mut buf[..slot.given];
+        frame.copy_from_slice(&slot.answer[..slot.given]);
+        if slot.len > slot.given {
+            set_end(frame);
+        }
+        slot.given
     }
 }
 
 impl Slot {
-    /// True if a frame is an answer to this one.
+    /// True if a frame is an answer to this one: the same datagrams, but for addresses that count
+    /// devices, and for datagrams that were taken out.
     fn sent_as(&self, frame: &[u8]) -> bool {
-        const INDEX: usize = FRAME_HEADER + 1;
-        self.len > INDEX
-            && frame.len() >= self.len
-            && frame[SOURCE_END] == self.sent[SOURCE_END]
-            && frame[FRAME_HEADER - 2..FRAME_HEADER] == self.sent[FRAME_HEADER - 2..FRAME_HEADER]
-            && frame[INDEX] == self.sent[INDEX]
+        let same = |range: std::ops::Range<usize>| frame.get(range.clone()) == self.sent.get(range);
+        if self.len <= FRAME_HEADER
+            || frame.len() < self.len
+            || !same(SOURCE_END)
+            || !same(FRAME_HEADER - 2..FRAME_HEADER)
+        {
+            return false;
+        }
+        datagrams(&self.sent[..self.len]).all(|datagram| {
+            let at = datagram.start;
+            let command = datagram.header.command;
+            let counts = command.is_positional();
+            let taken_out = counts && frame[at] == NOP;
+            let address = if counts { at + 4 } else { at + 2 };
+            (frame[at] == command.0 || taken_out)
+                && same(at + 1..at + 2)
+                && same(address..at + 7)
+                && (frame[at + 7] ^ self.sent[at + 7]) & 0x87 == 0
+        })
     }
 
-    /// True if one copy is an answer: some device has processed it. A frame outside the cycle is
-    /// better lost than incomplete, because it is repeated.
-    fn is_useful(&self) -> bool {
+    /// True if one copy is worth an answer. The cycle takes what some device has processed. All other
+    /// frames are repeated if they are lost, so each of their datagrams must have met its device.
+    /// Broadcasts must meet `all` devices.
+    fn is_useful(&self, all: u16) -> bool {
         let cyclic = self.sent[SOURCE_END.end - 1] == CYCLIC;
         let mut copies = self.copies.iter().flatten();
-        cyclic && copies.any(|copy| copy.returned || copy.devices.is_some_and(|count| count > 0))
+        if cyclic {
+            let met = |copy: &CopyPath| copy.returned || copy.devices.is_some_and(|n| n > 0);
+            return copies.any(met);
+        }
+        let answer = &self.answer[..self.given];
+        let met = copies.filter_map(|copy| copy.devices).sum::<u16>() == all;
+        datagrams(answer).all(|datagram| {
+            let counter = &answer[datagram.data.end..datagram.data.end + WORKING_COUNTER];
+            let broadcast = is_broadcast(datagram.header.command);
+            counter != [0; WORKING_COUNTER] && (met || !broadcast)
+        })
     }
 }
 
 impl Link for RedundantLink {
     fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
+        if frame.len() > MAX_FRAME {
+            return Err(LinkError::TooLong(frame.len()));
+        }
         let index = self.next % SLOTS;
         self.next += 1;
         self.oldest = self.oldest.max(self.next.saturating_sub(SLOTS));
         let before = self.status.before();
         let slot = &mut self.slots[index];
-        let place = slot.sent.get_mut(..frame.len());
-        let place = place.ok_or(LinkError::TooLong(frame.len()))?;
-        place.copy_from_slice(frame);
-        slot.answer[..frame.len()].copy_from_slice(frame);
-        slot.len = frame.len();
+        slot.sent[..frame.len()].copy_from_slice(frame);
+        slot.given = frame.len();
+        slot.len = add_broadcast(&mut slot.sent, frame.len());
+        slot.answer[..slot.len].copy_from_slice(&slot.sent[..slot.len]);
         slot.sent_at = clock::now();
         slot.copies = [None; 2];
         slot.complete = false;
         let mut sent = Ok(());
         let mut failures = 0;
         for from in End::BOTH {
-            let copy = &mut self.scratch[..frame.len()];
-            copy.copy_from_slice(frame);
+            let copy = &mut self.scratch[..slot.len];
+            copy.copy_from_slice(&slot.sent[..slot.len]);
             address(copy, from, before);
             // An interface without a cable may refuse the frame; the other one carries on.
             let interface = from.swapped(self.status.swapped());
@@ -363,6 +406,13 @@ impl Link for RedundantLink {
     }
 }
 
+/// The command of a datagram that no device processes.
+const NOP: u8 = 0;
+
+const fn is_broadcast(command: Command) -> bool {
+    matches!(command, Command::BRD | Command::BWR | Command::BRW)
+}
+
 /// A datagram in a frame.
 struct Datagram {
     header: Header,
@@ -387,10 +437,53 @@ fn datagrams(frame: &[u8]) -> impl Iterator<Item = Datagram> {
     })
 }
 
+/// Adds a broadcast read to a frame that has none and has room: it shows how many devices a copy has
+/// met. Returns the length of the frame.
+fn add_broadcast(frame: &mut [u8; MAX_FRAME], len: usize) -> usize {
+    const DATA: usize = 1;
+    const ADDED: usize = HEADER + DATA + WORKING_COUNTER;
+    let known = datagrams(&frame[..len]).any(|datagram| is_broadcast(datagram.header.command));
+    let Some(last) = datagrams(&frame[..len]).last() else {
+        return len;
+    };
+    // Padding, or a frame that is cut: its datagrams do not end where it ends.
+    let whole = last.data.end + WORKING_COUNTER == len && !last.header.more;
+    if known || !whole || len + ADDED > MAX_FRAME {
+        return len;
+    }
+    let header = Header {
+        command: Command::BRD,
+        index: last.header.index,
+        address: 0,
+        len: DATA as u16,
+        more: false,
+    };
+    frame[last.start + 7] |= 0x80;
+    let added = &mut frame[len..len + ADDED];
+    added.fill(0);
+    added[..HEADER].copy_from_slice(&header.emit());
+    set_length(&mut frame[..len + ADDED]);
+    len + ADDED
+}
+
+/// Ends a frame with its last whole datagram.
+fn set_end(frame: &mut [u8]) {
+    if let Some(last) = datagrams(frame).last() {
+        frame[last.start + 7] &= !0x80;
+    }
+    set_length(frame);
+}
+
+/// Writes the length of the datagrams to the EtherCAT header.
+fn set_length(frame: &mut [u8]) {
+    let [low, high] = ((frame.len() - FRAME_HEADER) as u16).to_le_bytes();
+    frame[FRAME_HEADER - 2] = low;
+    frame[FRAME_HEADER - 1] = frame[FRAME_HEADER - 1] & 0xf0 | high & 0x07;
+}
+
 /// Prepares the copy of an interface; the first one's passes `before` devices. Positions count from the begin of each line, so a datagram to
 /// a position is addressed in one copy only. ARMW then writes to one line only; nothing here uses it.
 fn address(copy: &mut [u8], from: End, before: u16) {
-    const NOP: u8 = 0;
     if from == End::Second {
         copy[MARK_AT] |= MARK;
     }
@@ -432,7 +525,7 @@ fn merge(sent: &[u8], copy: &[u8], answer: &mut [u8]) -> Option<u16> {
     answer[PROCESSED_AT] |= copy[PROCESSED_AT] & 0x02;
     for datagram in datagrams(sent) {
         let command = datagram.header.command;
-        let broadcast = matches!(command, Command::BRD | Command::BWR | Command::BRW);
+        let broadcast = is_broadcast(command);
         let word = |frame: &[u8], at: usize| u16::from_le_bytes([frame[at], frame[at + 1]]);
         let mut add = |at: usize, more: u16| {
             let sum = word(answer, at).wrapping_add(more);

@@ -8,6 +8,7 @@ use std::collections::VecDeque;
 use std::fmt;
 use std::io::{self, Read};
 
+use super::redundant::RingStatus;
 use super::{Link, LinkError, MAX_FRAME, Nanos};
 use crate::clock;
 use crate::recording::frame::{Content, Frame, content};
@@ -107,9 +108,19 @@ pub struct Replay {
     too_long: bool,
     /// A frame was sent after the last recorded one.
     beyond: bool,
+    ring: Option<&'static RingStatus>,
 }
 
 impl Replay {
+    /// Sets that the recording is of a ring. A recording has each frame once, as of a closed ring.
+    #[must_use]
+    pub fn in_ring(self) -> Self {
+        Self {
+            ring: Some(RingStatus::closed()),
+            ..self
+        }
+    }
+
     /// Reads a recording that contains both directions.
     ///
     /// # Errors
@@ -166,6 +177,7 @@ impl Replay {
             more: 0,
             too_long: false,
             beyond: false,
+            ring: None,
         })
     }
 
@@ -295,6 +307,10 @@ impl Link for Replay {
             self.report_divergence(deviation);
         }
         Ok(())
+    }
+
+    fn ring(&self) -> Option<&'static RingStatus> {
+        self.ring
     }
 
     fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {

@@ -39,12 +39,19 @@ pub fn link(
         (Some(path), _) => {
             let failed = |error| Cause::Replay(format!("{}: {error}", path.display()));
             let reader = recording::open(path).map_err(failed)?;
-            Box::new(Replay::new(reader).map_err(failed)?)
+            let replay = Replay::new(reader).map_err(failed)?;
+            Box::new(match machine.bus.redundant {
+                None => replay,
+                Some(_) => replay.in_ring(),
+            })
         }
         (None, Nic::Sim) => simulated_link(machine, options.seed, options.faults.as_ref())?,
         (None, Nic::Interface(nic)) => {
             let mut open = |nic: &String| -> Result<Box<dyn Link>, Error> {
-                let (mut link, concerns) = link::open_exclusive(nic, machine.bus.link)?;
+                let (mut link, concerns) = match machine.bus.redundant {
+                    None => link::open_exclusive(nic, machine.bus.link)?,
+                    Some(_) => link::open_end_exclusive(nic, machine.bus.link)?,
+                };
                 let opened = Instant::now();
                 // Meanwhile; `become_realtime` repeats it and reports what is denied.
                 let _ = rt_thread::lock_memory();

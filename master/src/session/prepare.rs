@@ -158,6 +158,7 @@ impl RunBuilder<'_> {
                     phase: bus.dc.as_ref().map(Phase::new),
                     end: rt_end,
                 };
+                let ring = RingWatch::new(bus.ring, bus.ring_breaks);
                 let supervisor = Supervisor {
                     machine: Arc::clone(machine),
                     bus,
@@ -186,7 +187,7 @@ impl RunBuilder<'_> {
                     bus_status,
                     clock_tree: None,
                     returns: None,
-                    ring: RingWatch::default(),
+                    ring,
                     device_log: DeviceLog::default(),
                 };
                 Ok(Prepared { parts, supervisor })

@@ -48,7 +48,7 @@ impl Supervisor {
         let devices = self.bus.devices.iter();
         let tree = ClockTree {
             open: devices.map(|device| open_ports(device.dl_status)).collect(),
-            split: self.wire.ring().and_then(RingState::split),
+            split: self.bus.ring.and_then(RingState::split),
             reference: None,
         };
         let changes = self.bus.dc.as_ref().map(|_| {
@@ -166,9 +166,12 @@ impl Delays {
                 let station = |device| self.clocks.get(device).map_or(0, |(station, _)| *station);
                 let stations = ring.iter().map(|(device, _)| station(*device)).collect();
                 let closed: Vec<_> = ring.iter().map(|(_, delay)| *delay).collect();
-                let now = match wire.ring().and_then(RingState::split) {
-                    Some(first) => delays::split(&closed, usize::from(first)),
-                    None => closed,
+                let now = match wire.ring() {
+                    Some(RingState::Broken { behind, devices }) => {
+                        let missing = closed.len().saturating_sub(usize::from(devices));
+                        delays::split(&closed, usize::from(behind) + missing)
+                    }
+                    _ => closed,
                 };
                 (stations, now)
             }

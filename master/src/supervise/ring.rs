@@ -4,20 +4,35 @@ use super::Supervisor;
 use crate::clock::{self, Nanos};
 use crate::link::redundant::RingState;
 use crate::report::Progress;
+use crate::text::pluralize;
 
 /// A plug bounces: a state that rests for this time, in ns, is reported.
 const SETTLING_TIME: Nanos = 20_000_000;
+
+/// The period in ns in which short breaks are counted.
+const COUNT_PERIOD: Nanos = 1_000_000_000;
 
 /// The state of the ring that was reported last, and a later one with the time of its begin.
 #[derive(Debug, Default)]
 pub(crate) struct RingWatch {
     reported: Option<RingState>,
     next: Option<(RingState, Nanos)>,
+    /// The breaks that were counted up to the last report, and when they are counted again.
+    breaks: u32,
+    count_at: Nanos,
 }
 
 impl RingWatch {
-    /// Returns a state that has rested for [`SETTLING_TIME`] and is another one than the last. The
-    /// first state is known from the bring-up.
+    /// `state`: that of the bring-up, as it was reported, and the breaks until then.
+    pub(crate) fn new(state: Option<RingState>, breaks: u32) -> Self {
+        Self {
+            reported: state,
+            breaks,
+            ..Self::default()
+        }
+    }
+
+    /// Returns a state that has rested for [`SETTLING_TIME`] and is another one than the last.
     fn changed(&mut self, state: RingState, now: Nanos) -> Option<RingState> {
         let reported = *self.reported.get_or_insert(state);
         if state == reported {
@@ -37,6 +52,19 @@ impl RingWatch {
             }
         }
     }
+
+    /// Returns the number of breaks in the last second that were too short for a report.
+    fn short_breaks(&mut self, breaks: u32, reported: bool, now: Nanos) -> Option<u32> {
+        if reported {
+            self.breaks = breaks;
+        }
+        if now < self.count_at || self.next.is_some() {
+            return None;
+        }
+        self.count_at = now.saturating_add(COUNT_PERIOD);
+        let more = breaks.wrapping_sub(std::mem::replace(&mut self.breaks, breaks));
+        (more > 0).then_some(more)
+    }
 }
 
 impl Supervisor {
@@ -44,13 +72,27 @@ impl Supervisor {
         let Some(state) = self.wire.ring() else {
             return;
         };
-        let Some(state) = self.ring.changed(state, clock::now()) else {
-            return;
-        };
+        let now = clock::now();
+        let changed = self.ring.changed(state, now);
+        let (breaks, place) = self.wire.breaks();
+        let short = self.ring.short_breaks(breaks, changed.is_some(), now);
         let name = |position| {
             let devices = &mut self.bus.devices.iter();
             let device = devices.find(|device| device.at.position == position);
             device.map_or_else(|| format!("device {position}"), |d| d.at.name.clone())
+        };
+        if let Some(count) = short {
+            let behind = match place.checked_sub(1) {
+                Some(before) => format!("behind `{}`", name(before)),
+                None => "in front of the first device".to_owned(),
+            };
+            let times = pluralize(count as usize, "time");
+            self.report(Progress::Warning(format!(
+                "the ring was broken for short {times}, last {behind}: look for a loose plug or a damaged cable"
+            )));
+        }
+        let Some(state) = changed else {
+            return;
         };
         let text = state.text(self.bus.devices.len(), name);
         let broken = state != RingState::Closed;
@@ -82,6 +124,10 @@ mod tests {
             (50, RingState::Closed, Some(RingState::Closed)),
             (90, RingState::Closed, None),
         ];
+        assert_eq!(watch.short_breaks(1, true, 0), None);
+        assert_eq!(watch.short_breaks(3, false, 1_000 * ms), Some(2));
+        assert_eq!(watch.short_breaks(4, false, 1_001 * ms), None);
+        assert_eq!(watch.short_breaks(4, false, 2_001 * ms), Some(1));
         for (at, state, expected) in table {
             assert_eq!(watch.changed(state, at * ms), expected, "{at} ms");
         }

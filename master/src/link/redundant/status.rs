@@ -19,6 +19,8 @@ pub enum RingState {
     /// No frame has come back yet, or none does any longer.
     Silent,
     Closed,
+    /// Frames cross the ring in one direction only.
+    OneDirection,
     /// The ring is broken behind as many devices, of `devices` that answer.
     Broken {
         behind: u16,
@@ -32,7 +34,7 @@ impl RingState {
     pub const fn split(self) -> Option<u16> {
         match self {
             Self::Broken { behind, .. } => Some(behind),
-            Self::Silent | Self::Closed => None,
+            Self::Silent | Self::Closed | Self::OneDirection => None,
         }
     }
 
@@ -42,6 +44,11 @@ impl RingState {
     pub fn text(self, all: usize, name: impl Fn(u16) -> String) -> String {
         match self {
             Self::Silent => "no frame comes back to either end of the ring".to_owned(),
+            Self::OneDirection => {
+                "frames cross the ring in one direction only: a cable or an interface is damaged, \
+                 and the next broken cable may stop the machine"
+                    .to_owned()
+            }
             Self::Closed => "the ring is closed: a single broken cable stops nothing".to_owned(),
             Self::Broken { behind, devices } => {
                 let all = u16::try_from(all).unwrap_or(u16::MAX).max(devices);
@@ -75,41 +82,56 @@ pub struct RingStatus {
     /// Of each interface's copy: [`ARRIVED`], [`RETURNED`] and the number of devices.
     copies: [AtomicU64; 2],
     swapped: AtomicBool,
+    /// The number of breaks and, in the low 16 bits, the place of the last one.
+    breaks: AtomicU64,
 }
 
 const ARRIVED: u64 = 1 << 16;
 const RETURNED: u64 = 1 << 17;
 
 impl RingStatus {
+    /// Returns the status of a closed ring. It lives as long as the process.
+    #[must_use]
+    pub(in crate::link) fn closed() -> &'static Self {
+        let status = Self::default();
+        for copy in &status.copies {
+            copy.store(ARRIVED, Relaxed);
+        }
+        Box::leak(Box::new(status))
+    }
+
     /// Sets whether the copy of an interface came back to it and how many devices have processed it;
     /// `None` if it does not arrive.
     pub(super) fn set(&self, from: End, path: Option<(bool, u16)>) {
         let word = path.map_or(0, |(returned, devices)| {
             ARRIVED | if returned { RETURNED } else { 0 } | u64::from(devices)
         });
-        self.copies[from as usize].store(word, Relaxed);
+        let before = self.copies[from as usize].swap(word, Relaxed);
+        if from == End::First && before & (ARRIVED | RETURNED) == ARRIVED && word != before {
+            let (count, _) = self.breaks();
+            let place = word & 0xffff;
+            self.breaks
+                .store(u64::from(count.wrapping_add(1)) << 16 | place, Relaxed);
+        }
     }
 
-    /// Returns how many devices have processed the last copy of an interface with a broadcast, if it
-    /// took the same path.
-    pub(super) fn devices(&self, from: End, returned: bool) -> Option<u16> {
-        let word = self.copies[from as usize].load(Relaxed);
-        let same = word & ARRIVED != 0 && (word & RETURNED != 0) == returned;
-        same.then_some((word & 0xffff) as u16)
+    /// True if the last copy of the second interface has crossed the ring without any device.
+    pub(super) fn second_is_idle(&self) -> bool {
+        self.copies[1].load(Relaxed) == ARRIVED
     }
 
     /// Returns how many devices the copy of the first interface passes; the maximum if that is unknown.
     pub(super) fn before(&self) -> u16 {
+        let first = self.copies[0].load(Relaxed);
         match self.get() {
-            RingState::Silent => u16::MAX,
-            RingState::Closed | RingState::Broken { .. } => {
-                (self.copies[0].load(Relaxed) & 0xffff) as u16
-            }
+            RingState::Broken { behind, .. } => behind,
+            RingState::Closed => (first & 0xffff) as u16,
+            RingState::Silent | RingState::OneDirection => u16::MAX,
         }
     }
 
     /// Exchanges the interfaces: the first one is that at the IN port of the first device.
-    pub(super) fn swap(&self) {
+    pub(crate) fn swap(&self) {
         self.swapped.fetch_xor(true, Relaxed);
         for copy in &self.copies {
             copy.store(0, Relaxed);
@@ -125,19 +147,34 @@ impl RingStatus {
     #[must_use]
     pub fn get(&self) -> RingState {
         let [first, second] = [&self.copies[0], &self.copies[1]].map(|copy| copy.load(Relaxed));
+        let arrived = |word: u64| word & ARRIVED != 0;
+        let crossed = |word: u64| arrived(word) && word & RETURNED == 0;
         let devices = |word: u64| (word & 0xffff) as u16;
-        if first & ARRIVED != 0 && first & RETURNED == 0
-            || second & ARRIVED != 0 && second & RETURNED == 0
-        {
-            RingState::Closed
-        } else if (first | second) & ARRIVED == 0 {
-            RingState::Silent
-        } else {
+        match (crossed(first), crossed(second)) {
+            (true, true) => RingState::Closed,
+            (false, false) if !arrived(first) && !arrived(second) => RingState::Silent,
             // The copy that does not arrive has met no device.
-            RingState::Broken {
+            (false, false) => RingState::Broken {
                 behind: devices(first),
                 devices: devices(first).saturating_add(devices(second)),
-            }
+            },
+            // The copy of the other interface has not arrived since the break.
+            (true, false) if arrived(second) => RingState::Broken {
+                behind: devices(first).saturating_sub(devices(second)),
+                devices: devices(first),
+            },
+            (false, true) if arrived(first) => RingState::Broken {
+                behind: devices(first),
+                devices: devices(first),
+            },
+            _ => RingState::OneDirection,
         }
+    }
+
+    /// Returns how often the ring was broken, and behind how many devices it was the last time.
+    #[must_use]
+    pub fn breaks(&self) -> (u32, u16) {
+        let word = self.breaks.load(Relaxed);
+        ((word >> 16) as u32, (word & 0xffff) as u16)
     }
 }

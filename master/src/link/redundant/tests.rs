@@ -209,7 +209,7 @@ impl RingEnds for Queues {
     }
 }
 
-const COPY_TIMEOUT: Nanos = 1_000_000_000;
+const COPY_TIMEOUT: Nanos = 1_000_000;
 
 fn ring() -> (RedundantLink, Queues) {
     let queues = Queues::default();
@@ -225,6 +225,8 @@ enum Way {
     /// A ring that is closed; broken behind as many devices; whose first or second cable is out.
     Closed,
     Broken(u16),
+    /// The ring was broken behind as many devices for the second copy, and is closed for the first.
+    Closes(u16),
     /// The copy of an interface is lost on the way.
     Lost(End),
 }
@@ -239,7 +241,10 @@ impl RedundantLink {
             let mut copy = queues.sent(from);
             let (at, devices) = match (way, from) {
                 (Way::Lost(lost), _) if lost == from => continue,
-                (Way::Closed | Way::Lost(_), End::First) => (End::Second, 0..DEVICES),
+                (Way::Closes(behind), End::Second) => (End::Second, behind..DEVICES),
+                (Way::Closed | Way::Closes(_) | Way::Lost(_), End::First) => {
+                    (End::Second, 0..DEVICES)
+                }
                 (Way::Closed | Way::Lost(_), End::Second) => (End::First, 0..0),
                 (Way::Broken(0), End::First) | (Way::Broken(DEVICES), End::Second) => continue,
                 (Way::Broken(behind), End::First) => (End::First, 0..behind),
@@ -280,9 +285,8 @@ fn ring_recognises_breaks_and_repairs_by_the_paths_of_the_copies() {
             (Way::Broken(2), all, broken(2)),
             (Way::Broken(2), all, broken(2)),
             (Way::Broken(5), all, broken(5)),
-            (Way::Closed, all, closed),
-            // Its own cable is missed after some frames; nothing is lost meanwhile.
-            (Way::Broken(DEVICES), all, closed),
+            // A frame is on its way while the ring closes: some devices process both copies.
+            (Way::Closes(3), all, broken(5)),
             (Way::Closed, all, closed),
         ];
         for (index, (way, counted, state)) in (0..).zip(table) {
@@ -322,4 +326,46 @@ fn positions_are_asked_on_the_side_of_their_device() {
             assert_eq!((copy[16], position), expected, "{before} {from:?}");
         }
     }
+}
+
+/// ethercrab uses its 256 indices again and again: a late copy belongs to no other datagram.
+#[test]
+fn late_copy_of_another_datagram_is_not_merged() {
+    let run = || {
+        Clock::Virtual.enter();
+        let (mut link, queues) = ring();
+        let read = |station: u16| frame(7, &[(Command::FPRD, station, vec![0; 2])]);
+        link.send(&read(STATION + 1)).expect("sent");
+        let late = queues.sent(End::First);
+        link.send(&read(STATION + 4)).expect("sent");
+        let mut late = late;
+        process(&mut late, 0..DEVICES);
+        queues.arrive(End::Second, late);
+        let mut buf = [0; MAX_FRAME];
+        while link.recv(&mut buf).expect("received").is_some() {
+            assert_eq!(buf[18..20], (STATION + 1).to_le_bytes());
+        }
+        assert_eq!(link.slots[1].copies, [None; 2]);
+    };
+    std::thread::spawn(run).join().expect("no panic");
+}
+
+/// Frames arrive in one direction only: the processed copies, or the others.
+#[test]
+fn ring_that_carries_one_direction_is_not_reported_as_closed() {
+    let run = || {
+        Clock::Virtual.enter();
+        for (lost, answer) in [(End::Second, Some(DEVICES)), (End::First, None)] {
+            let (mut link, queues) = ring();
+            link.exchange(&queues, 0, Way::Closed);
+            for index in 1..20 {
+                let found = link.exchange(&queues, index, Way::Lost(lost));
+                assert_eq!(found, answer, "frame {index} without {lost:?}");
+                Clock::Virtual.sleep_until(clock::now() + 2 * COPY_TIMEOUT, 0);
+                let _ = link.recv(&mut [0; MAX_FRAME]);
+            }
+            assert_eq!(link.status.get(), RingState::OneDirection);
+        }
+    };
+    std::thread::spawn(run).join().expect("no panic");
 }

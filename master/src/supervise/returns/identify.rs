@@ -159,7 +159,12 @@ impl RunningSegment {
         } = numbers;
         let config = &self.machine.devices[index];
         compare_identity(&self.machine, config, (identity, serial), at)?;
-        if kept && serial != search.serial {
+        // The place of a drive is known by its neighbours only: after an exchange of plugs it is another
+        // drive of the machine.
+        let exchanged = self.devices.enumerate().any(|(other, device)| {
+            other != index && serial != 0 && serial != search.serial && device.serial == serial
+        });
+        if (kept || exchanged) && serial != search.serial {
             let (expected, found) = (search.serial, serial);
             return Err(Cause::Serial { expected, found }.with_device(at));
         }

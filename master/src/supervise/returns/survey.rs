@@ -10,6 +10,7 @@ use super::{RunningSegment, STEP, Search};
 use crate::acyclic::enumerate;
 use crate::acyclic::topology::{ParentPort, in_line, parents};
 use crate::config::Locator;
+use crate::link::redundant::RingState;
 use crate::report::{Cause, DevicePlace, Error};
 
 /// A device that answers.
@@ -39,6 +40,14 @@ impl RunningSegment {
         let stations = words(registers::STATION_ADDRESS).await?;
         let status = words(registers::DL_STATUS).await?.into_iter().zip(0..);
         let ring = self.wire.ring();
+        let after_gap = match ring {
+            Some(RingState::Broken { behind, devices })
+                if usize::from(devices) < self.devices.len() =>
+            {
+                Some(behind)
+            }
+            _ => None,
+        };
         let status = status.map(|(status, at)| in_line(at, status, ring));
         let own: HashMap<_, _> = self
             .devices
@@ -70,6 +79,10 @@ impl RunningSegment {
                 let device = answering.get(usize::from(port.device));
                 (device.and_then(|seen| seen.device), port.port)
             });
+            // Behind a gap of a ring, the first device may be any of those that are missing.
+            if after_gap.is_some_and(|after| position >= after) {
+                continue;
+            }
             // Behind a device that is unknown itself: that one is reported.
             let place = match before {
                 None => None,
