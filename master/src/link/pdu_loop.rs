@@ -98,7 +98,7 @@ pub fn main_device(cycle_ns: Nanos, pre_op: Duration) -> (&'static MainDevice<'s
 }
 
 impl PduLoop {
-    /// Sends at most one frame, with up to [`MAX_JOINED`] of the datagrams that ethercrab has ready.
+    /// Sends at most one frame, with up to 8 of the datagrams that ethercrab has ready.
     /// RT.
     pub fn send_one(&mut self, link: &mut dyn Link) -> Result<(), LinkError> {
         for _ in 0..MAX_JOINED {

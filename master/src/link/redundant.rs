@@ -7,7 +7,7 @@
 //!   second one; the copy of the second interface passes them unprocessed, in the other direction;
 //! - a broken ring is two lines. Each copy returns to its own interface, processed by its line.
 //!
-//! Each SubDevice therefore processes one copy. [`merge`] combines both to the answer of a line. The
+//! Each SubDevice therefore processes one copy. `merge` combines both to the answer of a line. The
 //! rest of the program does not notice which of the two it was.
 
 use ecaxis_ecat::datagram::{Command, HEADER, Header, WORKING_COUNTER};
