@@ -160,8 +160,9 @@ impl ReturnTask {
             for device in found {
                 let search = &mut searches[device];
                 search.attempted = true;
+                let place = search.place.map(|place| place.position);
                 let what = (search.restarted, search.absent);
-                attempts.add(segment.attempt(device, search.since, what));
+                attempts.add(segment.attempt((device, place), search.since, what));
             }
         }
     }

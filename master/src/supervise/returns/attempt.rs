@@ -5,17 +5,18 @@ use std::time::Duration;
 use ecaxis_ecat::index::DeviceIndex;
 
 use super::RunningSegment;
-use crate::acyclic::{AlState, al};
+use crate::acyclic::{AlState, DeviceRef, al};
 use crate::bringup::device_return::{RunningBus, RunningSync, bring_back, reset};
 use crate::bringup::{Step, enable_op_only};
 use crate::clock::{self, Nanos};
 use crate::report::{Error, Progress};
 
 impl RunningSegment {
-    /// Brings a device back that answers at its station address.
+    /// Brings a device back that answers at its station address. `position`: where it was found, if it
+    /// had no address.
     pub(super) async fn attempt(
         &self,
-        index: DeviceIndex,
+        (index, position): (DeviceIndex, Option<u16>),
         since: Option<Nanos>,
         (restarted, first): (bool, bool),
     ) -> (DeviceIndex, Result<(), Error>) {
@@ -26,7 +27,10 @@ impl RunningSegment {
         }
         let since = since.unwrap_or_else(clock::now);
         self.report(Progress::DeviceReturned {
-            device: self.devices[index].at.clone(),
+            device: DeviceRef {
+                position: position.unwrap_or(self.devices[index].at.position),
+                ..self.devices[index].at.clone()
+            },
             after_ns: clock::now().saturating_sub(since),
             restarted,
             first,
