@@ -7,8 +7,10 @@ use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config::{AxisRef, Machine};
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::rt::controller::{Controller, CycleContext};
-use ecaxis_master::session::{Attachments, Options, Progress, run_attached, simulated_bus};
-use ecaxis_test_support::{Heard, faults, machine, run};
+use ecaxis_master::session::{
+    Attachments, Options, Progress, run_attached, run_with, simulated_bus,
+};
+use ecaxis_test_support::{Heard, axes, faults, machine, run, virtual_time};
 
 /// Drives in a line, each in a group of its own that the others survive.
 pub fn line(count: usize, steps: &str) -> Machine {
@@ -174,6 +176,37 @@ fn terminal_with_outputs_of_the_program_does_not_return_by_itself() {
         let warned = heard.warnings().iter().any(|w| w.contains(warning));
         assert_eq!(warned, returns == 0, "{:?}", heard.warnings());
     }
+}
+
+/// Panics once all axes can move.
+struct Panics(Vec<AxisRef>);
+
+impl Controller for Panics {
+    fn cycle(&mut self, machine: &mut CycleContext<'_>) {
+        if self.0.iter().all(|axis| machine.axis(*axis).ready) {
+            panic!("as a faulty program does");
+        }
+    }
+}
+
+/// The stop of a machine takes its devices out of Op: none of them is lost, and none returns.
+#[test]
+fn no_device_returns_once_the_machine_stops() {
+    let machine = machine(&axes(60));
+    let axes = (0..3).map(|n| machine.axis(&format!("a{n}")).expect("an axis"));
+    let controller = Box::new(Panics(axes.collect()));
+    let (mut heard, stop) = (Heard::default(), Arc::<CancelToken>::default());
+    let outcome = run_with(machine, virtual_time(), stop, &mut heard, controller);
+    let error = outcome.result.expect_err("it panicked").to_string();
+    assert!(error.contains("panicked"), "{error}");
+    assert_eq!(heard.warnings(), [""; 0]);
+    let of_devices = |progress: &&Progress| {
+        matches!(
+            progress,
+            Progress::DeviceLost { .. } | Progress::DeviceReturned { .. }
+        )
+    };
+    assert_eq!(heard.0.iter().filter(of_devices).count(), 0);
 }
 
 const DRIVES: usize = 16;

@@ -169,6 +169,8 @@ impl Supervisor {
         ended.interrupted = worked.is_none();
         ended.group_stops = self.group_stops();
         let mut result = worked.unwrap_or(Ok(()));
+        // From here on devices leave Op on purpose, and none may return.
+        (self.clock_tree, self.returns) = (None, None);
         if let Err(error) = &result {
             // The axes stop while the bus is read.
             self.send(RtCommand::Stop).await;

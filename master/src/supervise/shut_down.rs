@@ -17,7 +17,6 @@ impl Supervisor {
     /// `failed`: the run already has an error.
     pub(super) async fn shut_down(&mut self, failed: bool) -> Result<(), Error> {
         self.report(Progress::Stopping);
-        (self.clock_tree, self.returns) = (None, None);
         self.send(RtCommand::Stop).await;
         let result = self.wait_for_standstill(failed).await;
         let stations = self.stations();
