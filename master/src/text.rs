@@ -9,6 +9,18 @@ pub fn pluralize(count: usize, noun: &str) -> String {
     }
 }
 
+/// Returns the first names of a list, and how many follow.
+#[must_use]
+pub(crate) fn few(names: &[String]) -> String {
+    const FEW: usize = 3;
+    let first = names.iter().take(FEW).map(String::as_str);
+    let text = first.collect::<Vec<_>>().join(", ");
+    match names.len().saturating_sub(FEW) {
+        0 => text,
+        more => format!("{text} and {more} more"),
+    }
+}
+
 /// Rounds to six decimals, without digits that come from computing.
 #[must_use]
 pub fn rounded(x: f64) -> f64 {

@@ -8,20 +8,28 @@ use ecaxis_test_support::program::{self, ProgramOutput};
 use ecaxis_test_support::tolerant_demo;
 use ecaxis_tools::bench::veth::VethPair;
 
+/// Serves the demonstration as a ring at one end of both pairs. Returns the machine file for the other
+/// end, and the bus.
+fn serve(first: &VethPair, second: &VethPair) -> (tempfile::NamedTempFile, ProgramOutput) {
+    let file = tempfile::Builder::new().suffix(".toml").tempfile();
+    let file = file.expect("a temporary file");
+    let bus = format!("[bus]\nredundant = \"{}\"\n", second.b);
+    let text = tolerant_demo().replacen("[bus]", &bus, 1);
+    std::fs::write(file.path(), text).expect("written");
+    let path = file.path().to_str().expect("a path in UTF-8");
+    let ring = ["sim", path, "--nic", &first.a, "--nic2", &second.a];
+    let mut bus = ProgramOutput::start(program::command().args(ring).stdout(Stdio::null()));
+    bus.says("answer");
+    (file, bus)
+}
+
 /// An interface without a link is a warning at one end of a ring, and an error at both.
 #[test]
 fn a_ring_starts_with_one_interface() {
     over_a_pair(|first| {
         let second = VethPair::new().expect("a second pair");
-        let file = tempfile::Builder::new().suffix(".toml").tempfile();
-        let file = file.expect("a temporary file");
-        let bus = format!("[bus]\nredundant = \"{}\"\n", second.b);
-        let text = tolerant_demo().replacen("[bus]", &bus, 1);
-        std::fs::write(file.path(), text).expect("written");
+        let (file, _bus) = serve(&first, &second);
         let path = file.path().to_str().expect("a path in UTF-8");
-        let ring = ["sim", path, "--nic", &first.a, "--nic2", &second.a];
-        let mut bus = ProgramOutput::start(program::command().args(ring).stdout(Stdio::null()));
-        bus.says("answer");
         for down in [&first, &second] {
             down.set(&down.a, false).expect("down");
             let run = ["run", path, "--nic", &first.b, "--no-fault-report"];
@@ -41,15 +49,8 @@ fn a_ring_starts_with_one_interface() {
 fn a_ring_outlasts_each_of_its_interfaces() {
     over_a_pair(|first| {
         let second = VethPair::new().expect("a second pair");
-        let file = tempfile::Builder::new().suffix(".toml").tempfile();
-        let file = file.expect("a temporary file");
-        let bus = format!("[bus]\nredundant = \"{}\"\n", second.b);
-        let text = tolerant_demo().replacen("[bus]", &bus, 1);
-        std::fs::write(file.path(), text).expect("written");
+        let (file, _bus) = serve(&first, &second);
         let path = file.path().to_str().expect("a path in UTF-8");
-        let ring = ["sim", path, "--nic", &first.a, "--nic2", &second.a];
-        let mut bus = ProgramOutput::start(program::command().args(ring).stdout(Stdio::null()));
-        bus.says("answer");
         let run = [
             "run",
             path,

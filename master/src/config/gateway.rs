@@ -423,7 +423,8 @@ impl CheckedNetwork {
         if self.setup.load <= MAX_LOAD {
             return;
         }
-        let mut cycles = (cycle_ns..=100 * MS).step_by(usize::try_from(cycle_ns).unwrap_or(1));
+        let mut cycles =
+            (cycle_ns..=100 * MS).step_by(usize::try_from(cycle_ns).unwrap_or(1).max(1));
         let fits = cycles.find(|sync| load(&self.setup, &self.simulated, *sync) <= MAX_LOAD);
         let hint = match fits {
             Some(sync) => {

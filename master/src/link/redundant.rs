@@ -104,7 +104,7 @@ const CYCLIC: u8 = 0x20;
 /// A copy that has been missing so often in a row has no way back. Fewer than the attempts of
 /// `enumerate::count`.
 const MAX_MISSED: u32 = 4;
-/// A later copy in ns is dropped: ethercrab uses its indices again.
+/// A copy that arrives this time after sending, in ns, is dropped: ethercrab uses its indices again.
 const MAX_AGE: Nanos = 20_000_000;
 /// The frames taken in one call; other traffic must not hold the cycle.
 const FRAMES_AT_ONCE: usize = 32;
@@ -333,7 +333,7 @@ impl Slot {
             return copies.any(met);
         }
         let answer = &self.answer[..self.given];
-        let met = copies.filter_map(|copy| copy.devices).sum::<u16>() == all;
+        let met = copies.find_map(|copy| copy.devices) == Some(all);
         datagrams(answer).all(|datagram| {
             let counter = &answer[datagram.data.end..datagram.data.end + WORKING_COUNTER];
             let broadcast = is_broadcast(datagram.header.command);
@@ -481,8 +481,9 @@ fn set_length(frame: &mut [u8]) {
     frame[FRAME_HEADER - 1] = frame[FRAME_HEADER - 1] & 0xf0 | high & 0x07;
 }
 
-/// Prepares the copy of an interface; the first one's passes `before` devices. Positions count from the begin of each line, so a datagram to
-/// a position is addressed in one copy only. ARMW then writes to one line only; nothing here uses it.
+/// Prepares the copy of an interface. That of the first interface passes `before` devices. Positions
+/// count from the begin of each line, so a datagram to a position is addressed in one copy only. ARMW
+/// then writes to one line only; nothing here uses it.
 fn address(copy: &mut [u8], from: End, before: u16) {
     if from == End::Second {
         copy[MARK_AT] |= MARK;

@@ -153,7 +153,7 @@ pub enum Cause {
             (1, false) => "SubDevice answers",
             _ => "SubDevices answer",
         },
-        few(missing)
+        crate::text::few(missing)
     )]
     Missing {
         expected: usize,
@@ -559,17 +559,6 @@ fn reversed(candidates: &[String]) -> String {
         [] => "a SubDevice".to_owned(),
         [device] => device.clone(),
         several => format!("one of {}", several.join(", ")),
-    }
-}
-
-/// Returns the first names of a list, and how many follow.
-fn few(names: &[String]) -> String {
-    const FEW: usize = 3;
-    let first = names.iter().take(FEW).map(String::as_str);
-    let text = first.collect::<Vec<_>>().join(", ");
-    match names.len().saturating_sub(FEW) {
-        0 => text,
-        more => format!("{text} and {more} more"),
     }
 }
 

@@ -23,7 +23,8 @@ struct Answering {
 
 impl RunningSegment {
     /// Reads the segment. Identifies devices without an address of the machine, as far as they are
-    /// behind one of the machine. Returns those of `wanted` that are there. `lost`: the number of missing devices. Others are reported.
+    /// behind one of the machine. Returns those of `wanted` that are there; others are reported.
+    /// `lost`: the number of missing devices.
     pub(super) async fn survey(
         &self,
         (wanted, lost): (&[DeviceIndex], usize),
