@@ -145,7 +145,7 @@ impl Axis {
             loop_state: LoopState::default(),
             derived: control_law::DerivedConstants::new(&config),
             profile: Profile::new(),
-            home: HomingRun::default(),
+            home: HomingRun::of(&config),
             probes: Probes::new(),
             probe_mapped: false,
             brake_state: stop::BrakeState::default(),

@@ -38,6 +38,14 @@ pub fn read_text(path: &Path, max_bytes: u64) -> Result<String> {
     String::from_utf8(bytes).map_err(|error| Error::new(ErrorKind::InvalidData, error))
 }
 
+/// Returns the reason why a file cannot be read.
+pub(crate) fn unreadable(path: &Path, error: &Error) -> String {
+    match error.kind() {
+        ErrorKind::IsADirectory => format!("{} is a folder, not a file", path.display()),
+        _ => format!("cannot read {}: {error}", path.display()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

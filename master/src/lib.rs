@@ -14,6 +14,7 @@
 //! - [`ros2`]: these values as ROS 2 messages and as MCAP files;
 //! - [`mailbox`]: CoE and FoE over raw datagrams, also during operation;
 //! - [`acyclic`]: access to a bus without a cycle, in the state in which it is;
+//! - [`parameters`]: object names and values; saved to files, compared, restored;
 //! - [`link`]: transports for Ethernet frames;
 //! - [`recording`]: recording files, in this project's format and others;
 //! - [`change_log`]: who changed what on the machine, and when;
@@ -46,6 +47,7 @@ pub mod file;
 pub mod file_digest;
 pub mod link;
 pub mod mailbox;
+pub mod parameters;
 pub mod post_mortem;
 pub mod recording;
 pub mod report;

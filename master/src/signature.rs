@@ -32,6 +32,8 @@ pub enum SignedKind {
     Tables,
     /// Programs of devices.
     Firmware,
+    /// Parameter files that a machine file names.
+    Parameters,
 }
 
 impl fmt::Display for SignedKind {
@@ -41,6 +43,7 @@ impl fmt::Display for SignedKind {
             Self::Esi => "ESI files",
             Self::Tables => "set-point tables",
             Self::Firmware => "firmware",
+            Self::Parameters => "parameter files",
         })
     }
 }

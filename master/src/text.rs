@@ -1,4 +1,6 @@
-//! Formatting of numbers.
+//! Formatting of numbers and names, and similar names.
+
+use strsim::osa_distance;
 
 /// Returns a count with its noun: `1 frame`, `2 frames`.
 #[must_use]
@@ -18,6 +20,39 @@ pub(crate) fn few(names: &[String]) -> String {
     match names.len().saturating_sub(FEW) {
         0 => text,
         more => format!("{text} and {more} more"),
+    }
+}
+
+/// Quotes a text for TOML.
+#[must_use]
+pub fn quoted(text: &str) -> String {
+    toml::Value::String(text.to_owned()).to_string()
+}
+
+/// Returns the entry of `known` that `word` probably stands for.
+#[must_use]
+pub fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
+    // Longer words are not names, and the comparison takes time.
+    let word: String = word.chars().take(64).collect::<String>().to_lowercase();
+    let known: Vec<&str> = known.into_iter().collect();
+    // By edit distance alone, `move_to` is nearer to `move_by`, which means something else.
+    let stem = |k: &&&str| {
+        word.strip_prefix(**k)
+            .is_some_and(|rest| rest.starts_with('_'))
+    };
+    let stem = known.iter().find(stem).copied();
+    let near = known
+        .into_iter()
+        .map(|k| (osa_distance(&word, &k.to_lowercase()), k))
+        .filter(|(d, k)| match k.chars().count().max(word.chars().count()) {
+            // All one-letter names are one edit apart.
+            0..=2 => *d == 0,
+            longer => *d <= (longer / 3).max(1),
+        })
+        .min_by_key(|(d, _)| *d);
+    match (near, stem) {
+        (Some((2.., _)) | None, Some(stem)) => Some(stem),
+        (near, _) => near.map(|(_, k)| k),
     }
 }
 

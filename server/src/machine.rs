@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock;
-use ecaxis_master::report::{Observer, Progress};
+use ecaxis_master::report::{Home, Observer, Progress};
 use ecaxis_master::session::{self, Attachments, Options};
 use serde_json::json;
 
@@ -149,10 +149,11 @@ impl Observer for Reporter<'_> {
                 device,
                 after_ns,
                 restarted,
+                home,
                 first,
             } => hub.event(json!({
                 "event": "device_returned", "device": device.name, "after_s": *after_ns as f64 * 1e-9,
-                "restarted": restarted, "first": first,
+                "restarted": restarted, "home_lost": *home == Some(Home::Lost), "first": first,
             })),
             Progress::Ring { text, broken } => {
                 hub.event(json!({"event": "ring", "broken": broken, "text": text}));

@@ -2,12 +2,18 @@
 //! `ecaxis sdo` and `ecaxis eeprom`.
 
 mod cli;
+mod restore;
 use std::thread;
 
 use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_esi::Dictionary;
 use ecaxis_master::acyclic::eeprom::{Eeprom, EepromAccess};
 use ecaxis_master::acyclic::image::{with_alias, write};
+use ecaxis_master::acyclic::parameters::compare::compare;
+use ecaxis_master::acyclic::parameters::dictionary;
+use ecaxis_master::acyclic::parameters::restore::restore;
+use ecaxis_master::acyclic::parameters::restore_order::is_setting;
+use ecaxis_master::acyclic::parameters::upload::{UploadResult, collect};
 use ecaxis_master::acyclic::{AlState, al};
 use ecaxis_master::acyclic::{DatagramClient, Registers, device, mailbox};
 use ecaxis_master::bringup::bring_up;
@@ -18,18 +24,14 @@ use ecaxis_master::link::scan_answers::ScanAnswers;
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::mailbox::worker::EmergencySink;
 use ecaxis_master::mailbox::{CoeClient, Emergencies, FoeClient, MailboxTransport, ObjectList};
+use ecaxis_master::parameters::dump::Dump;
+use ecaxis_master::parameters::{DataType, Kind, items};
 use ecaxis_master::report::{Cause, Error};
 use ecaxis_master::rt::image::plan;
 use ecaxis_master::session::run_on_link;
 use ecaxis_master::session::simulated_bus;
 use ecaxis_sim::FirmwareHeader;
 use ecaxis_test_support::{fixture, machine, root};
-use ecaxis_tools::parameters::compare::compare;
-use ecaxis_tools::parameters::dump::Dump;
-use ecaxis_tools::parameters::restore::restore;
-use ecaxis_tools::parameters::restore_order::is_setting;
-use ecaxis_tools::parameters::upload::{UploadResult, collect};
-use ecaxis_tools::parameters::{DataType, Kind, dictionary, items};
 
 /// Ignores emergencies.
 #[derive(Debug)]
@@ -366,7 +368,7 @@ fn from_one_to_the_other(machine: Machine) -> (usize, usize) {
                 .1;
             let restored = with_device(&wire, 1, async |coe| {
                 let file = &dump.parameters;
-                let done = restore(coe, &wire, &at, &dictionary, file, &mut |_, _| {}).await;
+                let done = restore(coe, &wire, &at, Some(&dictionary), file, &mut |_, _| {}).await;
                 done.expect("restored")
             })
             .await;
@@ -381,7 +383,7 @@ fn from_one_to_the_other(machine: Machine) -> (usize, usize) {
             // A second restore has nothing to write.
             let again = with_device(&wire, 1, async |coe| {
                 let file = &dump.parameters;
-                let done = restore(coe, &wire, &at, &dictionary, file, &mut |_, _| {}).await;
+                let done = restore(coe, &wire, &at, Some(&dictionary), file, &mut |_, _| {}).await;
                 done.expect("restored")
             })
             .await;

@@ -5,6 +5,7 @@
 mod brake;
 mod bus_faults;
 mod causes;
+mod exchange;
 mod failures;
 mod groups;
 mod limits;

@@ -2,7 +2,6 @@
 //!
 //! - [`scan`]: the SubDevices of a segment, and a machine file generated from them;
 //! - [`compare`]: compares a machine file with a bus;
-//! - [`parameters`]: object names and values; saved to files, compared, restored;
 //! - [`firmware`]: firmware updates;
 //! - [`doctor`]: checks of host settings that delay the cycle;
 //! - [`host`]: the state of a computer from its files;
@@ -19,5 +18,4 @@ pub mod doctor;
 pub mod document;
 pub mod firmware;
 pub mod host;
-pub mod parameters;
 pub mod scan;

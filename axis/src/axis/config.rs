@@ -52,6 +52,8 @@ pub struct AxisConfig {
     /// True if the drive supports Statusword bit 12 (drive follows command value) in CSP, CSV and
     /// CST.
     pub follows_bit: bool,
+    /// True if the drive keeps home without power: an absolute encoder.
+    pub absolute: bool,
 }
 
 impl AxisConfig {
@@ -81,6 +83,7 @@ impl AxisConfig {
             fault_reset: FaultReset::default(),
             stop_timeout_s: None,
             follows_bit: true,
+            absolute: false,
         }
     }
 

@@ -1,6 +1,6 @@
 //! Homing: executes the requests of the sequence and applies the new position.
 
-use super::{Axis, ControlledQuantity};
+use super::{Axis, AxisConfig, ControlledQuantity};
 use crate::cia402::{Mode, ModeCommand, ModeStatus};
 use crate::homing::{HomingError, HomingInputs, HomingOutputs, Outcome, Sequence};
 use crate::status::{CommandError, HomingStatus};
@@ -10,11 +10,18 @@ pub(super) struct HomingRun {
     sequence: Option<Sequence>,
     order: Option<HomingOutputs>,
     pub(super) status: HomingStatus,
-    /// True if home was found and no homing has started since.
+    /// True if home is known: by an absolute encoder, or found and no homing has started since.
     pub(super) homed: bool,
 }
 
 impl HomingRun {
+    pub(super) fn of(config: &AxisConfig) -> Self {
+        Self {
+            homed: config.absolute,
+            ..Self::default()
+        }
+    }
+
     pub(super) const fn running(&self) -> bool {
         self.sequence.is_some()
     }
@@ -41,9 +48,10 @@ impl HomingRun {
 }
 
 impl Axis {
-    /// Takes the position of a drive that has restarted as it is. It has no home any more.
-    pub fn forget_home(&mut self) {
-        self.home.homed = false;
+    /// Takes the position of a drive that has restarted as it is. `same`: it is the drive that was
+    /// there before. Home is kept only by the absolute encoder of the same drive.
+    pub fn restarted(&mut self, same: bool) {
+        self.home.homed &= same && self.config.absolute;
         self.actual.start_over(&self.config.scale);
     }
 

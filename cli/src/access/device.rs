@@ -8,14 +8,14 @@ use ecaxis_esi::sii::Sii;
 use ecaxis_esi::{DeviceHeader, Dictionary, Identity, SelectOptions, select};
 use ecaxis_master::acyclic::eeprom::EepromAccess;
 use ecaxis_master::acyclic::enumerate::EnumeratedDevice;
+use ecaxis_master::acyclic::parameters::dictionary;
 use ecaxis_master::acyclic::{AlState, DeviceRef};
 use ecaxis_master::acyclic::{DatagramClient, device};
 use ecaxis_master::config::{self, DeviceConfig, Locator, Machine, Nic, nearest};
 use ecaxis_master::esi_library::{self, Library, RevisionMatch, cache_file};
 use ecaxis_master::mailbox::{CoeClient, NamedObject, SdoError};
+use ecaxis_master::parameters::dump::Origin;
 use ecaxis_master::report::{Cause, Error};
-use ecaxis_tools::parameters::dictionary;
-use ecaxis_tools::parameters::dump::Origin;
 
 use crate::access::bus::{self, Bus};
 use crate::args::numbers::number_16;

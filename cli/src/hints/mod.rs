@@ -98,6 +98,12 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         Cause::Serial { found, .. } => {
             format!("if the device was replaced on purpose, write `serial = {found}` or omit `serial`")
         }
+        Cause::Settings { .. } => {
+            "`ecaxis sdo compare` shows all differences; save a new file with `ecaxis sdo dump`, or correct the value in it".to_owned()
+        }
+        Cause::OtherFirmware { .. } => {
+            "update the firmware of the device (`ecaxis firmware update`), or save the parameters of a device with this firmware".to_owned()
+        }
         Cause::NotLocated { .. } => {
             "set the device's alias or ID switch, or find it by `position`".to_owned()
         }

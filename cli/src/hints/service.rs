@@ -5,10 +5,10 @@ use std::path::Path;
 use ecaxis_ecat::mailbox::abort_code as abort;
 use ecaxis_master::acyclic::eeprom::EepromError;
 use ecaxis_master::acyclic::image::WriteError;
+use ecaxis_master::acyclic::parameters::restore::RestoreError;
 use ecaxis_master::config::Nic;
 use ecaxis_master::mailbox::{CoeCause, InfoError, SdoError};
 use ecaxis_master::report::{Cause, Error};
-use ecaxis_tools::parameters::restore::RestoreError;
 
 use super::{Failure, failure, sdo};
 

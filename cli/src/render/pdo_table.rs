@@ -1,11 +1,11 @@
 //! Tables that several subcommands use.
 
 use ecaxis_esi::{Device, Field, Layout, SmLayout, SmUse, StartupSdo, address};
+use ecaxis_master::parameters::meaning::meaning;
 use ecaxis_master::text::pluralize;
 use ecaxis_tools::cells;
 use ecaxis_tools::document::format::{hex_bytes, hex16};
 use ecaxis_tools::document::{Document, Table};
-use ecaxis_tools::parameters::meaning::meaning;
 
 /// Adds the SyncManagers and the offset of each object.
 pub(crate) fn process_data(device: &Device, layout: &Layout, out: &mut Document) {

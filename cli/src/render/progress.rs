@@ -7,6 +7,7 @@ use ecaxis_master::acyclic::DeviceRef;
 use ecaxis_master::bringup::{Step, StepTime};
 use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config::{Bus, Nic, TorqueUnit};
+use ecaxis_master::report::Home;
 use ecaxis_master::session::{AxisLine, Observer, Progress, Status};
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -170,11 +171,12 @@ impl Observer for ProgressPrinter {
             Progress::DeviceReturned {
                 device,
                 after_ns,
-                restarted,
+                home,
                 first,
+                ..
             } => note(&match first {
                 true => device_appeared(device),
-                false => device_returned(device, *after_ns, *restarted),
+                false => device_returned(device, *after_ns, *home),
             }),
             Progress::GroupWaits { group } => {
                 note(&format!(
@@ -283,12 +285,12 @@ pub fn device_appeared(device: &DeviceRef) -> String {
 }
 
 /// Describes a device that is in Op again.
-pub fn device_returned(device: &DeviceRef, after_ns: Nanos, restarted: bool) -> String {
+pub fn device_returned(device: &DeviceRef, after_ns: Nanos, home: Option<Home>) -> String {
     let after = after_ns as f64 * 1e-9;
-    let home = if restarted {
-        "; it had no power, so home is lost"
-    } else {
-        ""
+    let home = match home {
+        Some(Home::Lost) => "; it had no power, so home is lost",
+        Some(Home::Kept) => "; it had no power, and keeps home by its absolute encoder",
+        None => "",
     };
     format!("{device} is in Op again after {after:.2} s{home}; reset its axes, then enable them")
 }

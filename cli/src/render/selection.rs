@@ -1,8 +1,8 @@
 //! The configuration of a device as JSON, for `esi show` and `explain`.
 
 use ecaxis_esi::{Field, Mode, Selection, SmLayout, StartupSdo};
+use ecaxis_master::parameters::meaning::meaning;
 use ecaxis_tools::document::format::hex_bytes;
-use ecaxis_tools::parameters::meaning::meaning;
 use serde_json::{Value, json};
 
 /// Returns the process data, the clock and the start-up SDOs of a device.

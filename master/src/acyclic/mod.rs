@@ -11,6 +11,7 @@
 //! - [`eeprom`]: the EEPROM interface of one device;
 //! - [`image`]: EEPROM images, and how to write them;
 //! - [`mailbox`]: the mailboxes of one device, and the state they need;
+//! - [`parameters`]: the parameters of one device;
 //! - [`topology`]: how the devices are connected.
 
 use crate::mailbox::{DatagramError, MailboxTransport};
@@ -28,6 +29,7 @@ pub mod eeprom;
 pub mod enumerate;
 pub mod image;
 pub mod mailbox;
+pub mod parameters;
 #[cfg(test)]
 mod tests;
 pub mod topology;

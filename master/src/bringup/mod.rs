@@ -43,6 +43,7 @@ pub(crate) mod device_return;
 pub mod drive_units;
 mod eeproms;
 mod identify;
+mod kept_parameters;
 mod limits;
 mod mailbox;
 mod mapping;
@@ -472,6 +473,8 @@ async fn configure(
     times: &StepTimes,
 ) -> Result<(), Error> {
     let name = Some(config.name.as_str());
+    let step = kept_parameters::restore_to(wire, config, device, progress);
+    times.measure("parameter file", name, step).await?;
     let step = device::start_up(wire, config, device, StartupPhase::InPreOp, progress);
     times.measure("start-up SDOs", name, step).await?;
     let step = mapping::compare(wire, config, device);

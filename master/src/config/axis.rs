@@ -53,6 +53,7 @@ pub(crate) fn setup(
         None => None,
     };
     config.stop_timeout_s = control::seconds(&raw.stop_timeout);
+    config.absolute = raw.absolute.value().unwrap_or(false);
     config.follows_bit = raw.follows_bit.value().unwrap_or(true);
     if let Some(dead_time_s) = control::seconds(&raw.dead_time) {
         config.dead_time_s = dead_time_s;

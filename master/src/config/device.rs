@@ -75,6 +75,7 @@ pub(crate) fn check(
     });
     let network = gateway::check(&raw, device, chosen.as_mut(), files.cycle.as_ref(), p);
     let startup = Startup::of(&raw);
+    let parameters = files.parameters(&raw, device, p);
     let device = device.map(|d| Arc::new(d.clone()));
     let identity = identity(raw.identity.as_ref(), p);
     let mut sim = sim.unwrap_or_default();
@@ -101,6 +102,7 @@ pub(crate) fn check(
             startup,
             identity: identity?,
             serial: raw.serial.value(),
+            parameters: parameters?,
             optional: raw.optional.value().unwrap_or(false),
             sim,
             gateway,

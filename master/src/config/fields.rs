@@ -9,8 +9,9 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use super::duration::{self, show};
-use super::problem::{Problems, Span, list, nearest, suggestion};
+use super::problem::{Problems, Span, list, suggestion};
 use super::schema::{self, Schema};
+use crate::text::nearest;
 
 pub(crate) type Value<'d> = &'d Spanned<DeValue<'d>>;
 

@@ -60,13 +60,14 @@ mod tests;
 mod travel;
 mod units;
 
+pub use crate::text::nearest;
 pub(crate) use axis::is_maxon;
 pub use copy::{BitRange, CopySetup};
 pub(crate) use device::unused_axis;
 pub use drive_limits::LimitConflict;
 pub use drive_units::{AdoptedUnits, UnitProblem};
 pub use gateway::{GatewaySetup, NodeSetup};
-pub use problem::{ConfigError, Problem, nearest};
+pub use problem::{ConfigError, Problem};
 pub use program::{Action, Step, StopGroup, StopSetup, TableFile};
 pub use signal::{NameError, Signal};
 pub use startup::{Startup, StartupOptions};
@@ -83,6 +84,7 @@ use crate::esi_library::{RevisionMatch, SiiImage};
 use crate::file;
 use crate::file_digest::{FileDigest, UsedFile};
 use crate::link::SocketKind;
+use crate::parameters::kept::KeptParameters;
 pub use crate::rt::config::{Condition, ExchangeMode, GroupStopScope};
 use crate::rt::config::{GroupConfig, RtConfig};
 pub use crate::rt::controller::{AxisRef, InputRef, OutputRef};
@@ -236,6 +238,8 @@ pub struct DeviceConfig {
     pub identity: RevisionMatch,
     /// The required serial number.
     pub serial: Option<u32>,
+    /// The parameter file of the device that belongs here.
+    pub parameters: Option<Arc<KeptParameters>>,
     /// `true` if the device may be absent.
     pub optional: bool,
     pub sim: sim::SimSetup,

@@ -6,9 +6,9 @@ use std::fmt;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use strsim::osa_distance;
-
+use crate::file::unreadable;
 use crate::signature::{PolicyError, SignatureError, SignaturePolicy, VerifiedFiles};
+use crate::text::nearest;
 
 /// The reason why a machine file is rejected.
 #[derive(Debug, thiserror::Error)]
@@ -30,14 +30,6 @@ pub enum ConfigError {
     /// All mistakes in the file, in line order.
     #[error("{}", all(.0))]
     Problems(Vec<Problem>),
-}
-
-/// Returns the reason why a file cannot be read.
-pub(crate) fn unreadable(path: &Path, error: &std::io::Error) -> String {
-    match error.kind() {
-        std::io::ErrorKind::IsADirectory => format!("{} is a folder, not a file", path.display()),
-        _ => format!("cannot read {}: {error}", path.display()),
-    }
 }
 
 fn all(problems: &[Problem]) -> String {
@@ -194,33 +186,6 @@ fn floor(text: &str, at: usize) -> usize {
         at -= 1;
     }
     at
-}
-
-/// Returns the entry of `known` that `word` probably stands for.
-#[must_use]
-pub fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
-    // Longer words are not names, and the comparison takes time.
-    let word: String = word.chars().take(64).collect::<String>().to_lowercase();
-    let known: Vec<&str> = known.into_iter().collect();
-    // By edit distance alone, `move_to` is nearer to `move_by`, which means something else.
-    let stem = |k: &&&str| {
-        word.strip_prefix(**k)
-            .is_some_and(|rest| rest.starts_with('_'))
-    };
-    let stem = known.iter().find(stem).copied();
-    let near = known
-        .into_iter()
-        .map(|k| (osa_distance(&word, &k.to_lowercase()), k))
-        .filter(|(d, k)| match k.chars().count().max(word.chars().count()) {
-            // All one-letter names are one edit apart.
-            0..=2 => *d == 0,
-            longer => *d <= (longer / 3).max(1),
-        })
-        .min_by_key(|(d, _)| *d);
-    match (near, stem) {
-        (Some((2.., _)) | None, Some(stem)) => Some(stem),
-        (near, _) => near.map(|(_, k)| k),
-    }
 }
 
 /// Returns ``did you mean `x`?`` or the list of choices.

@@ -187,6 +187,20 @@ pub enum Cause {
     },
     #[error("identify: the machine file names serial number {expected}, the device has {found}")]
     Serial { expected: u32, found: u32 },
+    #[error(
+        "its settings cannot become those of {file}: {}",
+        crate::text::few(problems)
+    )]
+    Settings { file: String, problems: Vec<String> },
+    #[error(
+        "{object} is {found}, in {file} it is {expected}: its parameters are of another firmware or model"
+    )]
+    OtherFirmware {
+        object: String,
+        file: String,
+        expected: String,
+        found: String,
+    },
     #[error("no SubDevice has {locator}")]
     NotLocated { locator: String },
     #[error("start-up SDO {} {name} = {value} (from {origin}): {}", address(*index, *sub), source.cause)]

@@ -25,6 +25,6 @@ pub use emergencies::{EmergencyLine, EmergencyLog, EmergencyReport};
 pub use error::{Cause, DriveReport, Error, FailedStep, Location};
 pub use events::EventLine;
 pub use progress::{
-    AxisLine, DevicePlace, Observer, ProbeCapture, Progress, Status, StepRef, UnknownDevice,
+    AxisLine, DevicePlace, Home, Observer, ProbeCapture, Progress, Status, StepRef, UnknownDevice,
 };
 pub use summary::{AxisSummary, DeviceErrors, GroupStop, Summary, ThreadSummary};

@@ -97,8 +97,10 @@ pub enum Progress {
         device: DeviceRef,
         /// The time in ns since it was found lost.
         after_ns: Nanos,
-        /// It had no power: the position of an incremental encoder is lost.
+        /// It had no power.
         restarted: bool,
+        /// What that has made of the home of its axes.
+        home: Option<Home>,
         /// It is optional and was absent until now.
         first: bool,
     },
@@ -112,6 +114,15 @@ pub enum Progress {
     /// The status of the machine, five times a second of machine time.
     Status(Status),
     Stopping,
+}
+
+/// The home of the axes of a device that has restarted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Home {
+    /// By absolute encoders.
+    Kept,
+    /// Of at least one axis.
+    Lost,
 }
 
 /// A device that is not in the machine file.

@@ -308,7 +308,7 @@ impl Engine {
                 .publish_presence(answering, |group| groups.get(group).is_some_and(stopped));
         }
         if any_stopped {
-            self.forget_homes();
+            self.take_restarts();
         }
         for group in self.groups.indices() {
             if let Some(cause) = self.guard.lost(group) {
@@ -320,13 +320,13 @@ impl Engine {
         }
     }
 
-    /// Devices that have restarted have no home any more. Their groups have stopped. RT: O(devices ×
-    /// axes) while a device returns, else O(devices).
-    fn forget_homes(&mut self) {
+    /// Reports restarts of devices to their axes. Their groups have stopped. RT: O(devices × axes)
+    /// while a device returns, else O(devices).
+    fn take_restarts(&mut self) {
         for device in self.exchange.device_answers().indices() {
-            if self.exchange.take_restarted(device) {
+            if let Some(same) = self.exchange.take_restart(device) {
                 let own = self.axes.iter_mut().filter(|slot| slot.device == device);
-                own.for_each(|slot| slot.axis.forget_home());
+                own.for_each(|slot| slot.axis.restarted(same));
             }
         }
     }

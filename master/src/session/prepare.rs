@@ -241,9 +241,15 @@ fn mailbox_workers(
     worker::open(openings, &listener)
 }
 
-/// Returns the machine with its axes in the drives' own units.
+/// Returns the machine with its axes in the drives' own units. The absolute encoder of a device that
+/// has taken the place of another has no home.
 fn apply_drive_units(machine: &Machine, bus: &Bus) -> Arc<Machine> {
     let mut machine = machine.clone();
+    for axis in &mut *machine.axes {
+        let kept = machine.devices[axis.device].parameters.as_ref();
+        let serial = bus.devices[axis.device].serial;
+        axis.config.absolute &= kept.is_none_or(|kept| kept.is_of(serial));
+    }
     for (axis, adopted) in bus.devices.iter().flat_map(|found| &found.adopted) {
         machine.adopt(*axis, adopted);
     }

@@ -108,6 +108,8 @@ struct Search {
     attempted: bool,
     /// The serial number of the device that was there last.
     serial: u32,
+    /// The device has another serial number than the one that was lost.
+    replaced: bool,
     /// It is optional and was absent until now.
     absent: bool,
     /// Where it was last.
@@ -160,9 +162,7 @@ impl ReturnTask {
             for device in found {
                 let search = &mut searches[device];
                 search.attempted = true;
-                let place = search.place.map(|place| place.position);
-                let what = (search.restarted, search.absent);
-                attempts.add(segment.attempt((device, place), search.since, what));
+                attempts.add(segment.attempt(device, search.clone()));
             }
         }
     }
@@ -180,6 +180,7 @@ impl RunningSegment {
             if !lost.contains(&device) && !search.attempted {
                 *search = Search {
                     restarted: search.restarted,
+                    replaced: search.replaced,
                     serial: search.serial,
                     place: search.place,
                     absent: search.absent,

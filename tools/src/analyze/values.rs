@@ -1,7 +1,7 @@
 //! Formats object values.
 
 use super::mailbox::Transfer;
-use crate::parameters::meaning::meaning;
+use ecaxis_master::parameters::meaning::meaning;
 
 /// The maximum number of bytes shown of a value that is neither a number nor a text.
 const SHOWN: usize = 16;

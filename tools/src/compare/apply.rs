@@ -6,11 +6,11 @@ use ecaxis_ecat::index::DeviceIndex;
 use toml_edit::{Array, ArrayOfTables, DocumentMut, Item, Table, TableLike, Value};
 
 use super::{Comparison, Difference};
-use crate::document::format::quoted;
 use crate::scan::write::{self, OutputPath};
 use crate::scan::{EsiMatch, Scan};
 use ecaxis_master::config::{self, ConfigError, Locator, Machine};
 use ecaxis_master::esi_library::RevisionMatch;
+use ecaxis_master::text::quoted;
 
 /// The maximum nesting of `repeat`, above the limit of machine files.
 const DEPTH: usize = 16;

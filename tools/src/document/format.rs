@@ -53,12 +53,6 @@ pub fn names_of<'a>(all: &[(bool, &'a str)], gap: &str) -> String {
     names.collect::<Vec<&'a str>>().join(gap)
 }
 
-/// Quotes a text for TOML.
-#[must_use]
-pub(crate) fn quoted(text: &str) -> String {
-    toml::Value::String(text.to_owned()).to_string()
-}
-
 /// Formats a repetition: `once`, `2 times`.
 #[must_use]
 pub fn times(count: u32) -> String {

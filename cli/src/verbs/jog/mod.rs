@@ -404,9 +404,10 @@ impl Observer for Listener {
             Progress::DeviceReturned {
                 device,
                 after_ns,
-                restarted,
+                home,
                 first: false,
-            } => (device_returned(device, *after_ns, *restarted), false),
+                ..
+            } => (device_returned(device, *after_ns, *home), false),
             Progress::Ring { text, broken } => (text.clone(), *broken),
             Progress::DeviceReturned { device, .. } => (device_appeared(device), false),
             Progress::UnknownDevice(device) => (device.to_string(), true),

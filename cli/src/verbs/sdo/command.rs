@@ -1,7 +1,7 @@
 //! `ecaxis sdo store`, `ecaxis sdo defaults`.
 
+use ecaxis_master::acyclic::parameters::command::Command;
 use ecaxis_master::mailbox::MailboxTransport;
-use ecaxis_tools::parameters::command::Command;
 use serde_json::json;
 
 use crate::access::device::{DeviceArgs, Open, no_more};

@@ -58,8 +58,11 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
             (left, there, [file.clone(), name])
         }
     };
-    let found =
-        ecaxis_tools::parameters::compare::compare(&left.parameters, &right.parameters, args.all);
+    let found = ecaxis_master::acyclic::parameters::compare::compare(
+        &left.parameters,
+        &right.parameters,
+        args.all,
+    );
     let [first, second] = &names;
     match args.common.json {
         true => print_json(&as_json(&found))?,

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use ecaxis_tools::parameters::dump::Dump;
-use ecaxis_tools::parameters::upload::collect;
+use ecaxis_master::acyclic::parameters::upload::collect;
+use ecaxis_master::parameters::dump::Dump;
 use serde_json::json;
 
 use super::{Common, refusal};

@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
 use ecaxis_esi::Dictionary;
+use ecaxis_master::acyclic::parameters::compare::Difference;
 use ecaxis_master::mailbox::{NamedObject, abort_text};
+use ecaxis_master::parameters::dump::Dump;
+use ecaxis_master::parameters::lookup::{FindError, ObjectQuery, find};
 use ecaxis_tools::cells;
 use ecaxis_tools::document::Table;
 use ecaxis_tools::document::format::or_dash;
-use ecaxis_tools::parameters::compare::Difference;
-use ecaxis_tools::parameters::dump::Dump;
-use ecaxis_tools::parameters::lookup::{FindError, ObjectQuery, find};
 use serde_json::{Value, json};
 
 use crate::access::device::{DeviceArgs, Target, address};

@@ -4,13 +4,14 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use ecaxis_esi::Object;
+use ecaxis_master::acyclic::parameters::dictionary;
 use ecaxis_master::config::duration;
 use ecaxis_master::mailbox::{CoeCause, NamedObject, SdoError, Subject, object_name};
+use ecaxis_master::parameters::lookup::ObjectQuery;
+use ecaxis_master::parameters::meaning::meaning;
+use ecaxis_master::parameters::{DataType, name_of, type_of};
 use ecaxis_master::text::pluralize;
 use ecaxis_tools::document::format::hex_bytes;
-use ecaxis_tools::parameters::lookup::ObjectQuery;
-use ecaxis_tools::parameters::meaning::meaning;
-use ecaxis_tools::parameters::{DataType, dictionary, name_of, type_of};
 use serde_json::json;
 
 use super::{Common, Line, print_lines, wanted};

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use ecaxis_tools::parameters::restore::{Restored, restore};
+use ecaxis_master::acyclic::parameters::restore::{Restored, restore};
 use serde_json::json;
 
 use super::{Common, as_json, load, print_differences, refusal};
@@ -60,7 +60,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
                 open.coe,
                 &at.wire,
                 &at.device,
-                &dictionary,
+                Some(&dictionary),
                 parameters,
                 &mut progress,
             );

@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use ecaxis_master::file;
 use ecaxis_master::mailbox::MailboxTransport;
-use ecaxis_tools::parameters::meaning::meaning;
-use ecaxis_tools::parameters::{DataType, ValueError};
+use ecaxis_master::parameters::meaning::meaning;
+use ecaxis_master::parameters::{DataType, ValueError};
 use serde_json::json;
 
 use super::read::{data_type, describe, hex, parts};

@@ -8,9 +8,11 @@ use ecaxis_esi as esi;
 use toml::Spanned;
 
 use crate::config::fields::KeyExt;
-use crate::config::problem::{Problems, Span, suggestion, unreadable};
+use crate::config::problem::{Problems, Span, suggestion};
 use crate::config::raw::RawDevice;
 use crate::esi_library::{self, Library, LoadError, SiiImage};
+use crate::file::unreadable;
+use crate::parameters::kept::KeptParameters;
 
 /// Data shared by all devices: the ESI folder, the files read so far, and the cycle.
 pub(crate) struct EsiFiles<'f> {
@@ -60,6 +62,22 @@ impl<'f> EsiFiles<'f> {
             return None;
         }
         Some(image)
+    }
+
+    /// Returns the parameter file that `parameters` names.
+    pub fn parameters(
+        &self,
+        raw: &RawDevice,
+        device: Option<&esi::Device>,
+        p: &mut Problems<'_>,
+    ) -> Option<Option<Arc<KeptParameters>>> {
+        let Some(name) = &raw.parameters else {
+            return Some(None);
+        };
+        let path = self.folder.join(name.get_ref());
+        let read = KeptParameters::read(&path, device?, &mut p.files);
+        let read = read.map_err(|(message, hint)| p.add_hint(name.span(), message, hint));
+        Some(Some(Arc::new(read.ok()?)))
     }
 
     /// Returns the file that `esi` names, or the matching file in the folder that it names. Without

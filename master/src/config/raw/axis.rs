@@ -94,6 +94,8 @@ table! { "[device.axis]",
         on_trip: Key<StopMethod> [STOP_METHODS],
         /// Reaction to an emergency stop (`"quick-stop"`, `"no-power"`; default `"quick-stop"`)
         on_emergency: Key<StopMethod> [STOPS_BY_DRIVE],
+        /// The drive keeps home without power: absolute encoder (`true`, `false`; default `false`)
+        absolute: Key<bool>,
         /// Homing by the drive; 0x6060 and 0x6061 must be mapped
         homing: Option<RawHoming>,
     }

@@ -181,6 +181,9 @@ table! { "[[device]]",
         identity: Key<String> [IDENTITIES],
         /// Serial number that the device must have (number; default any)
         serial: Key<u32>,
+        /// Parameter file (`ecaxis sdo dump`) of the device; its settings are written to a device with
+        /// another serial number (path; default none)
+        parameters: Key<String>,
         /// Selects module or PDO set, 0x6060 and start-up SDOs (`"csp"`, `"csv"`, `"cst"`; default
         /// none: no axis)
         mode: Key<String> [MODES],

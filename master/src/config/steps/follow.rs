@@ -9,10 +9,11 @@ use toml::Spanned;
 use super::ProgramChecker;
 use super::target::TargetKind;
 use crate::config::fields::KeyExt;
-use crate::config::problem::{Problems, unreadable};
+use crate::config::problem::Problems;
 use crate::config::raw::{RawGear, RawWave};
 use crate::config::{Action, AxisSetup, TableFile};
 use crate::file;
+use crate::file::unreadable;
 use crate::signature::SignedKind;
 
 /// The maximum length of a table in bytes.

@@ -27,7 +27,7 @@ impl Engine {
                 let Some(state) = own.and_then(|at| gateway.lost(at.node)) else {
                     continue;
                 };
-                slot.axis.forget_home();
+                slot.axis.restarted(false);
                 if let Some(group) = self.groups.get_mut(slot.group) {
                     group.found = group.found.or(Some(StopCause::NodeLost { axis, state }));
                 }

@@ -1,9 +1,7 @@
 //! The status of mailboxes and the bus time as the cycle sees them, for other threads. Atomics keep
 //! the cost of reading them away from the cycle.
 
-use std::sync::atomic::{
-    AtomicBool, AtomicI64, AtomicU8, AtomicU16, AtomicU64, AtomicUsize, Ordering,
-};
+use std::sync::atomic::{AtomicI64, AtomicU8, AtomicU16, AtomicU64, AtomicUsize, Ordering};
 
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 
@@ -33,14 +31,17 @@ pub struct BusStatus {
     clock: AtomicI64,
     /// For each member: [`STOPPED`] and [`OUT_OF_OP`].
     presence: IndexVec<DeviceIndex, AtomicU8>,
-    /// For each member, true if it has restarted and the cycle does not know it yet.
-    restarted: IndexVec<DeviceIndex, AtomicBool>,
+    /// For each member, a restart that the cycle does not know yet.
+    restarts: IndexVec<DeviceIndex, AtomicU8>,
     /// The member that is the reference clock; `usize::MAX`: none.
     reference: AtomicUsize,
     /// The number of devices that answered the last broadcast.
     answering: AtomicU16,
 }
 
+/// A member that has restarted, and another device in its place.
+const RESTARTED: u8 = 1;
+const REPLACED: u8 = 2;
 /// The member belongs to a stopped group.
 const STOPPED: u8 = 1;
 /// The member did not answer its last read, or was not in Op.
@@ -58,7 +59,7 @@ impl BusStatus {
             mailboxes: (0..members).map(|_| AtomicU64::new(0)).collect(),
             clock: AtomicI64::new(NO_CLOCK),
             presence: (0..members).map(|_| AtomicU8::new(0)).collect(),
-            restarted: (0..members).map(|_| AtomicBool::new(false)).collect(),
+            restarts: (0..members).map(|_| AtomicU8::new(0)).collect(),
             reference: AtomicUsize::new(usize::MAX),
             answering: AtomicU16::new(0),
         }
@@ -89,18 +90,22 @@ impl BusStatus {
         }
     }
 
-    /// Reports that a member has restarted: its axes have no home any more.
-    pub fn set_restarted(&self, member: DeviceIndex) {
-        if let Some(restarted) = self.restarted.get(member) {
-            restarted.store(true, Ordering::Relaxed);
+    /// Reports that a member has restarted. `same`: it is the device that was there before.
+    pub fn set_restarted(&self, member: DeviceIndex, same: bool) {
+        if let Some(restart) = self.restarts.get(member) {
+            let what = if same { RESTARTED } else { REPLACED };
+            restart.store(what, Ordering::Relaxed);
         }
     }
 
-    /// Returns true once after [`BusStatus::set_restarted`]. RT: O(1).
-    pub(super) fn take_restarted(&self, member: DeviceIndex) -> bool {
-        let restarted = self.restarted.get(member);
-        restarted
-            .is_some_and(|seen| seen.load(Ordering::Relaxed) && seen.swap(false, Ordering::Relaxed))
+    /// Returns `same` once after [`BusStatus::set_restarted`]. RT: O(1).
+    pub(super) fn take_restart(&self, member: DeviceIndex) -> Option<bool> {
+        let restart = self.restarts.get(member)?;
+        if restart.load(Ordering::Relaxed) == 0 {
+            return None;
+        }
+        let what = restart.swap(0, Ordering::Relaxed);
+        (what != 0).then_some(what == RESTARTED)
     }
 
     /// Stores the reference clock. RT: O(1).
@@ -154,9 +159,9 @@ impl Exchange {
         self.schedule.al_status_polls = polls;
     }
 
-    /// Returns true once after a member has restarted. RT: O(1).
-    pub fn take_restarted(&self, member: DeviceIndex) -> bool {
-        self.bus_status.take_restarted(member)
+    /// Returns once after a member has restarted whether it is the same device as before. RT: O(1).
+    pub fn take_restart(&self, member: DeviceIndex) -> Option<bool> {
+        self.bus_status.take_restart(member)
     }
 
     /// Publishes how many devices answer and which members are in Op, for the other threads. RT:

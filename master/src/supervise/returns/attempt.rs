@@ -4,41 +4,62 @@ use std::time::Duration;
 
 use ecaxis_ecat::index::DeviceIndex;
 
-use super::RunningSegment;
+use super::{RunningSegment, Search};
 use crate::acyclic::{AlState, DeviceRef, al};
 use crate::bringup::device_return::{RunningBus, RunningSync, bring_back, reset};
 use crate::bringup::{Step, enable_op_only};
-use crate::clock::{self, Nanos};
-use crate::report::{Error, Progress};
+use crate::clock;
+use crate::config::AxisSetup;
+use crate::report::{Error, Home, Progress};
 
 impl RunningSegment {
-    /// Brings a device back that answers at its station address. `position`: where it was found, if it
-    /// had no address.
+    /// Brings a device back that answers at its station address.
     pub(super) async fn attempt(
         &self,
-        (index, position): (DeviceIndex, Option<u16>),
-        since: Option<Nanos>,
-        (restarted, first): (bool, bool),
+        index: DeviceIndex,
+        search: Search,
     ) -> (DeviceIndex, Result<(), Error>) {
-        let done = self.bring_to_op(index, restarted).await;
+        let done = self.bring_to_op(index, &search).await;
         if done.is_err() {
             self.leave_in_init(index).await;
             return (index, done);
         }
-        let since = since.unwrap_or_else(clock::now);
+        let since = search.since.unwrap_or_else(clock::now);
+        let at = self.devices[index].at.clone();
         self.report(Progress::DeviceReturned {
             device: DeviceRef {
-                position: position.unwrap_or(self.devices[index].at.position),
-                ..self.devices[index].at.clone()
+                position: search.place.map_or(at.position, |place| place.position),
+                ..at
             },
             after_ns: clock::now().saturating_sub(since),
-            restarted,
-            first,
+            restarted: search.restarted,
+            home: self.home(index, &search),
+            first: search.absent,
         });
         (index, Ok(()))
     }
 
-    async fn bring_to_op(&self, index: DeviceIndex, restarted: bool) -> Result<(), Error> {
+    /// Returns what a restart has made of the home of the axes.
+    fn home(&self, index: DeviceIndex, search: &Search) -> Option<Home> {
+        let mut axes = self.machine.axes_of(index).peekable();
+        let same = self.is_same(index, search);
+        let kept = |(_, axis): (_, &AxisSetup)| same && axis.config.absolute;
+        axes.peek().filter(|_| search.restarted)?;
+        Some(if axes.all(kept) {
+            Home::Kept
+        } else {
+            Home::Lost
+        })
+    }
+
+    /// Returns true if the serial number shows that a device is the one that was there before.
+    fn is_same(&self, index: DeviceIndex, search: &Search) -> bool {
+        let kept = self.machine.devices[index].parameters.as_ref();
+        let known = kept.is_none_or(|kept| kept.is_of(search.serial));
+        search.serial != 0 && !search.replaced && known
+    }
+
+    async fn bring_to_op(&self, index: DeviceIndex, search: &Search) -> Result<(), Error> {
         let reference = self.bus_status.reference().filter(|r| *r != index);
         let reference = reference
             .and_then(|r| self.devices.get(r))
@@ -47,6 +68,7 @@ impl RunningSegment {
         let mut device = self.devices[index].without_mailbox();
         let (coe, give_back) = loan.unzip();
         device.coe = coe;
+        device.serial = search.serial;
         let progress = &self.progress;
         let report = |step| {
             if let Step::Warning(text) = step {
@@ -67,10 +89,11 @@ impl RunningSegment {
             let _ = give_back.send(coe);
         }
         returned?;
-        if restarted {
+        if search.restarted {
             // The axes need the positions of SafeOp, and their group is not released before Op.
             self.settle().await;
-            self.bus_status.set_restarted(index);
+            let same = self.is_same(index, search);
+            self.bus_status.set_restarted(index, same);
             self.settle().await;
         }
         enable_op_only(&self.wire, &device, true).await?;

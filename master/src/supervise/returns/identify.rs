@@ -184,12 +184,18 @@ impl RunningSegment {
         // An optional device that was absent has no serial number yet.
         if serial != search.serial && config.serial.is_none() && search.place.is_some() {
             let warning = format!(
-                "{}: the device has the serial number {}, before it was {}: it is another one of the same kind. \
-                 Parameters and home are its own",
-                self.devices[index].at, serial, search.serial
+                "{}: the device has the serial number {serial}, before it was {}: it is another one of the same \
+                 kind. Home is lost; {}",
+                self.devices[index].at,
+                search.serial,
+                match config.parameters {
+                    Some(_) => "its parameters are compared with the parameter file",
+                    None => "its parameters are its own (`parameters` restores those of a file)",
+                }
             );
             let _ = self.progress.send(Progress::Warning(warning));
         }
+        search.replaced |= serial != search.serial && search.place.is_some();
         search.serial = serial;
         Ok(())
     }

@@ -9,9 +9,9 @@ use std::path::{Path, PathBuf};
 use ecaxis_esi as esi;
 
 use super::{Device, EsiMatch, Scan};
-use crate::document::format::quoted;
 use ecaxis_master::config::duration;
 use ecaxis_master::esi_library::RevisionMatch;
+use ecaxis_master::text::quoted;
 
 mod axis;
 mod lines;

@@ -7,16 +7,16 @@ use ecaxis_esi::model::Access;
 use ecaxis_esi::{Dictionary, Object, ObjectItem, Writable};
 use proptest::prelude::*;
 
-use super::compare::compare;
-use super::dictionary::dictionary;
-use super::dump::{Dump, DumpError, Origin};
-use super::lookup::{FindError, ObjectQuery, find};
-use super::restore::{RestoreError, Restored, restore};
-use super::restore_order::{Write, order};
-use super::{DataType, Kind, Parameter};
 use ecaxis_master::acyclic::DeviceRef;
+use ecaxis_master::acyclic::parameters::compare::compare;
+use ecaxis_master::acyclic::parameters::dictionary::dictionary;
+use ecaxis_master::acyclic::parameters::restore::{RestoreError, Restored, restore};
+use ecaxis_master::acyclic::parameters::restore_order::{Write, order};
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::mailbox::{CoeClient, DatagramError, MailboxTransport, NamedObject};
+use ecaxis_master::parameters::dump::{Dump, DumpError, Origin};
+use ecaxis_master::parameters::lookup::{FindError, ObjectQuery, find};
+use ecaxis_master::parameters::{DataType, Kind, Parameter};
 use ecaxis_master::report::Cause;
 use ecaxis_test_support::mailbox::fault_injection::Mischief;
 use ecaxis_test_support::mailbox::server::Server;
@@ -363,7 +363,7 @@ impl Failing {
             &mut coe,
             self,
             &device,
-            &dictionary,
+            Some(&dictionary),
             &wanted,
             progress,
         ))

@@ -1,13 +1,13 @@
 //! Writes values to a device.
 
+use crate::acyclic::DeviceRef;
+use crate::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, abort_text};
+use crate::report::{Cause, Error};
 use ecaxis_esi::Dictionary;
-use ecaxis_master::acyclic::DeviceRef;
-use ecaxis_master::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, abort_text};
-use ecaxis_master::report::{Cause, Error};
 
 use super::compare::Difference;
 use super::restore_order::{Write, is_list, is_setting, order, settings_only};
-use super::{Parameter, writable_in_pre_op};
+use crate::parameters::{Parameter, writable_in_pre_op};
 
 /// The maximum number of passes. Settings limit each other, so refused writes are retried after the
 /// others.
@@ -154,7 +154,7 @@ impl<W: MailboxTransport> Device<'_, W> {
 }
 
 /// Writes the settings of `parameters` that exist and differ, in a safe order, and reads them back.
-/// The device must be in PreOp. `progress` receives the completed and planned writes. A
+/// Without a dictionary all exist. The device must be in PreOp. `progress` receives the completed and planned writes. A
 /// cancellation takes effect when no list is empty.
 ///
 /// # Errors
@@ -164,7 +164,7 @@ pub async fn restore(
     coe: &mut CoeClient,
     wire: &impl MailboxTransport,
     device: &DeviceRef,
-    dictionary: &Dictionary,
+    dictionary: Option<&Dictionary>,
     parameters: &[Parameter],
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Restored, RestoreError> {
@@ -188,7 +188,7 @@ impl<W: MailboxTransport> Device<'_, W> {
 
     async fn restore(
         &mut self,
-        dictionary: &Dictionary,
+        dictionary: Option<&Dictionary>,
         parameters: &[Parameter],
         progress: &mut dyn FnMut(usize, usize),
         course: &mut RestoreProgress,
@@ -201,8 +201,11 @@ impl<W: MailboxTransport> Device<'_, W> {
             .filter(|p| is_setting(p))
         {
             self.go_on(course)?;
-            let item = dictionary.item(parameter.at.index, parameter.at.sub);
-            if !item.is_some_and(writable_in_pre_op) {
+            let exists = dictionary.is_none_or(|dictionary| {
+                let item = dictionary.item(parameter.at.index, parameter.at.sub);
+                item.is_some_and(writable_in_pre_op)
+            });
+            if !exists {
                 restored.missing.push(parameter.at);
                 continue;
             }

@@ -3,7 +3,7 @@
 //! Lists, whose subindex 0 is the count, are emptied, filled and counted. PDO lists follow the
 //! order of ETG.1020: no PDO is assigned while its mapping changes.
 
-use super::Parameter;
+use crate::parameters::Parameter;
 
 /// The index offset between the axes of a drive (CiA 402).
 const AXIS: u16 = 0x0800;

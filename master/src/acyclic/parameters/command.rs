@@ -3,9 +3,9 @@
 
 use std::time::Duration;
 
-use ecaxis_master::acyclic::DeviceRef;
-use ecaxis_master::mailbox::{CoeClient, MailboxTransport, Timeouts};
-use ecaxis_master::report::{Cause, Error};
+use crate::acyclic::DeviceRef;
+use crate::mailbox::{CoeClient, MailboxTransport, Timeouts};
+use crate::report::{Cause, Error};
 
 /// The time-out of the command. A device answers when it is done; flash memories take tens of
 /// seconds.

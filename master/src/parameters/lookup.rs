@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use ecaxis_esi::{Address, Dictionary, address};
 
 use super::{items, name_of};
-use ecaxis_master::config::nearest;
-use ecaxis_master::mailbox::object_name;
+use crate::mailbox::object_name;
+use crate::text::nearest;
 
 /// The maximum number of candidates listed for an ambiguous name.
 const MAX_REPORTED: usize = 6;

@@ -1,11 +1,11 @@
 //! Reads every readable object.
 
+use crate::acyclic::DeviceRef;
+use crate::mailbox::{CoeClient, MailboxTransport, NamedObject};
+use crate::report::{Cause, Error};
 use ecaxis_esi::Dictionary;
-use ecaxis_master::acyclic::DeviceRef;
-use ecaxis_master::mailbox::{CoeClient, MailboxTransport, NamedObject};
-use ecaxis_master::report::{Cause, Error};
 
-use super::{Parameter, items, name_of, type_of, writable_in_pre_op};
+use crate::parameters::{Parameter, items, name_of, type_of, writable_in_pre_op};
 
 /// The values of a device.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]

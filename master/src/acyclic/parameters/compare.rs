@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use super::Parameter;
 use super::restore_order::{is_setting, settings_only};
-use ecaxis_master::mailbox::NamedObject;
+use crate::mailbox::NamedObject;
+use crate::parameters::Parameter;
 
 /// A value that differs; `None` if a side does not have the object.
 #[derive(Debug, Clone, PartialEq, Eq)]

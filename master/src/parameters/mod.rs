@@ -1,31 +1,19 @@
-//! Parameters of a device: found by name or number, saved to files, compared and restored. MAY
-//! BLOCK AND ALLOCATE.
+//! Parameters of a device: found by name or number, and saved to files. `acyclic::parameters` reads and
+//! writes them.
 //!
-//! - [`lookup`]: finds an object by number or name;
-//! - [`dictionary`]: the dictionary from the device (SDO Information), in the form of ESI
-//!   dictionaries;
-//! - [`upload`]: reads every readable object;
 //! - [`dump`]: parameter files;
-//! - [`restore_order`]: selects and orders the writes of a restore;
-//! - [`compare`], [`restore`]: compares two sets of values, writes one to a device;
-//! - [`meaning`](mod@meaning): the text of a word or code;
-//! - [`command`]: "save" and "load" (0x1010, 0x1011).
+//! - [`kept`]: the parameter file of a device of a machine;
+//! - [`lookup`]: finds an object by number or name;
+//! - [`meaning`](mod@meaning): the text of a word or code.
 
 use ecaxis_esi::{Dictionary, Object, ObjectItem, Writable};
 
-use ecaxis_master::mailbox::NamedObject;
+use crate::mailbox::NamedObject;
 
-pub mod command;
-pub mod compare;
-pub mod dictionary;
 pub mod dump;
+pub mod kept;
 pub mod lookup;
 pub mod meaning;
-pub mod restore;
-pub mod restore_order;
-#[cfg(test)]
-mod tests;
-pub mod upload;
 
 pub use ecaxis_ecat::data_type::{DataType, Kind};
 pub use ecaxis_ecat::value::ValueError;

@@ -17,8 +17,8 @@ use ecaxis_esi::{Address, Identity};
 use serde::Deserialize;
 
 use super::{DataType, Parameter};
-use crate::document::format::quoted;
-use ecaxis_master::mailbox::NamedObject;
+use crate::mailbox::NamedObject;
+use crate::text::quoted;
 
 /// The device of the parameters.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]

@@ -1,15 +1,15 @@
 //! The dictionary of a device from SDO Information.
 
-use ecaxis_esi::model::{Access, PdoMapping};
-use ecaxis_esi::{Dictionary, Object, ObjectCode, ObjectItem, Writable};
-use ecaxis_master::acyclic::DeviceRef;
-use ecaxis_master::mailbox::{
+use crate::acyclic::DeviceRef;
+use crate::mailbox::{
     CoeCause, CoeClient, EntryDescription, InfoError, InfoRequest, MailboxTransport,
     ObjectDescription, ObjectList,
 };
-use ecaxis_master::report::{Cause, Error};
+use crate::report::{Cause, Error};
+use ecaxis_esi::model::{Access, PdoMapping};
+use ecaxis_esi::{Dictionary, Object, ObjectCode, ObjectItem, Writable};
 
-use super::DataType;
+use crate::parameters::DataType;
 
 /// The maximum number of subindices; the largest known device has a tenth of it.
 const MAX_ITEMS: usize = 50_000;
