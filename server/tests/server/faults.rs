@@ -41,6 +41,25 @@ fn a_drive_fault_is_reported_and_reset() {
     assert_eq!(client.kept_events("group_released").len(), 1);
 }
 
+/// The refusal of the stop counted for the reset that followed it.
+#[test]
+fn a_reset_that_follows_a_stop_is_not_refused() {
+    let script = "[[fault]]\nkind = 'drive-fault'\nat = '2s'\ndevice = 0\ncode = 0x3210\n";
+    let server = Server::with_faults(demo(), script);
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "*"}));
+    let slow = |axis: &str| json!({"axis": axis, "to": 50, "speed": 0.01, "wait": true});
+    let (first, second) = (
+        client.send("move", slow("x")),
+        client.send("move", slow("y")),
+    );
+    assert_eq!(client.answer(first)["ok"], json!(false));
+    assert_eq!(client.answer(second)["ok"], json!(false));
+    client.ok("stop", json!({}));
+    client.done("reset", json!({"axis": "*"}));
+    client.done("enable", json!({"axis": "*"}));
+}
+
 #[test]
 fn a_cable_that_breaks_and_returns_needs_no_person() {
     let script = "[[fault]]\nkind = 'silent'\nat = '2s'\nfor = '3s'\n";

@@ -229,7 +229,9 @@ impl RequestController {
         match request {
             Request::StopAll => {
                 for (axis, hand) in self.hands.enumerate_mut() {
-                    if scene.enabled(axis) {
+                    // With a stopped group the axis stops anyway and refuses the command. The
+                    // refusal would count for the next request, such as the reset.
+                    if scene.enabled(axis) && !scene.stopped(axis) {
                         hand.stop(axis, scene.now, out);
                     }
                 }
