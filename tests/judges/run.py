@@ -2,7 +2,7 @@
 """Other people's tools judge the simulated bus.
 
 pysoem (SOEM's MainDevice) brings a bus up that `ecaxis sim` serves on one end of a veth pair, and
-works with it; so does ethercrab, more briefly. Emitted EEPROM images are read by both, and by SOEM's slaveinfo.
+works with it; so do ethercrab and, over a ring, KickCAT, more briefly. Emitted EEPROM images are read by both, and by SOEM's slaveinfo.
 Chromium opens the page of `ecaxis serve` and those of `ecaxis analyze` and `ecaxis bench`. Foxglove's client, `mcap` and `rosbags` read its values. Run in an environment with `requirements.txt` installed, as root:
 
     python tests/judges/run.py [SECTION …] [--keep FOLDER] [--all]
@@ -23,7 +23,7 @@ import rig
 from report import Report, Stop
 from watch import Watch
 
-SECTIONS = ["bringup", "overlap", "mailbox", "parameters", "operation", "oddities", "faults", "ring", "gateway", "ethercrab", "eeproms", "recordings", "page", "reports", "monitoring", "service", "rights", "viewers"]
+SECTIONS = ["bringup", "overlap", "mailbox", "parameters", "operation", "oddities", "faults", "chain", "ring", "kickcat", "gateway", "ethercrab", "eeproms", "recordings", "page", "reports", "monitoring", "service", "rights", "viewers"]
 
 TRIES = 3
 # The maximum stalled share of a section's time. If every try exceeds it, the section has no result.

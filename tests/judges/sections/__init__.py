@@ -12,10 +12,12 @@ import rig
 from report import Report
 
 from .bringup import bringup, overlap
+from .chain import chain
 from .eeproms import eeproms
 from .ethercrab import ethercrab
 from .faults import faults
 from .gateway import gateway
+from .kickcat import kickcat
 from .mailbox import mailbox
 from .monitoring import monitoring
 from .oddities import oddities
@@ -29,7 +31,7 @@ from .ring import ring
 from .service import service
 from .viewers import viewers
 
-__all__ = ["Bench", "bringup", "eeproms", "ethercrab", "faults", "gateway", "mailbox", "monitoring", "oddities", "operation", "overlap", "page", "parameters", "recordings", "reports", "rights", "ring", "service", "viewers"]
+__all__ = ["Bench", "bringup", "chain", "eeproms", "ethercrab", "faults", "gateway", "kickcat", "mailbox", "monitoring", "oddities", "operation", "overlap", "page", "parameters", "recordings", "reports", "rights", "ring", "service", "viewers"]
 
 MAXON = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml"
 OWN = rig.ROOT / "configs/esi"
