@@ -67,6 +67,12 @@ impl DatagramClient {
         self.ring.map(RingStatus::get)
     }
 
+    /// Returns the status of the ring, with cable redundancy.
+    #[must_use]
+    pub fn ring_status(&self) -> Option<&'static RingStatus> {
+        self.ring
+    }
+
     /// Exchanges both interfaces of a ring.
     pub(crate) fn exchange_ends(&self) {
         if let Some(ring) = self.ring {
@@ -78,6 +84,13 @@ impl DatagramClient {
     #[must_use]
     pub fn breaks(&self) -> (u32, u16) {
         self.ring.map_or((0, 0), RingStatus::breaks)
+    }
+
+    /// Counts the breaks of the ring from now on.
+    pub(crate) fn forget_breaks(&self) {
+        if let Some(ring) = self.ring {
+            ring.forget_breaks();
+        }
     }
 
     /// Returns true if the cables of both interfaces of a ring are exchanged.

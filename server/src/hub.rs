@@ -14,6 +14,7 @@ use ecaxis_axis::setpoint::StreamConfig;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_master::clock::{self, Nanos};
 use ecaxis_master::config::{Machine, OutputRef, Signal};
+use ecaxis_master::link::redundant::RingStatus;
 use ecaxis_master::mailbox::Mailboxes;
 use ecaxis_master::post_mortem::FaultReport;
 use ecaxis_master::report::{DevicePlace, Error};
@@ -134,6 +135,7 @@ struct Inner {
     latest: Option<Arc<Latest>>,
     /// The places of the devices; empty until the bus is up.
     places: IndexVec<DeviceIndex, DevicePlace>,
+    ring: Option<&'static RingStatus>,
     mailboxes: Option<Mailboxes>,
     step: RunningStep,
     speed_override: f64,
@@ -226,6 +228,7 @@ impl Hub {
                 shutdown: false,
                 latest: None,
                 places: IndexVec::default(),
+                ring: None,
                 mailboxes: None,
                 step: RunningStep::default(),
                 speed_override: 1.0,
@@ -460,6 +463,7 @@ impl Hub {
         }
         inner.latest = None;
         inner.places = IndexVec::default();
+        inner.ring = None;
         inner.mailboxes = None;
         inner.step = RunningStep::default();
         // The next run has a virtual time of its own.

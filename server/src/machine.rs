@@ -97,6 +97,7 @@ impl Observer for Reporter<'_> {
         let hub = self.hub;
         match progress {
             Progress::Topology(places) => hub.set_places(places.clone()),
+            Progress::RingStatus(ring) => hub.set_ring(ring),
             Progress::Mailboxes(mailboxes) => hub.set_mailboxes(mailboxes.clone()),
             Progress::Step(ecaxis_master::bringup::Step::State(
                 ecaxis_master::acyclic::AlState::Op,

@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use ecaxis_axis::State;
 use ecaxis_master::acyclic::AlState;
 use ecaxis_master::config::Machine;
+use ecaxis_master::link::redundant::RingState;
 use ecaxis_master::rt::stats::LatencyHistogram;
 use ecaxis_master::{COMMIT, VERSION};
 
@@ -120,6 +121,21 @@ fn server(text: &mut Text, hub: &Hub) {
             }
         },
     );
+    if let Some(ring) = hub.ring() {
+        let closed = ring.get() == RingState::Closed;
+        let help = "1 if the ring of a machine with cable redundancy is closed.";
+        text.gauge("ecaxis_ring_closed", help, f64::from(closed));
+        let help = "Breaks of the ring.";
+        text.family("ecaxis_ring_breaks_total", "counter", help, |out| {
+            out.put(&[], ring.breaks().0.into());
+        });
+        let help = "1 if the interface at an end of the ring has a link.";
+        text.family("ecaxis_interface_link", "gauge", help, |out| {
+            for (nic, has_link) in ring.links() {
+                out.put(&[("interface", nic)], f64::from(has_link));
+            }
+        });
+    }
     let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
     let area = &hub.area;
     for (name, help, value) in [

@@ -1,5 +1,6 @@
 //! The objects `machine` and `state` of the protocol.
 
+use std::collections::BTreeMap;
 use std::sync::atomic::Ordering;
 
 use ecaxis_axis::{AxisStatus, Controlword, Mode, Statusword};
@@ -9,6 +10,7 @@ use ecaxis_esi::address;
 use ecaxis_master::acyclic::AlState;
 use ecaxis_master::acyclic::topology::ports;
 use ecaxis_master::config::{AxisSetup, Machine, Signal};
+use ecaxis_master::link::redundant::{RingState, RingStatus};
 use ecaxis_master::report::events::describe_stop;
 use ecaxis_master::rt::exchange::{DiagnosticRegister, SubDeviceDiagnostics};
 use ecaxis_master::rt::samples::CYCLE_COLUMNS;
@@ -219,11 +221,24 @@ fn bus_state(hub: &Hub, latest: Option<&Latest>) -> Value {
             ("inputs_fresh", json!(snapshot.inputs_fresh)),
             ("stopping", json!(stopping)),
             ("phase", json!(phase)),
+            ("ring", hub.ring().map_or(Value::Null, ring_state)),
         ] {
             bus.insert(key.to_owned(), value);
         }
     }
     Value::Object(bus)
+}
+
+fn ring_state(ring: &RingStatus) -> Value {
+    let state = match ring.get() {
+        RingState::Closed => "closed",
+        RingState::Broken { .. } => "broken",
+        RingState::OneDirection => "one-direction",
+        RingState::Silent => "silent",
+    };
+    let (breaks, _) = ring.breaks();
+    json!({"state": state, "behind": ring.get().split(), "breaks": breaks,
+           "links": ring.links().collect::<BTreeMap<_, _>>()})
 }
 
 fn axis_state(

@@ -71,7 +71,8 @@ fn a_ring_outlasts_each_of_its_interfaces() {
             ),
         ] {
             pair.set(&pair.b, false).expect("down");
-            run.says(place);
+            run.says(&format!("`{}` has no link", pair.b));
+            assert!(run.heard().contains(place), "{}", run.heard());
             std::thread::sleep(Duration::from_millis(300));
             pair.set(&pair.b, true).expect("up");
             run.says("the ring is closed");

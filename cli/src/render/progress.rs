@@ -154,7 +154,10 @@ impl Observer for ProgressPrinter {
             }
             Progress::Emergency(report) => note(&format!("warning: {report}")),
             // The stop of the group is reported.
-            Progress::DeviceLost { .. } | Progress::Topology(_) | Progress::Mailboxes(_) => {}
+            Progress::DeviceLost { .. }
+            | Progress::Topology(_)
+            | Progress::RingStatus(_)
+            | Progress::Mailboxes(_) => {}
             Progress::GroupStopped { group, cause } => {
                 note(&format!(
                     "warning: the group `{group}` stops, the rest goes on: {cause}"

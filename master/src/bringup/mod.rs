@@ -110,9 +110,8 @@ pub struct Bus {
     /// The propagation delays in a closed ring, in the order of the segment; `None` without cable
     /// redundancy.
     pub ring_delays: Option<RingDelays>,
-    /// The state of the ring when the delays were measured, and its breaks until then.
+    /// The state of the ring when the delays were measured.
     pub ring: Option<RingState>,
-    pub ring_breaks: u32,
     /// The durations of the steps so far.
     pub times: StepTimes,
 }
@@ -218,7 +217,7 @@ pub async fn bring_up(
     // From here on, ethercrab only carries datagrams; see docs/decisions/0001.
     drop(group);
     let mut devices = found;
-    let (mut ring_delays, mut ring_breaks) = (None, 0);
+    let mut ring_delays = None;
     let ring = wire.ring();
     if let Some(ring) = ring {
         progress(ring_step(machine, ring));
@@ -230,7 +229,7 @@ pub async fn bring_up(
         let measured = times.measure("propagation delays", None, measure).await?;
         ring_delays = Some(measured);
         // The measurement has opened it.
-        (ring_breaks, _) = wire.breaks();
+        wire.forget_breaks();
     }
     let reference = clocks::reference(&devices);
     let set_up = Box::pin(set_up(
@@ -260,7 +259,6 @@ pub async fn bring_up(
         clocks_settled,
         ring_delays,
         ring,
-        ring_breaks,
         times,
     })
 }

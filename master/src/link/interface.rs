@@ -1,8 +1,10 @@
 //! The requirements on a network interface for EtherCAT, and settings that disturb the cycle.
 
 use std::fmt;
+use std::fs::File;
 use std::io;
 use std::net::IpAddr;
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use super::filter::LinkStats;
@@ -140,6 +142,30 @@ pub fn interfaces() -> Vec<String> {
         .collect();
     names.sort();
     names
+}
+
+/// Reads during a run whether an interface has a link.
+#[derive(Debug)]
+pub struct Carrier {
+    pub nic: String,
+    file: File,
+}
+
+impl Carrier {
+    /// Opens the interface's file in sysfs, if there is one.
+    #[must_use]
+    pub fn open(nic: &str) -> Option<Self> {
+        let file = File::open(SysfsNic::of(Path::new(SYS), nic).folder.join("carrier")).ok()?;
+        let nic = nic.to_owned();
+        Some(Self { nic, file })
+    }
+
+    /// Returns true if the interface has a link. It has none while it is down, where reading fails.
+    #[must_use]
+    pub fn has_link(&self) -> bool {
+        let mut text = [0];
+        self.file.read_at(&mut text, 0).is_ok_and(|len| len == 1) && text == *b"1"
+    }
 }
 
 /// An interface's folder in sysfs.

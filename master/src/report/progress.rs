@@ -12,6 +12,7 @@ use super::{DeviceRef, EmergencyReport, Error};
 use crate::clock::Nanos;
 use crate::config::{Machine, TorqueUnit};
 use crate::link::NicWarning;
+use crate::link::redundant::RingStatus;
 use crate::mailbox::Mailboxes;
 use crate::rt::channel::{PhaseStatus, Snapshot};
 use crate::rt::stats::Counters;
@@ -104,6 +105,8 @@ pub enum Progress {
         /// It is optional and was absent until now.
         first: bool,
     },
+    /// The status of the ring of a machine with cable redundancy; when the cycle begins.
+    RingStatus(&'static RingStatus),
     /// A cable of the ring is broken, or the ring is closed again.
     Ring {
         text: String,

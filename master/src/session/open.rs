@@ -18,6 +18,7 @@ use crate::clock::{self, Clock, Nanos};
 use crate::config::sim::{self, bus_order};
 use crate::config::{DeviceConfig, Locator, Machine, Nic};
 use crate::link::capture::{CapturingLink, Recorder, WriterMode};
+use crate::link::interface::Carrier;
 use crate::link::redundant::{Interfaces, RedundantLink, RingEnds};
 use crate::link::replay::Replay;
 use crate::link::sim::{SimLink, SimRing};
@@ -68,7 +69,14 @@ pub fn link(
             let link = open(nic)?;
             match &machine.bus.redundant {
                 None => link,
-                Some(second) => ring(link, open(second)?, copy_timeout(machine)),
+                Some(second) => {
+                    let ring = ring(link, open(second)?, copy_timeout(machine));
+                    let carriers = Carrier::open(nic).zip(Carrier::open(second));
+                    if let (Some(status), Some(carriers)) = (ring.ring(), carriers) {
+                        status.watch(carriers.into());
+                    }
+                    ring
+                }
             }
         }
     };

@@ -135,6 +135,9 @@ impl RunBuilder<'_> {
                 let (mailboxes, workers) =
                     mailbox_workers(&mut bus, wire, &exchange, machine.bus.cycle_ns, &log);
                 let _ = progress.send(Progress::Topology(bus.places()));
+                if let Some(ring) = wire.ring_status() {
+                    let _ = progress.send(Progress::RingStatus(ring));
+                }
                 let _ = progress.send(Progress::Mailboxes(mailboxes.clone()));
                 let Attachments {
                     controller,
@@ -158,7 +161,7 @@ impl RunBuilder<'_> {
                     phase: bus.dc.as_ref().map(Phase::new),
                     end: rt_end,
                 };
-                let ring = RingWatch::new(bus.ring, bus.ring_breaks);
+                let ring = RingWatch::new(bus.ring);
                 let supervisor = Supervisor {
                     machine: Arc::clone(machine),
                     bus,

@@ -12,42 +12,57 @@ const SETTLING_TIME: Nanos = 20_000_000;
 /// The period in ns in which short breaks are counted.
 const COUNT_PERIOD: Nanos = 1_000_000_000;
 
-/// The state of the ring that was reported last, and a later one with the time of its begin.
+/// The period in ns in which the links of the interfaces are read.
+const LINK_PERIOD: Nanos = 100_000_000;
+
+/// The state of the ring, and for each interface whether it has no link.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Seen {
+    state: RingState,
+    no_link: [bool; 2],
+}
+
+/// What was reported last, and what was seen later with the time of its begin.
 #[derive(Debug, Default)]
 pub(crate) struct RingWatch {
-    reported: Option<RingState>,
-    next: Option<(RingState, Nanos)>,
+    reported: Option<Seen>,
+    next: Option<(Seen, Nanos)>,
+    /// The links, and when they are read again.
+    no_link: [bool; 2],
+    read_at: Nanos,
     /// The breaks that were counted up to the last report, and when they are counted again.
     breaks: u32,
     count_at: Nanos,
 }
 
 impl RingWatch {
-    /// `state`: that of the bring-up, as it was reported, and the breaks until then.
-    pub(crate) fn new(state: Option<RingState>, breaks: u32) -> Self {
+    /// `state`: that of the bring-up, as it was reported.
+    pub(crate) fn new(state: Option<RingState>) -> Self {
         Self {
-            reported: state,
-            breaks,
+            reported: state.map(|state| Seen {
+                state,
+                no_link: [false; 2],
+            }),
             ..Self::default()
         }
     }
 
-    /// Returns a state that has rested for [`SETTLING_TIME`] and is another one than the last.
-    fn changed(&mut self, state: RingState, now: Nanos) -> Option<RingState> {
-        let reported = *self.reported.get_or_insert(state);
-        if state == reported {
+    /// Returns what has rested for [`SETTLING_TIME`] and was not reported last.
+    fn changed(&mut self, seen: Seen, now: Nanos) -> Option<Seen> {
+        let reported = *self.reported.get_or_insert(seen);
+        if seen == reported {
             self.next = None;
             return None;
         }
         match self.next {
-            Some((next, since)) if next == state => {
+            Some((next, since)) if next == seen => {
                 let rests = now.saturating_sub(since) >= SETTLING_TIME;
-                let changed = rests.then_some(state)?;
+                let changed = rests.then_some(seen)?;
                 (self.reported, self.next) = (Some(changed), None);
                 Some(changed)
             }
             _ => {
-                self.next = Some((state, now));
+                self.next = Some((seen, now));
                 None
             }
         }
@@ -69,11 +84,21 @@ impl RingWatch {
 
 impl Supervisor {
     pub(super) fn follow_ring(&mut self) {
-        let Some(state) = self.wire.ring() else {
+        let Some(ring) = self.wire.ring_status() else {
             return;
         };
         let now = clock::now();
-        let changed = self.ring.changed(state, now);
+        if now >= self.ring.read_at {
+            self.ring.read_at = now.saturating_add(LINK_PERIOD);
+            for (no_link, (_, has_link)) in self.ring.no_link.iter_mut().zip(ring.links()) {
+                *no_link = !has_link;
+            }
+        }
+        let seen = Seen {
+            state: ring.get(),
+            no_link: self.ring.no_link,
+        };
+        let changed = self.ring.changed(seen, now);
         let (breaks, place) = self.wire.breaks();
         let short = self.ring.short_breaks(breaks, changed.is_some(), now);
         let name = |position| {
@@ -91,10 +116,13 @@ impl Supervisor {
                 "the ring was broken for short {times}, last {behind}: look for a loose plug or a damaged cable"
             )));
         }
-        let Some(state) = changed else {
+        let Some(Seen { state, no_link }) = changed else {
             return;
         };
-        let text = state.text(self.bus.devices.len(), name);
+        let mut text = state.text(self.bus.devices.len(), name);
+        for ((nic, _), _) in ring.links().zip(no_link).filter(|(_, no_link)| *no_link) {
+            text += &format!("; `{nic}` has no link");
+        }
         let broken = state != RingState::Closed;
         self.report(Progress::Ring { text, broken });
     }
@@ -109,6 +137,10 @@ mod tests {
         let broken = RingState::Broken {
             behind: 2,
             devices: 4,
+        };
+        let seen = |state| Seen {
+            state,
+            no_link: [false; 2],
         };
         let mut watch = RingWatch::default();
         let ms = 1_000_000;
@@ -129,7 +161,11 @@ mod tests {
         assert_eq!(watch.short_breaks(4, false, 1_001 * ms), None);
         assert_eq!(watch.short_breaks(4, false, 2_001 * ms), Some(1));
         for (at, state, expected) in table {
-            assert_eq!(watch.changed(state, at * ms), expected, "{at} ms");
+            assert_eq!(
+                watch.changed(seen(state), at * ms),
+                expected.map(seen),
+                "{at} ms"
+            );
         }
     }
 }

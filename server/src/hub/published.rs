@@ -13,6 +13,17 @@ impl Hub {
         self.lock().latest.clone()
     }
 
+    /// Sets the ring of the run, with cable redundancy.
+    pub fn set_ring(&self, ring: &'static RingStatus) {
+        self.lock().ring = Some(ring);
+    }
+
+    /// Returns the ring of the run, with cable redundancy.
+    #[must_use]
+    pub fn ring(&self) -> Option<&'static RingStatus> {
+        self.lock().ring
+    }
+
     pub fn set_places(&self, places: IndexVec<DeviceIndex, DevicePlace>) {
         self.lock().places = places;
     }

@@ -148,3 +148,26 @@ fn each_device_names_the_port_that_leads_to_it() {
         [true, false, false, false].map(Value::from)
     );
 }
+
+/// The state shows a ring that breaks and is repaired; no axis notices.
+#[test]
+fn a_broken_ring_is_part_of_the_state() {
+    let script = "[[fault]]\nkind = 'link-break'\nat = '2s'\nfor = '3s'\ndevice = 1\nport = 0\n";
+    let mut machine = demo();
+    machine.bus.redundant = Some("second".to_owned());
+    let server = Server::with_faults(machine, script);
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "*"}));
+    let mut ring = |seconds: f64| {
+        client.advance(seconds);
+        let state = client.ask("state", json!({}));
+        state["bus"]["ring"].clone()
+    };
+    let expected = |state: &str, behind: Value, breaks: u32| json!({"state": state, "behind": behind, "breaks": breaks, "links": {}});
+    assert_eq!(ring(0.5), expected("closed", Value::Null, 0));
+    assert_eq!(ring(3.0), expected("broken", json!(1), 1));
+    assert_eq!(ring(5.0), expected("closed", Value::Null, 1));
+    let events = client.kept_events("ring");
+    let broken: Vec<_> = events.iter().map(|event| &event["broken"]).collect();
+    assert_eq!(broken, [&json!(true), &json!(false)]);
+}

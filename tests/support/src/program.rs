@@ -112,6 +112,11 @@ impl ProgramOutput {
         self.child.id()
     }
 
+    /// Returns the messages so far.
+    pub fn heard(&self) -> &str {
+        &self.heard
+    }
+
     /// Waits until a message contains this text.
     #[track_caller]
     pub fn says(&mut self, text: &str) {

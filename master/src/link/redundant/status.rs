@@ -1,8 +1,10 @@
 //! What the copies of the last frames have shown of the ring.
 
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 
 use super::End;
+use crate::link::interface::Carrier;
 
 /// The path of a copy of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -82,6 +84,8 @@ pub struct RingStatus {
     /// Of each interface's copy: [`ARRIVED`], [`RETURNED`] and the number of devices.
     copies: [AtomicU64; 2],
     swapped: AtomicBool,
+    /// The network interfaces, first and second.
+    carriers: OnceLock<[Carrier; 2]>,
     /// The number of breaks and, in the low 16 bits, the place of the last one.
     breaks: AtomicU64,
 }
@@ -169,6 +173,23 @@ impl RingStatus {
             },
             _ => RingState::OneDirection,
         }
+    }
+
+    /// Sets the interfaces whose links are read, once.
+    pub fn watch(&self, carriers: [Carrier; 2]) {
+        let _ = self.carriers.set(carriers);
+    }
+
+    /// Returns the name of each interface and whether it has a link. Not for the cycle. Without
+    /// network interfaces it is empty.
+    pub fn links(&self) -> impl Iterator<Item = (&str, bool)> {
+        let carriers = self.carriers.get().into_iter().flatten();
+        carriers.map(|carrier| (carrier.nic.as_str(), carrier.has_link()))
+    }
+
+    /// Counts the breaks from now on.
+    pub(crate) fn forget_breaks(&self) {
+        self.breaks.store(0, Relaxed);
     }
 
     /// Returns how often the ring was broken, and behind how many devices it was the last time.
