@@ -6,6 +6,8 @@ use std::path::Path;
 use ecaxis_test_support::recordings::process_images;
 use ecaxis_test_support::{axes, faults, machine, recorded, run};
 
+use super::returns::returned;
+
 /// In cycles of 1 ms.
 const RELEASE: usize = 80;
 const ENGAGE: usize = 120;
@@ -39,16 +41,17 @@ impl Seen {
     }
 }
 
-fn cycles(recording: &Path) -> Vec<Seen> {
+/// `at`: the place of `a0` in the image.
+fn cycles(recording: &Path, at: usize) -> Vec<Seen> {
     let word = |data: &[u8]| u16::from_le_bytes([data[0], data[1]]);
     let position = |data: &[u8]| i32::from_le_bytes([data[2], data[3], data[4], data[5]]);
     let images = process_images(recording).into_iter();
     let seen = images.map(|(out, data)| Seen {
         open: out[2 * REGION] & 1 != 0,
-        controlword: word(&out),
-        target: position(&out),
-        statusword: word(&data),
-        actual: position(&data),
+        controlword: word(&out[at..]),
+        target: position(&out[at..]),
+        statusword: word(&data[at..]),
+        actual: position(&data[at..]),
     });
     seen.collect()
 }
@@ -58,7 +61,7 @@ fn recorded_cycles(script: &str) -> (Vec<Seen>, bool) {
     let folder = tempfile::tempdir().expect("a folder");
     let (options, path) = recorded(faults(script), folder.path());
     let (outcome, _) = run(machine(&braked()), options);
-    (cycles(&path), outcome.result.is_ok())
+    (cycles(&path, 0), outcome.result.is_ok())
 }
 
 /// Checks that the brake is closed until the drive is enabled, and opens `RELEASE` cycles before
@@ -138,4 +141,44 @@ fn a_fault_of_another_drive_closes_the_brake_at_standstill() {
         off >= closed + ENGAGE,
         "closed in cycle {closed}, no power in {off}"
     );
+}
+
+/// A held load: the drive, then the device of its brake, loses power and returns. The brake stays closed
+/// until the axis is enabled by command, and the first target is the actual position.
+#[test]
+fn a_returned_drive_holds_its_load_before_the_brake_opens() {
+    let group = "\n[[stop.group]]\nname = \"z\"\naxes = [\"a0\"]\ndevices = [\"io\"]\noutside = \"continue\"\n";
+    let steps = "\n[[step]]\nenable = true\n\n[[step]]\nmove = { a1 = 80.0 }\n\n[[step]]\nmove = { a1 = -80.0 }\n\n[[step]]\nreset = [\"a0\"]\n\
+                 \n[[step]]\nenable = [\"a0\"]\n\n[[step]]\nmove = { a0 = 2.0 }\n";
+    // Behind `a1`, which stays.
+    let text = braked().replacen("position = 1", "position = first", 1);
+    let text = text.replacen("position = 0", "position = 1", 1);
+    let text = text.replacen("position = first", "position = 0", 1);
+    let text = text.split("\n[[step]]").next().expect("devices");
+    let machine = machine(&format!("{text}{group}{steps}"));
+    for device in [1, 2] {
+        let script = format!(
+            "[[fault]]\nkind = \"power-off\"\ndevice = {device}\nat = \"1.5s\"\nfor = \"500ms\"\n"
+        );
+        let folder = tempfile::tempdir().expect("a folder");
+        let (options, path) = recorded(faults(&script), folder.path());
+        let (outcome, heard) = run(machine.clone(), options);
+        let warnings = heard.warnings();
+        let result = outcome.result;
+        result.unwrap_or_else(|error| panic!("{device}: {error}; {warnings:?}"));
+        assert_eq!(returned(&heard).len(), 1, "{device}: {warnings:?}");
+        // Its group is the second in the image.
+        let seen = cycles(&path, REGION);
+        let first = opens_before_motion(&seen);
+        let closed = first + seen[first..].iter().position(|s| !s.open).expect("closed");
+        let again = closed + seen[closed..].iter().position(|s| s.open).expect("open");
+        // Enabled by the second command, with the actual position as the target, before it opens.
+        let without = seen[closed..again].iter().rposition(|s| !s.enabled());
+        let enabled = closed + without.expect("without power") + 1;
+        assert!(enabled < again, "{device}: enabled {enabled}, open {again}");
+        let held = &seen[enabled..again];
+        let off = |s: &Seen| s.target.abs_diff(s.actual);
+        assert!(held.iter().all(|s| off(s) <= 1), "{device}: {held:?}");
+        opens_before_motion(&seen[closed..]);
+    }
 }

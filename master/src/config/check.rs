@@ -19,7 +19,8 @@ use super::steps::{self, Resolved, ResolvedAxis, ResolvedDevice};
 use crate::file_digest::{FileDigest, UsedFile};
 
 use super::{
-    AxisSetup, Bus, Locator, MAX_SUBDEVICES, Machine, Nic, ServerSetup, Signal, Spin, signal,
+    AxisSetup, Bus, GroupStopScope, Locator, MAX_SUBDEVICES, Machine, Nic, ServerSetup, Signal,
+    Spin, StopSetup, signal,
 };
 
 /// Returns `None` only if a problem has been reported.
@@ -116,6 +117,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
     }
     for brake in brakes {
         if let Some(axis) = axes.iter_mut().find(|axis| axis.name == brake.axis) {
+            brake.check_group(axis, &program.stop, p);
             axis.brake_output = Some(brake.output);
         }
     }
@@ -152,6 +154,25 @@ struct BrakeOutput {
     axis: String,
     output: Signal,
     place: Span,
+}
+
+impl BrakeOutput {
+    /// Reports a brake that closes on a moving axis: its output is in a group that may stop alone.
+    fn check_group(&self, axis: &AxisSetup, stop: &StopSetup, p: &mut Problems<'_>) {
+        let of = |device| stop.groups.iter().find(|g| g.devices.contains(&device));
+        let Some(group) = of(self.output.device) else {
+            return;
+        };
+        let alone = group.outside == GroupStopScope::Continue;
+        if alone && of(axis.device).is_none_or(|own| own.name != group.name) {
+            let (name, axis, group) = (&self.output.name, &self.axis, &group.name);
+            let message = format!(
+                "`{name}` opens the brake of `{axis}`, and its group `{group}` may stop while `{axis}` moves"
+            );
+            let hint = "put both into one group (`devices`)";
+            p.add_hint(self.place.clone(), message, hint);
+        }
+    }
 }
 
 /// Returns the outputs that release brakes. `set`: the outputs that steps set.

@@ -224,6 +224,11 @@ fn brake_output_is_exclusive() {
             "[[step]]\nset = { \"io.a\".\"Output 1\" = true }\n",
             "and a step sets it",
         ),
+        (
+            "",
+            "[[stop.group]]\nname = \"g\"\naxes = [\"y\"]\ndevices = [\"io.a\"]\noutside = \"continue\"\n",
+            "its group `g` may stop while `x` moves",
+        ),
     ] {
         let Err(ConfigError::Problems(found)) = load(first, second, steps) else {
             panic!("{second} {steps}")
