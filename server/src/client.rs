@@ -20,6 +20,7 @@ use tokio::sync::Semaphore;
 use crate::command::{
     ALL, Access, BusAction, Index, InterpolationName, Op, Point, ProgramAction, Request,
 };
+use crate::diagnostics::diagnostics_as_json;
 use crate::error::{ErrorCode, OpError};
 use crate::external::{STREAM_POINTS, StreamPoint, command_area};
 use crate::hub::{BusState, Hub, Outcome, Transfer, Work};
@@ -276,6 +277,7 @@ impl Client {
                 Ok(object(json!({"events": events})))
             }
             Op::FaultReports {} => Ok(object(json!({"reports": hub.fault_reports()}))),
+            Op::Diagnostics {} => Ok(object(json!({"diagnostics": diagnostics_as_json(hub)}))),
             Op::Await { bus, timeout_ms } => self.await_bus(bus, timeout_ms).await,
             Op::SdoRead {
                 device,

@@ -36,6 +36,8 @@ pub enum Op {
     },
     /// Returns the last 20 fault reports.
     FaultReports {},
+    /// Returns the state of bus, devices and axes with a level each, as ROS diagnostics.
+    Diagnostics {},
     /// Subscribes to topics.
     Subscribe {
         topics: Vec<Topic>,
@@ -278,6 +280,7 @@ impl Op {
             | Self::State {}
             | Self::Events { .. }
             | Self::FaultReports {}
+            | Self::Diagnostics {}
             | Self::Subscribe { .. }
             | Self::Unsubscribe { .. }
             | Self::Await { .. } => Access::Read,

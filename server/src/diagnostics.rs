@@ -7,6 +7,7 @@ use ecaxis_master::config::{AxisSetup, DeviceConfig};
 use ecaxis_master::report::events::describe_stop;
 use ecaxis_master::ros2::topics::{Diagnostic, DiagnosticLevel};
 use ecaxis_master::rt::exchange::SubDeviceDiagnostics;
+use serde_json::{Map, Value, json};
 
 use crate::hub::{BusState, Hub, Latest};
 
@@ -30,6 +31,22 @@ pub fn diagnostics(hub: &Hub) -> Vec<Diagnostic> {
         .chain(devices)
         .chain(axes)
         .collect()
+}
+
+/// Returns the same as JSON.
+#[must_use]
+pub fn diagnostics_as_json(hub: &Hub) -> Value {
+    let diagnostics = diagnostics(hub).into_iter().map(|diagnostic| {
+        let values = diagnostic.values.into_iter();
+        let values: Map<_, _> = values
+            .map(|(key, text)| (key.to_owned(), json!(text)))
+            .collect();
+        json!({
+            "level": diagnostic.level as u8, "name": diagnostic.name, "message": diagnostic.message,
+            "hardware_id": diagnostic.hardware_id, "values": values,
+        })
+    });
+    diagnostics.collect()
 }
 
 fn bus(hub: &Hub, latest: Option<&Latest>) -> Diagnostic {

@@ -9,7 +9,7 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 use ecaxis_esi::address;
 use ecaxis_master::acyclic::AlState;
 use ecaxis_master::acyclic::topology::ports;
-use ecaxis_master::config::{AxisSetup, Machine, Signal};
+use ecaxis_master::config::{AxisSetup, Machine, Signal, si_factor};
 use ecaxis_master::link::redundant::{RingState, RingStatus};
 use ecaxis_master::report::events::describe_stop;
 use ecaxis_master::rt::exchange::{DiagnosticRegister, SubDeviceDiagnostics};
@@ -102,6 +102,7 @@ fn axis_setup(machine: &Machine, index: AxisIndex, axis: &AxisSetup) -> Value {
         "unit": axis.unit,
         "velocity_unit": format!("{}/s", axis.unit),
         "torque_unit": "%",
+        "si": si_factor(&axis.unit),
         "modes": modes.collect::<Vec<_>>(),
         "homing": axis.homing.is_some(),
         "limits": {

@@ -72,7 +72,7 @@ pub use program::{Action, Step, StopGroup, StopSetup, TableFile};
 pub use signal::{NameError, Signal};
 pub use startup::{Startup, StartupOptions};
 pub use state_timeouts::StateTimeouts;
-pub(crate) use units::si_factor;
+pub use units::si_factor;
 
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 use ecaxis_esi as esi;

@@ -54,7 +54,8 @@ pub(crate) fn is_turn(unit: &str) -> bool {
 }
 
 /// Returns the metres or radians in one unit; `None` for units of neither.
-pub(crate) fn si_factor(unit: &str) -> Option<f64> {
+#[must_use]
+pub fn si_factor(unit: &str) -> Option<f64> {
     use std::f64::consts::{PI, TAU};
     Some(match unit {
         "m" => 1.0,
