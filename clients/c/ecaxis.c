@@ -1,5 +1,7 @@
 /* ecaxis for C, see ecaxis.h and docs/server.md. Nothing that a server sends is trusted. */
+#ifndef _GNU_SOURCE
 #define _GNU_SOURCE
+#endif
 #include "ecaxis.h"
 
 #include <errno.h>
@@ -995,7 +997,7 @@ void ecaxis_cyclic_set(ecaxis_cyclic *c, int axis, ecaxis_kind kind, double valu
     memcpy(&c->prepared[2 * axis + 1], &value, sizeof value);
 }
 
-void ecaxis_cyclic_publish(ecaxis_cyclic *c) {
+uint64_t ecaxis_cyclic_publish(ecaxis_cyclic *c) {
     uint64_t sequence = load(&c->commands, SEQUENCE) & ~(uint64_t)1;
     store(&c->commands, SEQUENCE, sequence + 1);
     atomic_thread_fence(memory_order_release);
@@ -1004,6 +1006,7 @@ void ecaxis_cyclic_publish(ecaxis_cyclic *c) {
     for (size_t n = 0; n < 2 * c->axes; n++)
         store(&c->commands, c->axes_at + n / 2 * c->axis_words + n % 2, c->prepared[n]);
     atomic_store_explicit(c->commands.words + SEQUENCE, sequence + 2, memory_order_release);
+    return c->counter;
 }
 
 bool ecaxis_cyclic_stopped(const ecaxis_cyclic *c, int axis) {
@@ -1011,5 +1014,6 @@ bool ecaxis_cyclic_stopped(const ecaxis_cyclic *c, int axis) {
 }
 
 ecaxis_counters ecaxis_cyclic_counters(const ecaxis_cyclic *c) {
-    return (ecaxis_counters){load(&c->commands, USED), load(&c->commands, LATE), load(&c->commands, REFUSED)};
+    return (ecaxis_counters){load(&c->commands, USED), load(&c->commands, LATE), load(&c->commands, REFUSED),
+                             load(&c->commands, LAST_USED)};
 }

@@ -137,6 +137,7 @@ typedef struct ecaxis_counters {
     uint64_t used;    /* sets that the server has used */
     uint64_t late;    /* cycles without a new set */
     uint64_t refused; /* set-points that it has refused */
+    uint64_t last;    /* the number of the last set that it has used */
 } ecaxis_counters;
 
 /* Maps the memory. NULL if that fails; the machine has the error. Needs the lease. */
@@ -163,8 +164,9 @@ uint64_t ecaxis_cyclic_next_ns(const ecaxis_cyclic *cyclic);
 bool ecaxis_cyclic_in_op(const ecaxis_cyclic *cyclic);
 /* Prepares the set-point of an axis by its number. The first position must be where the axis is. */
 void ecaxis_cyclic_set(ecaxis_cyclic *cyclic, int axis, ecaxis_kind kind, double value);
-/* Makes the prepared set-points valid for the next cycle. */
-void ecaxis_cyclic_publish(ecaxis_cyclic *cyclic);
+/* Makes the prepared set-points valid for the next cycle. Returns the number of the set. An axis that
+ * starts fast keeps its first position until the server has used that set. */
+uint64_t ecaxis_cyclic_publish(ecaxis_cyclic *cyclic);
 /* Returns true if the server has refused a set-point of the axis, or none came in time: the axis has
  * stopped, and follows again after a set with ECAXIS_NONE. */
 bool ecaxis_cyclic_stopped(const ecaxis_cyclic *cyclic, int axis);
