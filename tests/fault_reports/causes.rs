@@ -210,3 +210,18 @@ fn a_device_missing_during_the_scan_is_named() {
         assert!(headline.contains(name), "{script}: {headline}");
     }
 }
+
+/// The report says what disappeared where, and what came back when.
+#[test]
+fn devices_that_come_and_go_are_in_the_report() {
+    let script = fault("power-off", "1.5s", "for = \"300ms\"\ndevice = 1");
+    let (outcome, _) = run(machine(&(one_moves() + GROUP)), faults(&script));
+    let report = outcome.fault_report.expect("of the group");
+    let events: Vec<_> = report.events.iter().map(|event| &event.what).collect();
+    let place = |what: &str| events.iter().position(|event| event.contains(what));
+    let lost = place("`a1` (position 1, station 0x1001) is lost, behind port 1 of `a0`");
+    let back = place("`a1` (position 1, station 0x1001) is in Op again after 0.");
+    assert!(lost.is_some() && lost < back, "{events:#?}");
+    let at = |place: Option<usize>| report.events[place.expect("there")].at_s;
+    assert!(at(back) > at(lost) + 0.3, "{events:#?}");
+}
