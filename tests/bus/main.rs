@@ -14,6 +14,7 @@ mod cycles;
 mod damaged_eeprom;
 mod demo;
 mod eeproms;
+mod flow;
 mod fsoe;
 mod gateway_axes;
 mod homing;

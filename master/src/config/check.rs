@@ -89,8 +89,11 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
     let resolved = Resolved {
         devices: known,
         axes: &axes,
+        folder,
+        cycle_s,
     };
-    let program = steps::check(raw.steps, raw.stop, resolved, folder, cycle_s, repeat, p);
+    let names = (raw.signals, raw.variables, raw.sim);
+    let program = steps::check(raw.steps, raw.stop, names, resolved, repeat, p);
     let brakes = brake_outputs(&brakes, known, &program.outputs, p);
     let steps = program.outputs.iter().zip(&program.output_places);
     let steps = steps.map(|(output, place)| {
@@ -137,6 +140,9 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         steps: program.steps,
         inputs: program.inputs,
         outputs: program.outputs,
+        signals: program.signals,
+        variables: program.variables,
+        switched: program.switched,
         copies,
         stop: program.stop,
         tables: program.tables,

@@ -305,8 +305,11 @@ fn scale_torques(steps: &mut [Step], axis: AxisIndex, factor: f64) {
                     }
                 }
             }
-            Action::Repeat { steps, .. } => scale_torques(steps, axis, factor),
-            _ => {}
+            action => {
+                for step in action.inner_mut() {
+                    scale_torques(std::slice::from_mut(step), axis, factor);
+                }
+            }
         }
     }
 }

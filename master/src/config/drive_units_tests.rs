@@ -111,7 +111,8 @@ fn adopt_rescales_program_and_homing() {
     machine.steps = vec![
         step(torque(&[(0, 8.0), (1, 8.0)])),
         step(Action::Repeat {
-            times: 2,
+            times: Some(2),
+            until: None,
             steps: vec![step(torque(&[(0, 4.0)]))],
         }),
     ];

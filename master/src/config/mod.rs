@@ -68,7 +68,10 @@ pub use drive_limits::LimitConflict;
 pub use drive_units::{AdoptedUnits, UnitProblem};
 pub use gateway::{GatewaySetup, NodeSetup};
 pub use problem::{ConfigError, Problem};
-pub use program::{Action, Step, StopGroup, StopSetup, TableFile};
+pub use program::{
+    Action, AxisValue, NamedSignal, Step, StopGroup, StopSetup, Subject, SwitchedInput, TableFile,
+    Test, Variable, VariableRef, When,
+};
 pub use signal::{NameError, Signal};
 pub use startup::{Startup, StartupOptions};
 pub use state_timeouts::StateTimeouts;
@@ -85,7 +88,7 @@ use crate::file;
 use crate::file_digest::{FileDigest, UsedFile};
 use crate::link::SocketKind;
 use crate::parameters::kept::KeptParameters;
-pub use crate::rt::config::{Condition, ExchangeMode, GroupStopScope};
+pub use crate::rt::config::{Bounds, Condition, ExchangeMode, GroupStopScope};
 use crate::rt::config::{GroupConfig, RtConfig};
 pub use crate::rt::controller::{AxisRef, InputRef, OutputRef};
 use crate::rt::image::{OpOnly, ProcessData};
@@ -112,6 +115,12 @@ pub struct Machine {
     /// The signals that the steps read; `outputs` are those they set.
     pub inputs: Vec<Signal>,
     pub outputs: Vec<Signal>,
+    /// The names of `[signals]`.
+    pub signals: Vec<NamedSignal>,
+    /// The variables of the program.
+    pub variables: Vec<Variable>,
+    /// What the simulated bus does with its inputs.
+    pub switched: Vec<SwitchedInput>,
     pub copies: Vec<CopySetup>,
     pub stop: StopSetup,
     /// The set-point tables that the steps play.

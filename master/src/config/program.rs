@@ -2,10 +2,12 @@
 
 use std::path::PathBuf;
 
-use ecaxis_axis::{Edge, StopMethod};
+use ecaxis_axis::{AxisStatus, Edge, StopMethod};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 
-use super::{Condition, GroupStopScope, Machine, OutputRef, duration};
+use super::{
+    AxisSetup, Bounds, Condition, GroupStopScope, InputRef, Machine, OutputRef, Signal, duration,
+};
 use crate::text::rounded;
 
 /// One step of the program.
@@ -119,19 +121,197 @@ pub enum Action {
     Dwell {
         ns: u64,
     },
-    /// Wait until all conditions hold in the same cycle.
+    /// Wait until the condition holds.
     Wait {
-        conditions: Vec<Condition>,
-        timeout_ns: u64,
+        when: When,
+        /// `None`: without limit.
+        timeout_ns: Option<u64>,
     },
     /// Set outputs to values.
     Set {
         values: Vec<(OutputRef, f64)>,
     },
+    /// Set variables, or add to them.
+    Assign {
+        add: bool,
+        values: Vec<(VariableRef, f64)>,
+    },
+    /// Report a text.
+    Message {
+        text: String,
+    },
+    /// End the program with an error.
+    Alarm {
+        text: String,
+    },
     Repeat {
-        times: u32,
+        /// `None`: without end.
+        times: Option<u32>,
+        /// Checked after each round, which is then the last one.
+        until: Option<When>,
         steps: Vec<Step>,
     },
+    /// Repeat while the condition holds. It is checked before each round.
+    While {
+        when: When,
+        steps: Vec<Step>,
+    },
+    If {
+        when: When,
+        steps: Vec<Step>,
+        otherwise: Vec<Step>,
+    },
+}
+
+impl Action {
+    /// Returns the steps inside the step.
+    pub fn inner(&self) -> impl Iterator<Item = &Step> {
+        let (steps, otherwise): (&[Step], &[Step]) = match self {
+            Self::Repeat { steps, .. } | Self::While { steps, .. } => (steps, &[]),
+            Self::If {
+                steps, otherwise, ..
+            } => (steps, otherwise),
+            _ => (&[], &[]),
+        };
+        steps.iter().chain(otherwise)
+    }
+
+    /// True for a step after which no other one runs.
+    pub(crate) fn never_ends(&self) -> bool {
+        match self {
+            Self::Alarm { .. } => true,
+            Self::Repeat {
+                times: None,
+                until: None,
+                ..
+            } => true,
+            Self::Repeat { steps, .. } => steps.last().is_some_and(|s| s.action.never_ends()),
+            Self::If {
+                steps, otherwise, ..
+            } => [steps, otherwise]
+                .iter()
+                .all(|steps| steps.last().is_some_and(|s| s.action.never_ends())),
+            _ => false,
+        }
+    }
+
+    /// As [`Action::inner`].
+    pub(crate) fn inner_mut(&mut self) -> impl Iterator<Item = &mut Step> {
+        let (steps, otherwise): (&mut [Step], &mut [Step]) = match self {
+            Self::Repeat { steps, .. } | Self::While { steps, .. } => (steps, &mut []),
+            Self::If {
+                steps, otherwise, ..
+            } => (steps, otherwise),
+            _ => (&mut [], &mut []),
+        };
+        steps.iter_mut().chain(otherwise)
+    }
+}
+
+/// A condition of the program: alternatives, each of which is tests that hold at once.
+#[derive(Debug, Clone, PartialEq)]
+pub struct When(pub Vec<Vec<Test>>);
+
+impl When {
+    /// `value` returns the present value of a subject.
+    pub fn holds(&self, value: impl Fn(Subject) -> f64) -> bool {
+        let all = |tests: &Vec<Test>| tests.iter().all(|test| test.bounds.holds(value(test.of)));
+        self.0.iter().any(all)
+    }
+}
+
+/// A test of one value.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Test {
+    pub of: Subject,
+    pub bounds: Bounds,
+}
+
+/// A value that a condition tests.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Subject {
+    Input(InputRef),
+    Axis(AxisIndex, AxisValue),
+    Variable(VariableRef),
+}
+
+/// A name of `[signals]`, for a signal of a device.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NamedSignal {
+    pub name: String,
+    /// As [`Signal::name`].
+    pub signal: String,
+}
+
+/// An input of a simulated I/O device that is switched by time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SwitchedInput {
+    /// Since the bus got its power.
+    pub at_ns: u64,
+    /// It is 0 again after this time. `None`: never.
+    pub for_ns: Option<u64>,
+    pub input: Signal,
+    pub value: f64,
+}
+
+/// A variable by its place in [`Machine::variables`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct VariableRef(pub usize);
+
+/// A variable of the program.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Variable {
+    pub name: String,
+    pub initial: f64,
+}
+
+/// What a condition may test of an axis. Yes is 1, no is 0.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AxisValue {
+    Position,
+    Velocity,
+    Torque,
+    FollowingError,
+    Enabled,
+    Moving,
+    AtRest,
+    Homed,
+    Fault,
+}
+
+impl AxisValue {
+    pub const ALL: [(&str, Self); 9] = [
+        ("position", Self::Position),
+        ("velocity", Self::Velocity),
+        ("torque", Self::Torque),
+        ("following_error", Self::FollowingError),
+        ("enabled", Self::Enabled),
+        ("moving", Self::Moving),
+        ("at_rest", Self::AtRest),
+        ("homed", Self::Homed),
+        ("fault", Self::Fault),
+    ];
+
+    /// Returns the value, in the unit of the machine file.
+    pub(crate) fn of(self, status: &AxisStatus, setup: &AxisSetup) -> f64 {
+        let yes = |is: bool| f64::from(u8::from(is));
+        match self {
+            Self::Position => status.position,
+            Self::Velocity => status.velocity,
+            Self::Torque => setup.torque.shown(status.torque),
+            Self::FollowingError => status.following_error,
+            Self::Enabled => yes(status.ready),
+            Self::Moving => yes(status.moving),
+            Self::AtRest => yes(status.at_rest),
+            Self::Homed => yes(status.homed),
+            Self::Fault => yes(status.fault.is_some() || status.trip.is_some()),
+        }
+    }
+
+    pub(crate) fn is_yes_or_no(self) -> bool {
+        use AxisValue::{AtRest, Enabled, Fault, Homed, Moving};
+        matches!(self, Enabled | Moving | AtRest | Homed | Fault)
+    }
 }
 
 /// How the machine stops.
@@ -283,42 +463,106 @@ impl Machine {
             }
             Action::Dwell { ns } => format!("wait {}", duration::show(*ns)),
             Action::Wait {
-                conditions,
-                timeout_ns,
-            } => {
-                let each = conditions.iter().map(|c| self.condition(c));
-                format!(
-                    "wait until {}, {} at most",
-                    each.collect::<Vec<_>>().join(" and "),
-                    duration::show(*timeout_ns),
-                )
+                when,
+                timeout_ns: None,
+            } => format!("wait until {}", self.when(when)),
+            Action::Wait {
+                when,
+                timeout_ns: Some(ns),
+            } => format!(
+                "wait until {}, {} at most",
+                self.when(when),
+                duration::show(*ns)
+            ),
+            Action::Assign { add, values } => {
+                let sign = if *add { "+=" } else { "=" };
+                let each = values.iter().filter_map(|&(variable, value)| {
+                    Some(format!(
+                        "{} {sign} {value}",
+                        self.variables.get(variable.0)?.name
+                    ))
+                });
+                each.collect::<Vec<_>>().join(", ")
             }
+            Action::Message { text } => text.clone(),
+            Action::Alarm { text } => format!("alarm: {text}"),
             Action::Set { values } => {
                 let each = values.iter().filter_map(|&(output, value)| {
-                    Some(format!("{} = {value}", self.outputs.get(output.0)?.name))
+                    Some(format!(
+                        "{} = {value}",
+                        self.short(self.outputs.get(output.0)?)
+                    ))
                 });
                 format!("set {}", each.collect::<Vec<_>>().join(", "))
             }
-            Action::Repeat { times: 1, .. } => "once".to_owned(),
-            Action::Repeat { times, .. } => format!("{times} times"),
+            Action::Repeat { times, until, .. } => {
+                let times = match times {
+                    None => "for ever".to_owned(),
+                    Some(1) => "once".to_owned(),
+                    Some(times) => format!("{times} times"),
+                };
+                let until = until
+                    .as_ref()
+                    .map(|when| format!(", until {}", self.when(when)));
+                times + &until.unwrap_or_default()
+            }
+            Action::While { when, .. } => format!("while {}", self.when(when)),
+            Action::If { when, .. } => format!("if {}", self.when(when)),
         }
     }
 
     /// Returns a condition as text: `io.Input 3 = 1`.
     #[must_use]
     pub fn condition(&self, condition: &Condition) -> String {
-        let name = self
-            .inputs
-            .get(condition.input.0)
-            .map_or("?", |input| input.name.as_str());
-        let bounds = [
-            ("=", condition.equal),
-            (">", condition.above),
-            ("<", condition.below),
-        ];
-        let bounds = bounds.into_iter();
+        self.test(&Test {
+            of: Subject::Input(condition.input),
+            bounds: condition.bounds,
+        })
+    }
+
+    /// Returns the condition of a step as text: `io.Input 3 = 1 and x.position > 5, or …`.
+    #[must_use]
+    pub fn when(&self, when: &When) -> String {
+        let all = |tests: &Vec<Test>| {
+            let each: Vec<_> = tests.iter().map(|test| self.test(test)).collect();
+            each.join(" and ")
+        };
+        when.0.iter().map(all).collect::<Vec<_>>().join(", or ")
+    }
+
+    /// Returns the name of `[signals]`, otherwise the signal's own.
+    fn short(&self, signal: &Signal) -> String {
+        let named = self
+            .signals
+            .iter()
+            .find(|named| named.signal == signal.name);
+        named.map_or_else(|| signal.name.clone(), |named| named.name.clone())
+    }
+
+    pub(crate) fn test(&self, test: &Test) -> String {
+        let name = match test.of {
+            Subject::Input(input) => self.inputs.get(input.0).map(|input| self.short(input)),
+            Subject::Variable(at) => self.variables.get(at.0).map(|known| known.name.clone()),
+            Subject::Axis(axis, value) => {
+                let word = AxisValue::ALL.iter().find(|(_, each)| *each == value);
+                let axis = self.axes.get(axis);
+                axis.zip(word)
+                    .map(|(axis, (word, _))| format!("{}.{word}", axis.name))
+            }
+        };
+        let Bounds {
+            equal,
+            above,
+            below,
+        } = test.bounds;
+        let bounds = [("=", equal), (">", above), ("<", below)].into_iter();
         let bounds = bounds.filter_map(|(sign, n)| Some(format!("{sign} {}", n?)));
-        format!("{name} {}", bounds.collect::<Vec<_>>().join(" and "))
+        let bounds: Vec<_> = bounds.collect();
+        format!(
+            "{} {}",
+            name.as_deref().unwrap_or("?"),
+            bounds.join(" and ")
+        )
     }
 
     fn names(&self, axes: &[AxisIndex]) -> String {

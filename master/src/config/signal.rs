@@ -177,6 +177,25 @@ pub(super) fn split_device(
         .or_else(|| word.find('.'))
 }
 
+/// Returns the signal of a text such as `io.Input 3`; `None` if the device is invalid, which has been
+/// reported.
+pub(crate) fn of_text(
+    word: &str,
+    devices: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
+    way: SignalDirection,
+) -> Result<Option<Signal>, NameError> {
+    let Some(split) = split_device(word, devices) else {
+        let message = format!("\"{word}\" names no input and no output");
+        let hint = "write a device and its signal: \"io.Input 3\"";
+        return Err(NameError::of_signal(message, hint));
+    };
+    let (device, name) = (&word[..split], &word[split + 1..]);
+    let index = DeviceIndex(place(device, devices.iter().map(|d| d.name))?);
+    let config = devices[index].device;
+    let found = config.map(|config| one(name, way, index, config));
+    found.transpose()
+}
+
 /// Returns an output that no axis writes, from a text such as `io.Output 3`.
 pub(crate) fn output_of_text(
     text: &Spanned<String>,
@@ -194,7 +213,7 @@ pub(crate) fn output_of_text(
         return None;
     };
     let raw = RawSignal {
-        device: Spanned::new(text.span(), word[..split].to_owned()),
+        device: Some(Spanned::new(text.span(), word[..split].to_owned())),
         name: Spanned::new(text.span(), word[split + 1..].to_owned()),
     };
     resolve(&raw, devices, SignalDirection::Out, p)
@@ -208,7 +227,8 @@ pub(crate) fn resolve(
     p: &mut Problems<'_>,
 ) -> Option<Signal> {
     let names = devices.iter().map(|d| d.name);
-    let found = place(raw.device.get_ref(), names).and_then(|index| {
+    let device = raw.device.as_ref()?;
+    let found = place(device.get_ref(), names).and_then(|index| {
         let index = DeviceIndex(index);
         // An invalid device has already been reported.
         let device = devices[index].device;
@@ -217,7 +237,7 @@ pub(crate) fn resolve(
             .transpose()
     });
     found.unwrap_or_else(|error| {
-        let at = if error.device { &raw.device } else { &raw.name };
+        let at = if error.device { device } else { &raw.name };
         p.add_hint(at.span(), error.message, error.hint);
         None
     })
@@ -242,6 +262,15 @@ impl NameError {
             message,
             hint: hint.into(),
             device: false,
+        }
+    }
+
+    /// Returns the error of a name that is neither an input nor an output.
+    pub(super) fn or(self, output: Self) -> Self {
+        let guesses = |error: &Self| error.hint.starts_with("did you mean");
+        match guesses(&output) && !guesses(&self) {
+            true => output,
+            false => self,
         }
     }
 }
@@ -339,6 +368,19 @@ fn one(
 
 /// Names that a controller resolves before the machine runs.
 impl Machine {
+    /// Returns the inputs and the outputs of a device that steps may name.
+    #[must_use]
+    pub fn signals_of(&self, index: DeviceIndex) -> [Vec<Signal>; 2] {
+        let device = &self.devices[index];
+        [SignalDirection::In, SignalDirection::Out].map(|way| {
+            let candidates = Candidates::new(device, way);
+            let fields = candidates.fields.iter();
+            let named =
+                fields.filter_map(|field| one(&candidates.name(field), way, index, device).ok());
+            named.collect()
+        })
+    }
+
     /// Returns the axis with this name.
     ///
     /// # Errors

@@ -7,6 +7,7 @@ use std::path::Path;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use toml::Spanned;
 
+mod condition;
 mod follow;
 mod modes;
 mod preconditions;
@@ -16,11 +17,12 @@ mod target;
 
 use super::fields::{Key, KeyExt};
 use super::problem::{Problems, Span, suggestion};
-use super::raw::{RawAction, RawAxes, RawCondition, RawSignal, RawStep, RawStop};
-use super::signal::SignalDirection;
+use super::raw::{
+    Levels, NamedValues, RawAction, RawAxes, RawSimulation, RawStep, RawStop, TimeLimit,
+};
 use super::{
-    Action, AxisSetup, Condition, DeviceConfig, InputRef, OutputRef, Signal, Step, StopSetup,
-    TableFile, signal,
+    Action, AxisSetup, DeviceConfig, NamedSignal, Signal, Step, StopSetup, SwitchedInput,
+    TableFile, Variable,
 };
 use ecaxis_axis::Mode;
 pub(crate) use preconditions::enables;
@@ -54,6 +56,9 @@ pub(crate) struct ResolvedAxis<'c> {
 pub(crate) struct Resolved<'c> {
     pub devices: &'c IndexVec<DeviceIndex, ResolvedDevice<'c>>,
     pub axes: &'c IndexVec<AxisIndex, ResolvedAxis<'c>>,
+    /// The base of relative file names.
+    pub folder: &'c Path,
+    pub cycle_s: f64,
 }
 
 /// The steps with their signals.
@@ -66,15 +71,17 @@ pub(crate) struct Program {
     /// For each output, the first place that sets it.
     pub output_places: Vec<Span>,
     pub tables: Vec<TableFile>,
+    pub signals: Vec<NamedSignal>,
+    pub variables: Vec<Variable>,
+    pub switched: Vec<SwitchedInput>,
 }
 
-/// Checks the steps. `folder` is the base of relative file names.
+/// Checks the steps.
 pub(crate) fn check(
     steps: Vec<RawStep>,
     stop: RawStop,
+    (signals, variables, sim): (NamedValues<String>, NamedValues<f64>, RawSimulation),
     known: Resolved<'_>,
-    folder: &Path,
-    cycle_s: f64,
     repeat: u32,
     p: &mut Problems<'_>,
 ) -> Program {
@@ -82,8 +89,8 @@ pub(crate) fn check(
     let mut checker = ProgramChecker {
         devices: known.devices,
         axes: known.axes,
-        folder,
-        cycle_s,
+        folder: known.folder,
+        cycle_s: known.cycle_s,
         tables: Vec::new(),
         inputs: Vec::new(),
         outputs: Vec::new(),
@@ -92,13 +99,18 @@ pub(crate) fn check(
         switched: Vec::new(),
         number: String::new(),
         places: RefCell::default(),
+        signals: Vec::new(),
+        variables: Vec::new(),
     };
+    checker.name_signals(signals, p);
+    checker.name_variables(variables, p);
     let steps = checker.all(steps, "", p);
     // After an invalid step, the state of the axes is unknown.
     if p.count() == before {
         checker.flow(&steps, repeat, p);
     }
     let stop = checker.stop(&stop, p);
+    let switched = checker.switched_inputs(sim, p);
     Program {
         stop,
         steps,
@@ -106,6 +118,9 @@ pub(crate) fn check(
         outputs: checker.outputs,
         output_places: checker.output_places,
         tables: checker.tables,
+        signals: checker.signals,
+        variables: checker.variables,
+        switched,
     }
 }
 
@@ -125,6 +140,9 @@ struct ProgramChecker<'c> {
     number: String,
     /// The places of steps, and of axes named in them.
     places: RefCell<BTreeMap<(String, Option<AxisIndex>), Span>>,
+    /// The names of `[signals]`, and `[variables]`.
+    signals: Vec<NamedSignal>,
+    variables: Vec<Variable>,
 }
 
 impl ProgramChecker<'_> {
@@ -142,6 +160,21 @@ impl ProgramChecker<'_> {
             self.number.clone_from(&number);
             let place = (number.clone(), None);
             self.places.borrow_mut().insert(place, span.clone());
+            if let Some(last) = checked
+                .last()
+                .filter(|step: &&Step| step.action.never_ends())
+            {
+                let message = format!(
+                    "no run reaches this step: step {} in line {} does not end",
+                    last.number, last.line
+                );
+                p.add_hint(
+                    span,
+                    message,
+                    "remove it, or give the other step an end (`until`)",
+                );
+                break;
+            }
             if let Some(action) = self.one(step, &number, p) {
                 checked.push(Step {
                     number,
@@ -239,21 +272,18 @@ impl ProgramChecker<'_> {
                 (count > 0 && targets.len() == count).then_some(Action::Mode { targets })?
             }
             RawAction::Dwell(ns) => Action::Dwell { ns },
-            RawAction::Wait {
-                conditions,
-                timeout,
-            } => {
-                let count = conditions.len();
-                let conditions: Vec<Condition> = conditions
-                    .into_iter()
-                    .filter_map(|condition| self.condition(&condition, p))
-                    .collect();
-                (count > 0 && conditions.len() == count).then_some(Action::Wait {
-                    conditions,
-                    timeout_ns: timeout.unwrap_or(WAIT_NS),
-                })?
+            RawAction::Wait { when, timeout } => {
+                let checked = self.when(&when, p)?;
+                let TimeLimit(timeout_ns) = timeout.unwrap_or(TimeLimit(Some(WAIT_NS)));
+                if timeout_ns.is_none() {
+                    self.check_can_end(&checked, &span, p)?;
+                }
+                Action::Wait {
+                    when: checked,
+                    timeout_ns,
+                }
             }
-            RawAction::Set(values) => {
+            RawAction::Set(Levels(values)) => {
                 let count = values.len();
                 let values: Vec<_> = values
                     .into_iter()
@@ -261,10 +291,50 @@ impl ProgramChecker<'_> {
                     .collect();
                 (count > 0 && values.len() == count).then_some(Action::Set { values })?
             }
-            RawAction::Repeat { times, steps } => Action::Repeat {
+            RawAction::Assign { add, values } => {
+                let count = values.len();
+                let values: Vec<_> = values
+                    .into_iter()
+                    .filter_map(|(name, value)| {
+                        Some((self.variable(&name, p)?, value.into_inner()))
+                    })
+                    .collect();
+                (count > 0 && values.len() == count).then_some(Action::Assign { add, values })?
+            }
+            RawAction::Message(text) => Action::Message { text },
+            RawAction::Alarm(text) => Action::Alarm { text },
+            RawAction::Repeat {
                 times,
-                steps: self.all(steps, &format!("{number}."), p),
-            },
+                until,
+                steps,
+            } => {
+                let until = until.map(|until| self.when(&until, p));
+                let steps = self.all(steps, &format!("{number}."), p);
+                Action::Repeat {
+                    times,
+                    until: until.map_or(Some(None), |until| until.map(Some))?,
+                    steps,
+                }
+            }
+            RawAction::While { when, steps } => {
+                let when = self.when(&when, p);
+                let steps = self.all(steps, &format!("{number}."), p);
+                Action::While { when: when?, steps }
+            }
+            RawAction::If {
+                when,
+                steps,
+                otherwise,
+            } => {
+                let when = self.when(&when, p);
+                let steps = self.all(steps, &format!("{number}."), p);
+                let otherwise = self.all(otherwise, &format!("{number}.else."), p);
+                Action::If {
+                    when: when?,
+                    steps,
+                    otherwise,
+                }
+            }
         })
     }
 
@@ -345,64 +415,4 @@ impl ProgramChecker<'_> {
         let message = format!("`{name}` has several axes");
         (message, format!("name one of them: {}", own.join(", ")))
     }
-
-    fn condition(&mut self, raw: &RawCondition, p: &mut Problems<'_>) -> Option<Condition> {
-        let input = signal::resolve(&raw.signal, self.devices, SignalDirection::In, p)?;
-        let bounds = [&raw.equal, &raw.above, &raw.below].map(|bound| bound.as_ref());
-        if let Some(equal) = &raw.equal {
-            possible(&input, equal, p)?;
-        }
-        if let [_, Some(above), Some(below)] = bounds
-            && above.get_ref() >= below.get_ref()
-        {
-            let message = format!(
-                "no value is above {} and below {}",
-                above.get_ref(),
-                below.get_ref()
-            );
-            p.add(above.span(), message);
-            return None;
-        }
-        let [equal, above, below] = bounds.map(|bound| bound.map(|n| *n.get_ref()));
-        Some(Condition {
-            input: InputRef(signal::known(&mut self.inputs, input)),
-            equal,
-            above,
-            below,
-        })
-    }
-
-    fn output(
-        &mut self,
-        raw: &RawSignal,
-        value: &Spanned<f64>,
-        p: &mut Problems<'_>,
-    ) -> Option<(OutputRef, f64)> {
-        let output = signal::resolve(raw, self.devices, SignalDirection::Out, p)?;
-        possible(&output, value, p)?;
-        let index = signal::known(&mut self.outputs, output);
-        if self.output_places.len() < self.outputs.len() {
-            self.output_places.push(raw.name.span());
-        }
-        Some((OutputRef(index), *value.get_ref()))
-    }
-}
-
-/// Checks that the signal's bits can hold the value.
-fn possible(signal: &Signal, value: &Spanned<f64>, p: &mut Problems<'_>) -> Option<()> {
-    let (low, high, whole) = signal.range();
-    let n = *value.get_ref();
-    if (low..=high).contains(&n) && (!whole || n.fract() == 0.0) {
-        return Some(());
-    }
-    let message = format!("{n} is not a value of `{}`", signal.name);
-    let hint = if high == 1.0 {
-        "it is one bit: true or false".to_owned()
-    } else if whole {
-        format!("it has {} bits: {low} to {high}", signal.field.bit_len)
-    } else {
-        "it is a floating-point number of 32 bits".to_owned()
-    };
-    p.add_hint(value.span(), message, hint);
-    None
 }

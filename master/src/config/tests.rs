@@ -1,3 +1,4 @@
+mod flow;
 mod mistakes;
 
 use std::path::PathBuf;

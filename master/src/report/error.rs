@@ -363,7 +363,13 @@ pub enum Cause {
         #[source]
         error: ecaxis_axis::homing::HomingError,
     },
-    #[error("{condition} did not come within {timeout_ms} ms: it is {value}")]
+    /// A step `alarm` of the program.
+    #[error("alarm: {text}")]
+    Alarm { text: String },
+    #[error(
+        "{condition} did not come within {timeout_ms} ms{}",
+        if value.is_nan() { String::new() } else { format!(": it is {value}") }
+    )]
     WaitTimeout {
         condition: String,
         value: f64,

@@ -80,16 +80,22 @@ pub enum GroupStopScope {
     Continue,
 }
 
-/// A condition on an input. All given bounds must hold.
+/// A condition on an input.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Condition {
     pub input: InputRef,
+    pub bounds: Bounds,
+}
+
+/// Bounds of a value. All given ones must hold.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Bounds {
     pub equal: Option<f64>,
     pub above: Option<f64>,
     pub below: Option<f64>,
 }
 
-impl Condition {
+impl Bounds {
     /// RT.
     #[must_use]
     pub fn holds(&self, value: f64) -> bool {

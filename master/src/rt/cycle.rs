@@ -364,7 +364,7 @@ impl Engine {
         let pressed = |c: &Condition| {
             inputs
                 .get(c.input.0)
-                .is_none_or(|n| n.is_nan() || c.holds(*n))
+                .is_none_or(|n| n.is_nan() || c.bounds.holds(*n))
         };
         if self.guarding && self.config.emergency.iter().any(pressed) {
             self.stop(None, StopCause::EmergencyStop);

@@ -16,7 +16,7 @@ use crate::acyclic::eeprom::size_of;
 use crate::acyclic::image::with_alias;
 use crate::clock::{self, Clock, Nanos};
 use crate::config::sim::{self, bus_order};
-use crate::config::{DeviceConfig, Locator, Machine, Nic};
+use crate::config::{DeviceConfig, Locator, Machine, Nic, SwitchedInput};
 use crate::link::capture::{CapturingLink, Recorder, WriterMode};
 use crate::link::interface::Carrier;
 use crate::link::redundant::{Interfaces, RedundantLink, RingEnds};
@@ -175,9 +175,22 @@ pub fn simulated_bus(
         ..SegmentOptions::default()
     };
     let mut segment = Segment::with_topology(devices, topology, options);
-    if let Some(faults) = faults {
-        segment.set_faults(faults.clone());
+    let mut faults = faults.cloned().unwrap_or_default();
+    let order = bus_order(&machine.devices);
+    for switched in &machine.switched {
+        let SwitchedInput {
+            at_ns,
+            for_ns,
+            input,
+            value,
+        } = switched;
+        let name = &machine.devices[input.device].name;
+        if let Some(device) = order.iter().position(|other| other.name == *name) {
+            let object = (device, input.field.index, input.field.sub);
+            faults.add_input(object, *value as i64, (*at_ns, *for_ns));
+        }
     }
+    segment.set_faults(faults);
     Ok(segment)
 }
 

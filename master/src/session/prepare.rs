@@ -191,6 +191,7 @@ impl RunBuilder<'_> {
                     clock_tree: None,
                     returns: None,
                     ring,
+                    variables: Vec::new(),
                     device_log: DeviceLog::default(),
                 };
                 Ok(Prepared { parts, supervisor })

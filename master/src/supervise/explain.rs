@@ -42,7 +42,10 @@ impl Supervisor {
                 let value =
                     |input: InputRef| snapshot.inputs.get(input.0).copied().unwrap_or(f64::NAN);
                 let all = &self.machine.stop.emergency;
-                let pressed = all.iter().find(|c| c.holds(value(c.input))).or(all.first());
+                let pressed = all
+                    .iter()
+                    .find(|c| c.bounds.holds(value(c.input)))
+                    .or(all.first());
                 Cause::EmergencyStop {
                     condition: pressed.map_or(String::new(), |c| self.machine.condition(c)),
                 }

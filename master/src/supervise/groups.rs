@@ -150,6 +150,11 @@ pub(super) fn needed(action: &Action) -> Vec<AxisIndex> {
         | Action::Dwell { .. }
         | Action::Wait { .. }
         | Action::Set { .. }
-        | Action::Repeat { .. } => Vec::new(),
+        | Action::Assign { .. }
+        | Action::Message { .. }
+        | Action::Alarm { .. }
+        | Action::Repeat { .. }
+        | Action::While { .. }
+        | Action::If { .. } => Vec::new(),
     }
 }

@@ -82,6 +82,8 @@ pub struct Supervisor {
     pub enable: bool,
     /// `true` if a controller replaces the program.
     pub controlled: bool,
+    /// The values of the program's variables.
+    pub variables: Vec<f64>,
     /// The operator that replaces the program.
     pub operator: Option<Box<dyn operator::Operator>>,
     /// The operator at work.

@@ -73,6 +73,7 @@ impl Supervisor {
         }
         loop {
             let begun = clock::now();
+            self.variables = self.machine.variables.iter().map(|v| v.initial).collect();
             self.run_steps(&steps, ended.runs + 1, start).await?;
             if self.over(start) {
                 return Ok(());
@@ -131,17 +132,7 @@ impl Supervisor {
                     return Ok(());
                 }
                 self.await_program_step().await?;
-                if let Action::Repeat { times, steps } = &step.action {
-                    for _ in 0..*times {
-                        let begun = clock::now();
-                        self.run_steps(steps, run, start).await?;
-                        if self.over(start) {
-                            return Ok(());
-                        }
-                        if clock::now() == begun {
-                            self.poll_and_query().await?;
-                        }
-                    }
+                if self.run_branches(step, run, start).await? {
                     continue;
                 }
                 self.report(Progress::Program {
@@ -153,6 +144,53 @@ impl Supervisor {
             }
             Ok(())
         })
+    }
+
+    /// Runs the steps inside a step. Returns false if the step has none.
+    async fn run_branches(&mut self, step: &Step, run: u32, start: Nanos) -> Result<bool, Error> {
+        let (mut left, before, after, steps) = match &step.action {
+            Action::Repeat {
+                times,
+                until,
+                steps,
+            } => (*times, None, until.as_ref(), steps),
+            Action::While { when, steps } => (None, Some(when), None, steps),
+            Action::If {
+                when,
+                steps,
+                otherwise,
+            } => {
+                let steps = match self.holds(when).await? {
+                    true => steps,
+                    false => otherwise,
+                };
+                self.run_steps(steps, run, start).await?;
+                return Ok(true);
+            }
+            _ => return Ok(false),
+        };
+        while left != Some(0) {
+            if let Some(when) = before
+                && !self.holds(when).await?
+            {
+                break;
+            }
+            let begun = clock::now();
+            self.run_steps(steps, run, start).await?;
+            if self.over(start) {
+                break;
+            }
+            if clock::now() == begun {
+                self.poll_and_query().await?;
+            }
+            if let Some(when) = after
+                && self.holds(when).await?
+            {
+                break;
+            }
+            left = left.map(|left| left - 1);
+        }
+        Ok(true)
     }
 
     async fn run_step(&mut self, step: &Step, run: u32, start: Nanos) -> Result<(), Error> {
@@ -294,10 +332,20 @@ impl Supervisor {
                 }
                 Ok(())
             }
-            Action::Wait {
-                conditions,
-                timeout_ns,
-            } => self.wait(step, start, conditions, *timeout_ns).await,
+            Action::Wait { when, timeout_ns } => self.wait(step, start, when, *timeout_ns).await,
+            Action::Assign { add, values } => {
+                for (variable, value) in values {
+                    if let Some(number) = self.variables.get_mut(variable.0) {
+                        *number = if *add { *number + value } else { *value };
+                    }
+                }
+                Ok(())
+            }
+            // The report of the step has the text.
+            Action::Message { .. } => Ok(()),
+            Action::Alarm { text } => {
+                Err(Error::from(Cause::Alarm { text: text.clone() }).with_step(step))
+            }
             Action::Set { values } => {
                 let commands = values
                     .iter()
@@ -305,8 +353,8 @@ impl Supervisor {
                 self.send_all(&commands.collect::<Vec<_>>()).await;
                 self.taken(start).await
             }
-            // `run_steps` expands repetitions.
-            Action::Repeat { .. } => Ok(()),
+            // `run_branches` runs them.
+            Action::Repeat { .. } | Action::While { .. } | Action::If { .. } => Ok(()),
         }
     }
 

@@ -34,6 +34,7 @@ const KINDS: &[(&str, &[&str])] = &[
     ("absent", &["device"]),
     ("link-break", &["device", "port"]),
     ("node-silent", &["device", "node"]),
+    ("input", &["device", "index", "sub", "value"]),
     ("silent", &[]),
 ];
 
@@ -62,7 +63,7 @@ pub(super) fn check(raw: &RawFault, line: u32) -> Result<Fault, String> {
     })
 }
 
-fn given(raw: &RawFault) -> [(&'static str, bool); 16] {
+fn given(raw: &RawFault) -> [(&'static str, bool); 17] {
     [
         ("device", raw.device.is_some()),
         ("port", raw.port.is_some()),
@@ -80,6 +81,7 @@ fn given(raw: &RawFault) -> [(&'static str, bool); 16] {
         ("serial", raw.serial.is_some()),
         ("alias", raw.alias.is_some()),
         ("torque", raw.torque.is_some()),
+        ("value", raw.value.is_some()),
     ]
 }
 
@@ -161,6 +163,11 @@ fn kind(name: &str, raw: &RawFault) -> Result<FaultKind, String> {
             }
             FaultKind::NodeSilent { node }
         }
+        "input" => FaultKind::Input {
+            index: raw.index.ok_or("`index` is missing")?,
+            sub: raw.sub.unwrap_or(0),
+            value: raw.value.ok_or("`value` is missing")?,
+        },
         "silent" => FaultKind::Silent,
         // `power-off` and `absent`: the last kinds in the table above.
         _ => FaultKind::PowerOff,

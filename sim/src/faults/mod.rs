@@ -302,6 +302,9 @@ impl ActiveFault {
             FaultKind::Blocked => block(device, true),
             FaultKind::Emergency { code } => device.inject_emergency(code),
             FaultKind::NodeSilent { node } => silence(device, node, true),
+            FaultKind::Input { index, sub, value } => {
+                device.set_input(index, sub, value);
+            }
             FaultKind::Identity(new) | FaultKind::Swap(new) => {
                 self.saved = device.identification();
                 device.identify(&Identification {
@@ -319,6 +322,9 @@ impl ActiveFault {
             FaultKind::Load { .. } => load(device, 0.0),
             FaultKind::Blocked => block(device, false),
             FaultKind::NodeSilent { node } => silence(device, node, false),
+            FaultKind::Input { index, sub, .. } => {
+                device.set_input(index, sub, 0);
+            }
             _ => {}
         }
     }

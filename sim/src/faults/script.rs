@@ -20,6 +20,23 @@ pub struct FaultScript {
 }
 
 impl FaultScript {
+    /// Gives an input of an I/O device a value from `at` on; after `duration` it is 0.
+    pub fn add_input(
+        &mut self,
+        (device, index, sub): (usize, u16, u8),
+        value: i64,
+        (at, duration): (Nanos, Option<Nanos>),
+    ) {
+        self.faults.push(Fault {
+            at,
+            duration,
+            device,
+            kind: FaultKind::Input { index, sub, value },
+            name: "input",
+            line: 0,
+        });
+    }
+
     /// Delays all faults by `by` ns.
     pub(crate) fn delay(&mut self, by: Nanos) {
         for fault in &mut self.faults {
@@ -150,6 +167,12 @@ pub(crate) enum FaultKind {
     Emergency {
         code: u16,
     },
+    /// An input of an I/O device has a value; after the fault it is 0.
+    Input {
+        index: u16,
+        sub: u8,
+        value: i64,
+    },
 }
 
 impl Fault {
@@ -228,6 +251,7 @@ pub(super) struct RawFault {
     pub count: Option<u32>,
     pub probability: Option<f64>,
     pub torque: Option<f64>,
+    pub value: Option<i64>,
     pub delay: Option<String>,
     pub code: Option<u32>,
     pub index: Option<u16>,

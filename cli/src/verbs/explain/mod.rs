@@ -3,10 +3,11 @@
 use std::path::PathBuf;
 
 use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_esi::address;
 use ecaxis_esi::model::Position;
 use ecaxis_master::acyclic::StateTimeouts;
 use ecaxis_master::config::{
-    self, Action, BitRange, Bus, DeviceConfig, ExchangeMode, Machine, Nic, Step, duration,
+    self, BitRange, Bus, DeviceConfig, ExchangeMode, Machine, Nic, Step, duration,
 };
 use ecaxis_master::link::SocketKind;
 use ecaxis_master::rt::exchange::MAX_POLL_DATAGRAM;
@@ -73,6 +74,7 @@ fn explain(machine: &Machine, only: Option<DeviceIndex>) -> Document {
     wire(machine, &mut out);
     copies(machine, &mut out);
     stop::stop(machine, &mut out);
+    signals(machine, &mut out);
     program(machine, &mut out);
     out
 }
@@ -433,23 +435,44 @@ fn has_watchdog(device: &DeviceConfig, outputs: &BitRange) -> bool {
     })
 }
 
+/// Lists the inputs and outputs with the names that steps use.
+fn signals(machine: &Machine, out: &mut Document) {
+    let mut table = Table::new("name|object|bits|in [signals]");
+    for index in machine.devices.indices() {
+        let [inputs, outputs] = machine.signals_of(index);
+        let all = inputs.iter().map(|signal| ("in", signal));
+        for (way, signal) in all.chain(outputs.iter().map(|signal| ("out", signal))) {
+            let named = machine
+                .signals
+                .iter()
+                .find(|named| named.signal == signal.name);
+            table.row(cells![
+                format!("{way:<3}  {}", signal.name),
+                address(signal.field.index, signal.field.sub),
+                signal.field.bit_len,
+                named.map_or("", |named| named.name.as_str())
+            ]);
+        }
+    }
+    out.heading("inputs and outputs by name");
+    out.table(table);
+}
+
 fn program(machine: &Machine, out: &mut Document) {
     if machine.steps.is_empty() {
         out.heading("no program: the axes are enabled and hold their positions");
         return;
     }
     out.heading(format!("program, {}", times(machine.repeat)));
-    steps(machine, &machine.steps, out);
+    steps(machine, machine.steps.iter(), out);
 }
 
-fn steps(machine: &Machine, each: &[Step], out: &mut Document) {
+fn steps<'s>(machine: &Machine, each: impl Iterator<Item = &'s Step>, out: &mut Document) {
     for step in each {
         let indent = " ".repeat(3 * step.number.matches('.').count());
         let lead = format!("{indent}{}. ", step.number);
         out.item(lead, machine.describe(&step.action));
-        if let Action::Repeat { steps: inner, .. } = &step.action {
-            steps(machine, inner, out);
-        }
+        steps(machine, step.action.inner(), out);
     }
 }
 

@@ -14,13 +14,12 @@ use super::travel::RawTrack;
 use super::{ExchangeMode, GroupStopScope, MailboxSource, SocketKind, Spin, UnknownDeviceRule};
 
 mod axis;
+mod condition;
 mod step;
 
 pub(crate) use axis::{AxisTables, RawAxis, RawHoming, RawLimits};
-pub(crate) use step::{
-    Conditions, Named, RawAction, RawAxes, RawCondition, RawGear, RawProbe, RawSignal, RawStep,
-    RawWave,
-};
+pub(crate) use condition::{Conditions, Levels, NamedValues, RawCondition, RawSignal, RawWhen};
+pub(crate) use step::{Named, RawAction, RawAxes, RawGear, RawProbe, RawStep, RawWave, TimeLimit};
 
 table! { "the machine file",
     table RawMachine {
@@ -39,8 +38,32 @@ table! { "the machine file",
         stop: RawStop,
         /// Clients of `ecaxis serve`
         server: RawServer,
+        /// The simulated bus: inputs that are switched by time
+        sim: RawSimulation,
+        /// Names of inputs and outputs, `start = "io.Input 1"`
+        signals: NamedValues<String>,
+        /// Variables of the program with their values at its start, `parts = 0`
+        variables: NamedValues<f64>,
         /// The program: one verb for each step
         steps: Vec<RawStep> as "step",
+    }
+}
+
+table! { "[sim]",
+    table RawSimulation {
+        /// Inputs that are switched, `{ at = "2s", set = { start = true } }` (list of tables; default none)
+        inputs: Vec<RawInput>,
+    }
+}
+
+table! { "an input of [sim]",
+    table RawInput {
+        /// Time since the bus got its power (time; default 0)
+        at: Key<Ns>,
+        /// Time after which the inputs are 0 again (time; default never)
+        duration: Key<Ns> as "for",
+        /// Inputs and their values, as in a step `set`
+        set: Levels,
     }
 }
 

@@ -10,6 +10,7 @@ use toml::de::DeValue;
 use super::super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Written, array};
 use super::super::problem::{Problems, Span};
 use super::super::schema::{self, Schema, any_of, described, named};
+use super::condition::{Levels, RawWhen};
 
 /// Axes with a parameter each.
 pub(crate) type Named<T> = Vec<(Spanned<String>, Spanned<T>)>;
@@ -60,37 +61,43 @@ pub(crate) enum RawAction {
     Mode(Named<String>),
     Dwell(Ns),
     Wait {
-        conditions: Vec<RawCondition>,
-        timeout: Option<Ns>,
+        when: RawWhen,
+        timeout: Option<TimeLimit>,
     },
-    Set(Vec<(RawSignal, Spanned<f64>)>),
+    Set(Levels),
+    Assign {
+        add: bool,
+        values: Named<f64>,
+    },
+    Message(String),
+    Alarm(String),
     Repeat {
-        times: u32,
+        /// `None`: without end.
+        times: Option<u32>,
+        until: Option<RawWhen>,
         steps: Vec<RawStep>,
     },
+    While {
+        when: RawWhen,
+        steps: Vec<RawStep>,
+    },
+    If {
+        when: RawWhen,
+        steps: Vec<RawStep>,
+        otherwise: Vec<RawStep>,
+    },
 }
 
-/// `io."Input 3"`: a device and one of its signals.
-#[derive(Debug)]
-pub(crate) struct RawSignal {
-    pub device: Spanned<String>,
-    pub name: Spanned<String>,
-}
+/// The time-out of `wait`; `None`: without limit.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct TimeLimit(pub Option<Ns>);
 
-#[derive(Debug)]
-pub(crate) struct RawCondition {
-    pub signal: RawSignal,
-    pub equal: Key<f64>,
-    pub above: Key<f64>,
-    pub below: Key<f64>,
-}
-
-table! { "a condition",
-    table Bounds {
-        /// The signal is greater than this number
-        above: Key<f64>,
-        /// The signal is less than this number
-        below: Key<f64>,
+impl Read for TimeLimit {
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        match value.get_ref() {
+            DeValue::String(word) if word == NONE => Some(Self(None)),
+            _ => TIMEOUTS.read(value, key, p).map(|ns| Self(Some(ns))),
+        }
     }
 }
 
@@ -139,7 +146,7 @@ table! { "a probe",
 /// The verbs, each with an example and the keys that go with it. The key of a step that is a verb
 /// defines the action.
 #[rustfmt::skip] // one row per verb
-const VERBS: [(&str, &str, &[&str]); 21] = [
+const VERBS: [(&str, &str, &[&str]); 27] = [
     ("enable", "enable = [\"x\"]", &[]),
     ("disable", "disable = true", &[]),
     ("reset", "reset = [\"x\"]", &[]),
@@ -160,20 +167,31 @@ const VERBS: [(&str, &str, &[&str]); 21] = [
     ("dwell", "dwell = \"500ms\"", &[]),
     ("wait", "wait = { io.\"Input 1\" = true }", &["timeout"]),
     ("set", "set = { io.\"Output 1\" = true }", &[]),
-    ("repeat", "repeat = 3", &["step"]),
+    ("let", "let = { parts = 0 }", &[]),
+    ("add", "add = { parts = 1 }", &[]),
+    ("message", "message = \"load the magazine\"", &[]),
+    ("alarm", "alarm = \"no part in the gripper\"", &[]),
+    ("repeat", "repeat = 3", &["step", "until"]),
+    ("while", "while = { io.\"Input 1\" = true }", &["step"]),
+    ("if", "if = { io.\"Input 1\" = true }", &["step", "else"]),
 ];
 
 /// Keys that go with verbs, each with its description.
 #[rustfmt::skip] // one row per key
-const COMPANIONS: [(&str, &str); 5] = [
+const COMPANIONS: [(&str, &str); 7] = [
     ("speed", "Fraction of each axis' velocity limit (above 0, up to 1; default 1)"),
     ("ramp", "Fraction of the acceleration limit (above 0, up to 1); with `torque`: the time to the new torque"),
     ("arrive", "If `\"together\"`, all axes arrive in the same cycle (`\"each\"`, `\"together\"`; default `\"each\"`)"),
-    ("timeout", "Time after which the step fails (time, 1 ms to a week; default `\"10s\"`)"),
-    ("step", "The steps that are repeated"),
+    ("timeout", "Time after which the step fails (time, 1 ms to a week, or `\"none\"`; default `\"10s\"`)"),
+    ("step", "The steps that are repeated, or run if the condition holds"),
+    ("until", "Condition that ends the repetition after a round"),
+    ("else", "The steps that run if the condition does not hold"),
 ];
 
 const ARRIVALS: [(&str, bool); 2] = [("each", false), ("together", true)];
+
+const NONE: &str = "none";
+const FOREVER: &str = "forever";
 
 /// The timeouts of `wait`: at most half an hour more than a week.
 const TIMEOUTS: RangeInclusive<Ns> = 1_000_000..=606_600_000_000_000;
@@ -302,24 +320,60 @@ impl<'d> Step<'_, 'd> {
             "wait" => {
                 let timeout = self.table.get("timeout");
                 RawAction::Wait {
-                    timeout: timeout.and_then(|v| TIMEOUTS.read(v, "timeout", p)),
-                    conditions: Conditions::read(value, verb, p)?.0,
+                    timeout: timeout.and_then(|v| TimeLimit::read(v, "timeout", p)),
+                    when: RawWhen::read(value, verb, p)?,
                 }
             }
-            "set" => {
-                let signals = signals(value, p)?.into_iter();
-                let levels = signals.filter_map(|(signal, v)| Some((signal, level(v, verb, p)?)));
-                RawAction::Set(levels.collect())
+            "set" => RawAction::Set(Levels::read(value, verb, p)?),
+            "let" | "add" => RawAction::Assign {
+                add: verb == "add",
+                values: self.named(value, p)?,
+            },
+            "message" => RawAction::Message(String::read(value, verb, p)?),
+            "alarm" => RawAction::Alarm(String::read(value, verb, p)?),
+            "while" => {
+                let (when, steps) = (RawWhen::read(value, verb, p), self.steps(value, "step", p));
+                RawAction::While {
+                    when: when?,
+                    steps: steps?,
+                }
             }
-            _ => self.repeat(value, p)?,
+            "if" => {
+                let (when, steps) = (RawWhen::read(value, verb, p), self.steps(value, "step", p));
+                let otherwise = self.table.get("else");
+                let otherwise = otherwise.map(|_| self.steps(value, "else", p));
+                RawAction::If {
+                    when: when?,
+                    steps: steps?,
+                    otherwise: otherwise.unwrap_or_else(|| Some(Vec::new()))?,
+                }
+            }
+            _ => {
+                let times = match value.get_ref() {
+                    DeValue::String(word) if word == FOREVER => Some(None),
+                    _ => (1..=1_000_000).read(value, verb, p).map(Some),
+                };
+                let until = self.table.get("until");
+                let until = until.map(|until| RawWhen::read(until, "until", p));
+                let steps = self.steps(value, "step", p);
+                RawAction::Repeat {
+                    times: times?,
+                    until: until.map_or(Some(None), |until| until.map(Some))?,
+                    steps: steps?,
+                }
+            }
         })
     }
 
-    fn repeat(&self, value: Value<'d>, p: &mut Problems<'_>) -> Option<RawAction> {
-        let times = (1..=1_000_000).read(value, self.verb, p);
-        let Some(inner) = self.table.get("step") else {
+    /// Reads the steps inside the step.
+    fn steps(&self, value: Value<'d>, key: &str, p: &mut Problems<'_>) -> Option<Vec<RawStep>> {
+        let Some(inner) = self.table.get(key) else {
             let hint = "write the steps below it under [[step.step]], or as `step = [ … ]`";
-            p.add_hint(value.span(), "nothing is repeated", hint);
+            let message = match self.verb {
+                "if" => "`if` has no steps",
+                _ => "nothing is repeated",
+            };
+            p.add_hint(value.span(), message, hint);
             return None;
         };
         let depth = self.depth + 1;
@@ -328,12 +382,8 @@ impl<'d> Step<'_, 'd> {
             p.add(inner.span(), message);
             return None;
         }
-        let inner = array(p, inner, "[[step.step]] with two brackets")?.into_iter();
-        let steps = inner.filter_map(|v| read(v, depth, p)).collect();
-        Some(RawAction::Repeat {
-            times: times?,
-            steps,
-        })
+        let inner = array(p, inner, &format!("[[step.{key}]] with two brackets"))?.into_iter();
+        Some(inner.filter_map(|v| read(v, depth, p)).collect())
     }
 
     /// Reads one axis and its parameter.
@@ -408,104 +458,6 @@ fn axes(value: Value<'_>, verb: &str, p: &mut Problems<'_>) -> Option<RawAxes> {
     }
 }
 
-/// Reads `{ io."Input 3" = … }`: by device, then by signal.
-fn signals<'d>(value: Value<'d>, p: &mut Problems<'_>) -> Option<Vec<(RawSignal, Value<'d>)>> {
-    let example = "write `{ io.\"Input 1\" = true }`: device, signal, value";
-    let DeValue::Table(devices) = value.get_ref() else {
-        p.add_hint(value.span(), "expected devices and their signals", example);
-        return None;
-    };
-    let mut all = Vec::new();
-    for (device, inner) in devices {
-        let DeValue::Table(inner) = inner.get_ref() else {
-            let message = format!("no signal of `{}` is named", device.get_ref());
-            p.add_hint(inner.span(), message, example);
-            continue;
-        };
-        for (name, value) in inner {
-            let signal = RawSignal {
-                device: Spanned::new(device.span(), device.get_ref().to_string()),
-                name: Spanned::new(name.span(), name.get_ref().to_string()),
-            };
-            all.push((signal, value));
-        }
-    }
-    if all.is_empty() {
-        p.add_hint(value.span(), "no signal is named", example);
-    }
-    Some(all)
-}
-
-/// Reads a number; `true` is 1.
-fn level(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Key<f64> {
-    match value.get_ref() {
-        DeValue::Boolean(on) => Some(Spanned::new(value.span(), f64::from(u8::from(*on)))),
-        _ => Spanned::read(value, key, p),
-    }
-}
-
-#[derive(Debug)]
-pub(crate) struct Conditions(pub Vec<RawCondition>);
-
-impl Read for Conditions {
-    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
-        let signals = signals(value, p)?.into_iter();
-        Some(Self(
-            signals
-                .filter_map(|(signal, v)| condition(signal, v, key, p))
-                .collect(),
-        ))
-    }
-}
-
-fn condition(
-    signal: RawSignal,
-    value: Value<'_>,
-    key: &str,
-    p: &mut Problems<'_>,
-) -> Option<RawCondition> {
-    let bounds = match value.get_ref() {
-        DeValue::Table(_) => Bounds::read(value, key, p)?,
-        _ => {
-            let (equal, above, below) = (Some(level(value, key, p)?), None, None);
-            return Some(RawCondition {
-                signal,
-                equal,
-                above,
-                below,
-            });
-        }
-    };
-    let Bounds {
-        above,
-        below,
-        written,
-        ..
-    } = bounds;
-    if above.is_none() && below.is_none() {
-        if !written.unknown {
-            let hint = "write `true`, a number, or `{ above = 100 }`";
-            p.add_hint(value.span(), "this waits for nothing", hint);
-        }
-        return None;
-    }
-    Some(RawCondition {
-        signal,
-        equal: None,
-        above,
-        below,
-    })
-}
-
-impl Schema for Conditions {
-    fn schema() -> Json {
-        let mut bounds = Bounds::schema();
-        bounds["minProperties"] = 1.into();
-        let condition = any_of([f64::schema(), bool::schema(), bounds]);
-        named(named(condition))
-    }
-}
-
 impl Schema for RawStep {
     fn schema() -> Json {
         schema::definition("step")
@@ -572,9 +524,11 @@ fn argument(verb: &str) -> Json {
         "gear" => only(RawGear::schema()),
         "mode" => named(String::schema()),
         "dwell" => Ns::schema(),
-        "wait" => Conditions::schema(),
-        "set" => named(named(any_of([f64::schema(), bool::schema()]))),
-        _ => schema::integer(1, 1_000_000),
+        "wait" | "while" | "if" => RawWhen::schema(),
+        "set" => Levels::schema(),
+        "let" | "add" => named(f64::schema()),
+        "message" | "alarm" => String::schema(),
+        _ => any_of([schema::integer(1, 1_000_000), json!({ "enum": [FOREVER] })]),
     }
 }
 
@@ -584,7 +538,8 @@ fn companion(key: &str) -> Json {
         "speed" => f64::schema(),
         "ramp" => any_of([f64::schema(), Ns::schema()]),
         "arrive" => ARRIVALS.schema(),
-        "timeout" => TIMEOUTS.schema(),
+        "timeout" => any_of([TIMEOUTS.schema(), json!({ "enum": [NONE] })]),
+        "until" => RawWhen::schema(),
         _ => Vec::<RawStep>::schema(),
     }
 }

@@ -22,15 +22,17 @@ const ROUNDING: f64 = 1e-9;
 pub(crate) fn enables(steps: &[Step]) -> bool {
     steps.iter().any(|step| match &step.action {
         Action::Enable { .. } => true,
-        Action::Repeat { steps, .. } => enables(steps),
-        _ => false,
+        action => action
+            .inner()
+            .any(|step| enables(std::slice::from_ref(step))),
     })
 }
 
 /// The state of an axis between two steps.
 #[derive(Debug, Clone, PartialEq)]
 struct State {
-    mode: Mode,
+    /// `None`: it depends on a condition.
+    mode: Option<Mode>,
     /// The step that switched the mode.
     switched_by: Option<String>,
     power: bool,
@@ -64,6 +66,8 @@ struct ProgramState<'w, 'c, 'p, 's> {
     visits: u32,
     /// `true` if a step is being repeated.
     again: bool,
+    /// `true` while the state of a repetition is searched.
+    silent: bool,
     p: &'p mut Problems<'s>,
 }
 
@@ -73,7 +77,7 @@ impl ProgramChecker<'_> {
         let axes = self.axes.iter().map(|axis| {
             let axis = axis.setup?;
             Some(State {
-                mode: axis.config.mode,
+                mode: Some(axis.config.mode),
                 switched_by: None,
                 power,
                 disabled_by: None,
@@ -88,6 +92,7 @@ impl ProgramChecker<'_> {
             axes: axes.collect(),
             visits: 0,
             again: false,
+            silent: false,
             p,
         };
         walk.times(repeat, steps);
@@ -101,24 +106,77 @@ impl ProgramState<'_, '_, '_, '_> {
         for round in 0..times {
             let before = self.axes.clone();
             self.again = again || round > 0;
-            for step in steps {
-                self.visits += 1;
-                if self.visits > MOST_VISITS {
-                    return;
-                }
-                self.step(step);
-            }
-            if self.axes == before {
+            self.all(steps);
+            if self.axes == before || self.visits > MOST_VISITS {
                 break;
             }
         }
         self.again = again;
     }
 
+    fn all(&mut self, steps: &[Step]) {
+        for step in steps {
+            self.visits += 1;
+            if self.visits > MOST_VISITS {
+                return;
+            }
+            self.step(step);
+        }
+    }
+
+    /// Runs the steps as often as a condition may repeat them, also never. A step is refused if no
+    /// number of rounds makes it possible.
+    fn perhaps_often(&mut self, steps: &[Step]) {
+        let silent = std::mem::replace(&mut self.silent, true);
+        loop {
+            let before = self.axes.clone();
+            self.all(steps);
+            self.or(&before);
+            if self.axes == before || self.visits > MOST_VISITS {
+                break;
+            }
+        }
+        self.silent = silent;
+        let before = self.axes.clone();
+        self.all(steps);
+        self.or(&before);
+    }
+
+    /// The axes are in one of two states.
+    fn or(&mut self, other: &IndexVec<AxisIndex, Option<State>>) {
+        for (state, other) in self.axes.iter_mut().zip(other) {
+            if let (Some(state), Some(other)) = (state, other) {
+                state.or(other);
+            }
+        }
+    }
+
     fn step(&mut self, step: &Step) {
         let number = &step.number;
         match &step.action {
-            Action::Repeat { times, steps } => self.times(*times, steps),
+            Action::Repeat {
+                times,
+                until: None,
+                steps,
+            } => self.times(times.unwrap_or(u32::MAX), steps),
+            Action::Repeat {
+                until: Some(_),
+                steps,
+                ..
+            } => {
+                self.all(steps);
+                self.perhaps_often(steps);
+            }
+            Action::While { steps, .. } => self.perhaps_often(steps),
+            Action::If {
+                steps, otherwise, ..
+            } => {
+                let before = self.axes.clone();
+                self.all(steps);
+                let then = std::mem::replace(&mut self.axes, before);
+                self.all(otherwise);
+                self.or(&then);
+            }
             Action::Enable { axes } => self.each(axes, |state| {
                 if !state.power {
                     state.power = true;
@@ -233,7 +291,10 @@ impl ProgramState<'_, '_, '_, '_> {
             Action::Reset { .. }
             | Action::Dwell { .. }
             | Action::Wait { .. }
-            | Action::Set { .. } => {}
+            | Action::Set { .. }
+            | Action::Assign { .. }
+            | Action::Message { .. }
+            | Action::Alarm { .. } => {}
         }
     }
 
@@ -249,8 +310,8 @@ impl ProgramState<'_, '_, '_, '_> {
             self.need(step, axis, need);
         }
         self.each(&[axis], |state| {
-            if state.mode != mode {
-                state.mode = mode;
+            if state.mode != Some(mode) {
+                state.mode = Some(mode);
                 state.switched_by = Some(step.number.clone());
                 state.position = None;
             }
@@ -383,14 +444,16 @@ impl ProgramState<'_, '_, '_, '_> {
                 "let a step stop it before: `velocity = {{ {name} = 0.0 }}` or `stop = [\"{name}\"]`"
             );
             (message, hint)
-        } else if let Some(what) = need.what.filter(|what| !what.possible(state.mode, setup)) {
+        } else if let (Some(what), Some(mode)) = (need.what, state.mode)
+            && !what.possible(mode, setup)
+        {
             let by = match &state.switched_by {
                 Some(by) => format!(", to which step {by} has switched it"),
                 None => String::new(),
             };
             let message = format!(
                 "`{verb}` is not possible for `{name}` in mode \"{}\"{by}{round}",
-                word(state.mode)
+                word(mode)
             );
             (message, better(name, setup, what))
         } else {
@@ -400,7 +463,7 @@ impl ProgramState<'_, '_, '_, '_> {
     }
 
     fn refuse(&mut self, step: &Step, axis: AxisIndex, message: String, hint: String) {
-        let Some(Some(state)) = self.axes.get_mut(axis) else {
+        let Some(Some(state)) = self.axes.get_mut(axis).filter(|_| !self.silent) else {
             return;
         };
         if !std::mem::replace(&mut state.given_up, true) {
@@ -422,6 +485,33 @@ impl Precondition {
 }
 
 impl State {
+    /// Keeps what both states have. An axis that may have power counts as one that has it.
+    fn or(&mut self, other: &Self) {
+        let Self {
+            mode,
+            switched_by,
+            power,
+            disabled_by,
+            follows_since,
+            turns_since,
+            position,
+            given_up,
+        } = self;
+        *mode = mode.filter(|mode| other.mode == Some(*mode));
+        *power |= other.power;
+        *given_up |= other.given_up;
+        *position = position.filter(|at| other.position == Some(*at));
+        let keep = |own: &mut Option<String>, other: &Option<String>| {
+            if other.is_none() {
+                *own = None;
+            }
+        };
+        keep(switched_by, &other.switched_by);
+        keep(disabled_by, &other.disabled_by);
+        keep(follows_since, &other.follows_since);
+        keep(turns_since, &other.turns_since);
+    }
+
     /// Ends the previous motion because of a new command.
     fn stops(&mut self) {
         self.follows_since = None;

@@ -29,11 +29,11 @@ impl ProgramChecker<'_> {
             if let Some(group) = group.filter(|g| g.outside == GroupStopScope::Continue) {
                 let message = format!(
                     "`{}` is in the group `{}`, without which the machine goes on: an emergency would go unseen",
-                    raw.signal.device.get_ref(),
-                    group.name,
+                    self.devices[device].name, group.name,
                 );
                 let hint = "leave its device out of the group, or write `outside = \"stop\"`";
-                p.add_hint(raw.signal.device.span(), message, hint);
+                let at = raw.signal.device.as_ref().unwrap_or(&raw.signal.name);
+                p.add_hint(at.span(), message, hint);
             }
             emergency.push(condition);
         }

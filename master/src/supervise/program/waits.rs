@@ -6,7 +6,7 @@ use ecaxis_ecat::index::AxisIndex;
 
 use super::{SETTLE_TIMEOUT, STANDSTILL_TIME, Supervisor};
 use crate::clock::{self, Nanos};
-use crate::config::{Action, Condition, InputRef, Step};
+use crate::config::{Action, Step, Subject, When};
 use crate::report::{Cause, Error};
 use crate::rt::channel::Snapshot;
 
@@ -119,27 +119,55 @@ impl Supervisor {
         setup.map_or(0, |setup| setup.homing.method)
     }
 
-    /// Waits until all conditions hold in the same cycle.
+    /// Returns whether a condition holds in the next cycle.
+    pub(super) async fn holds(&mut self, when: &When) -> Result<bool, Error> {
+        let snapshot = self.poll_and_query().await?;
+        Ok(when.holds(|subject| self.value(&snapshot, subject)))
+    }
+
+    /// Returns the value of a subject. An unknown value satisfies no condition.
+    fn value(&self, snapshot: &Snapshot, subject: Subject) -> f64 {
+        let value = match subject {
+            Subject::Input(input) => snapshot.inputs.get(input.0).copied(),
+            Subject::Variable(variable) => self.variables.get(variable.0).copied(),
+            Subject::Axis(axis, value) => {
+                let (status, setup) = (snapshot.axes.get(axis), self.setup(axis));
+                status
+                    .zip(setup)
+                    .map(|(status, setup)| value.of(status, setup))
+            }
+        };
+        value.unwrap_or(f64::NAN)
+    }
+
+    /// Waits until a condition holds.
     pub(super) async fn wait(
         &mut self,
         step: &Step,
         start: Nanos,
-        conditions: &[Condition],
-        timeout: Nanos,
+        when: &When,
+        timeout: Option<Nanos>,
     ) -> Result<(), Error> {
         let begun = clock::now();
         loop {
             let snapshot = self.poll_and_query().await?;
-            let value = |input: InputRef| snapshot.inputs.get(input.0).copied().unwrap_or(f64::NAN);
-            let open = conditions.iter().find(|c| !c.holds(value(c.input)));
-            let Some(open) = open else { return Ok(()) };
-            if self.over(start) {
+            let value = |subject| self.value(&snapshot, subject);
+            if when.holds(value) || self.over(start) {
                 return Ok(());
             }
+            let Some(timeout) = timeout else { continue };
             if clock::now().saturating_sub(begun) > timeout {
+                let tests = || when.0.iter().flatten();
+                let open = tests().find(|test| !test.bounds.holds(value(test.of)));
+                let (condition, value) = match (open, tests().count()) {
+                    (Some(open), _) if when.0.len() == 1 => {
+                        (self.machine.test(open), value(open.of))
+                    }
+                    _ => (self.machine.when(when), f64::NAN),
+                };
                 let cause = Cause::WaitTimeout {
-                    condition: self.machine.condition(open),
-                    value: value(open.input),
+                    condition,
+                    value,
                     timeout_ms: timeout / 1_000_000,
                 };
                 return Err(Error::from(cause).with_step(step));

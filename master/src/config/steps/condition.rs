@@ -1,0 +1,299 @@
+//! Signals, variables and conditions by name.
+
+use toml::Spanned;
+
+use super::ProgramChecker;
+use crate::config::fields::KeyExt;
+use crate::config::problem::{Problems, Span, suggestion};
+use crate::config::raw::{
+    Conditions, NamedValues, RawCondition, RawInput, RawSignal, RawSimulation, RawWhen,
+};
+use crate::config::signal::{self, SignalDirection};
+use crate::config::{
+    AxisValue, Bounds, Condition, InputRef, NamedSignal, OutputRef, Signal, Subject, SwitchedInput,
+    Test, Variable, VariableRef, When,
+};
+
+impl ProgramChecker<'_> {
+    /// Takes the names of `[signals]`.
+    pub(super) fn name_signals(&mut self, raw: NamedValues<String>, p: &mut Problems<'_>) {
+        for (name, text) in raw.0 {
+            if !self.is_free(&name, p) {
+                continue;
+            }
+            let of = |way| signal::of_text(text.get_ref(), self.devices, way);
+            let found = of(SignalDirection::In)
+                .or_else(|input| of(SignalDirection::Out).map_err(|output| input.or(output)));
+            match found {
+                // Of an invalid device, which has been reported, nothing is known.
+                Ok(signal) => self.signals.push(NamedSignal {
+                    name: name.into_inner(),
+                    signal: signal.map_or_else(String::new, |signal| signal.name),
+                }),
+                Err(error) => p.add_hint(text.span(), error.message, error.hint),
+            }
+        }
+    }
+
+    /// Takes the names of `[variables]`.
+    pub(super) fn name_variables(&mut self, raw: NamedValues<f64>, p: &mut Problems<'_>) {
+        for (name, initial) in raw.0 {
+            if self.is_free(&name, p) {
+                self.variables.push(Variable {
+                    name: name.into_inner(),
+                    initial: initial.into_inner(),
+                });
+            }
+        }
+    }
+
+    /// Reports a name that something else has.
+    fn is_free(&self, name: &Spanned<String>, p: &mut Problems<'_>) -> bool {
+        let word = name.get_ref();
+        let taken = if self.devices.iter().any(|device| device.name == word) {
+            "a device"
+        } else if self.axes.iter().any(|axis| axis.name == word) {
+            "an axis"
+        } else if self.signals.iter().any(|signal| signal.name == *word) {
+            "a signal"
+        } else {
+            return true;
+        };
+        p.add_hint(
+            name.span(),
+            format!("`{word}` is the name of {taken} already"),
+            "take another name",
+        );
+        false
+    }
+
+    pub(super) fn variable(
+        &self,
+        name: &Spanned<String>,
+        p: &mut Problems<'_>,
+    ) -> Option<VariableRef> {
+        let word = name.get_ref();
+        let found = self.variables.iter().position(|known| known.name == *word);
+        if found.is_none() {
+            let names = self.variables.iter().map(|known| known.name.as_str());
+            let hint = match self.variables.is_empty() {
+                true => format!("write `{word} = 0` under [variables]"),
+                false => suggestion(word, names, "variables"),
+            };
+            p.add_hint(name.span(), format!("no variable is named `{word}`"), hint);
+        }
+        found.map(VariableRef)
+    }
+
+    /// Returns the device and the signal of a name of `[signals]`.
+    fn signal(&self, raw: &RawSignal, p: &mut Problems<'_>) -> Option<RawSignal> {
+        if raw.device.is_some() {
+            return Some(raw.clone());
+        }
+        let (word, span) = (raw.name.get_ref(), raw.name.span());
+        let Some(named) = self.signals.iter().find(|signal| signal.name == *word) else {
+            if self.devices.iter().any(|device| device.name == word) {
+                let hint =
+                    format!("write a device and its signal: `{{ {word}.\"Input 1\" = true }}`");
+                p.add_hint(span, format!("no signal of `{word}` is named"), hint);
+                return None;
+            }
+            let names = self.signals.iter().map(|signal| signal.name.as_str());
+            let hint = match self.signals.is_empty() {
+                true => format!("write `{word} = \"io.Input 1\"` under [signals]"),
+                false => suggestion(word, names, "signals"),
+            };
+            p.add_hint(span, format!("no signal is named `{word}`"), hint);
+            return None;
+        };
+        let split = signal::split_device(&named.signal, self.devices)?;
+        let (device, signal) = (&named.signal[..split], &named.signal[split + 1..]);
+        Some(RawSignal {
+            device: Some(Spanned::new(span.clone(), device.to_owned())),
+            name: Spanned::new(span, signal.to_owned()),
+        })
+    }
+
+    /// Returns a condition on an input, for the cycle.
+    pub(super) fn condition(
+        &mut self,
+        raw: &RawCondition,
+        p: &mut Problems<'_>,
+    ) -> Option<Condition> {
+        let signal = self.signal(&raw.signal, p)?;
+        let input = signal::resolve(&signal, self.devices, SignalDirection::In, p)?;
+        if let Some(equal) = &raw.equal {
+            possible(&input, equal, p)?;
+        }
+        let bounds = bounds(raw, p)?;
+        Some(Condition {
+            input: InputRef(signal::known(&mut self.inputs, input)),
+            bounds,
+        })
+    }
+
+    /// Returns a condition of a step.
+    pub(super) fn when(&mut self, raw: &RawWhen, p: &mut Problems<'_>) -> Option<When> {
+        let mut alternatives = Vec::with_capacity(raw.0.len());
+        for Conditions(each) in &raw.0 {
+            let tests: Vec<_> = each.iter().filter_map(|raw| self.test(raw, p)).collect();
+            if tests.len() == each.len() && !tests.is_empty() {
+                alternatives.push(tests);
+            }
+        }
+        (alternatives.len() == raw.0.len()).then_some(When(alternatives))
+    }
+
+    fn test(&mut self, raw: &RawCondition, p: &mut Problems<'_>) -> Option<Test> {
+        let name = &raw.signal.name;
+        let of = match &raw.signal.device {
+            Some(axis) => {
+                let value = AxisValue::ALL
+                    .iter()
+                    .find(|(word, _)| *word == name.get_ref());
+                let axis = value.and_then(|_| self.axis_named(axis));
+                axis.zip(value)
+                    .map(|(axis, (_, value))| Subject::Axis(axis, *value))
+            }
+            None => {
+                let mut all = self.variables.iter();
+                let at = all.position(|known| known.name == *name.get_ref());
+                at.map(|at| Subject::Variable(VariableRef(at)))
+            }
+        };
+        let Some(of) = of else {
+            let Condition { input, bounds } = self.condition(raw, p)?;
+            let of = Subject::Input(input);
+            return Some(Test { of, bounds });
+        };
+        if let (Subject::Axis(_, value), Some(equal)) = (of, &raw.equal) {
+            let n = *equal.get_ref();
+            if value.is_yes_or_no() && n != 0.0 && n != 1.0 {
+                p.add(
+                    equal.span(),
+                    format!("`{}` is true or false", name.get_ref()),
+                );
+                return None;
+            }
+            if !value.is_yes_or_no() {
+                let hint = "write `{ above = 9.9, below = 10.1 }`";
+                p.add_hint(
+                    equal.span(),
+                    "a measured value is never exactly a number",
+                    hint,
+                );
+                return None;
+            }
+        }
+        let bounds = bounds(raw, p)?;
+        Some(Test { of, bounds })
+    }
+
+    /// Reports a wait without limit that nothing can end.
+    pub(super) fn check_can_end(
+        &self,
+        when: &When,
+        span: &Span,
+        p: &mut Problems<'_>,
+    ) -> Option<()> {
+        let fixed = |test: &Test| matches!(test.of, Subject::Variable(_));
+        if when.0.iter().all(|tests| tests.iter().any(fixed)) {
+            let message = "nothing can end this wait: variables do not change while a step waits";
+            p.add_hint(span.clone(), message, "test variables with `if` or `while`");
+            return None;
+        }
+        Some(())
+    }
+
+    /// Returns the inputs that the simulated bus switches.
+    pub(super) fn switched_inputs(
+        &mut self,
+        raw: RawSimulation,
+        p: &mut Problems<'_>,
+    ) -> Vec<SwitchedInput> {
+        let mut switched = Vec::new();
+        for RawInput {
+            at, duration, set, ..
+        } in raw.inputs
+        {
+            for (signal, value) in set.0 {
+                let input = self.signal(&signal, p).and_then(|signal| {
+                    signal::resolve(&signal, self.devices, SignalDirection::In, p)
+                });
+                let Some(input) = input else { continue };
+                if possible(&input, &value, p).is_none() {
+                    continue;
+                }
+                let device = self.devices[input.device].device;
+                if device.is_some_and(|device| device.selection.mode.is_some()) {
+                    let message = format!(
+                        "`{}` is an input of a drive, which the drive sets",
+                        input.name
+                    );
+                    p.add_hint(signal.name.span(), message, "switch inputs of I/O devices");
+                    continue;
+                }
+                switched.push(SwitchedInput {
+                    at_ns: at.value().unwrap_or(0),
+                    for_ns: duration.value(),
+                    input,
+                    value: *value.get_ref(),
+                });
+            }
+        }
+        switched
+    }
+
+    pub(super) fn output(
+        &mut self,
+        raw: &RawSignal,
+        value: &Spanned<f64>,
+        p: &mut Problems<'_>,
+    ) -> Option<(OutputRef, f64)> {
+        let signal = self.signal(raw, p)?;
+        let output = signal::resolve(&signal, self.devices, SignalDirection::Out, p)?;
+        possible(&output, value, p)?;
+        let index = signal::known(&mut self.outputs, output);
+        if self.output_places.len() < self.outputs.len() {
+            self.output_places.push(raw.name.span());
+        }
+        Some((OutputRef(index), *value.get_ref()))
+    }
+}
+
+fn bounds(raw: &RawCondition, p: &mut Problems<'_>) -> Option<Bounds> {
+    if let (Some(above), Some(below)) = (&raw.above, &raw.below)
+        && above.get_ref() >= below.get_ref()
+    {
+        let (above_n, below_n) = (above.get_ref(), below.get_ref());
+        let message = format!("no value is above {above_n} and below {below_n}");
+        p.add(above.span(), message);
+        return None;
+    }
+    let [equal, above, below] =
+        [&raw.equal, &raw.above, &raw.below].map(|bound| bound.as_ref().map(|n| *n.get_ref()));
+    Some(Bounds {
+        equal,
+        above,
+        below,
+    })
+}
+
+/// Checks that the signal's bits can hold the value.
+fn possible(signal: &Signal, value: &Spanned<f64>, p: &mut Problems<'_>) -> Option<()> {
+    let (low, high, whole) = signal.range();
+    let n = *value.get_ref();
+    if (low..=high).contains(&n) && (!whole || n.fract() == 0.0) {
+        return Some(());
+    }
+    let message = format!("{n} is not a value of `{}`", signal.name);
+    let hint = if high == 1.0 {
+        "it is one bit: true or false".to_owned()
+    } else if whole {
+        format!("it has {} bits: {low} to {high}", signal.field.bit_len)
+    } else {
+        "it is a floating-point number of 32 bits".to_owned()
+    };
+    p.add_hint(value.span(), message, hint);
+    None
+}
