@@ -367,7 +367,9 @@ impl<'d> Step<'_, 'd> {
 
     /// Reads the steps inside the step.
     fn steps(&self, value: Value<'d>, key: &str, p: &mut Problems<'_>) -> Option<Vec<RawStep>> {
-        let Some(inner) = self.table.get(key) else {
+        let empty =
+            |value: &Value<'d>| matches!(value.get_ref(), DeValue::Array(all) if all.is_empty());
+        let Some(inner) = self.table.get(key).filter(|value| !empty(value)) else {
             let hint = "write the steps below it under [[step.step]], or as `step = [ … ]`";
             let message = match self.verb {
                 "if" => "`if` has no steps",

@@ -53,6 +53,11 @@ fn wrong_programs_are_refused_with_a_remedy() {
         (step("wait = { x.moving = 2 }"), "true or false", ""),
         (step("let = { m = 1 }"), "no variable is named `m`", "`n`"),
         (
+            step("repeat = \"forever\"\nstep = []"),
+            "nothing is repeated",
+            "[[step.step]]",
+        ),
+        (
             step("if = { a = true }"),
             "`if` has no steps",
             "[[step.step]]",
