@@ -4,6 +4,7 @@ import math
 import os
 import pathlib
 import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -22,12 +23,15 @@ def in_the_root(monkeypatch):
 
 
 def snippets():
-    text = (ROOT / "clients/python/README.md").read_text()
-    return re.findall(r"```python\n(.*?)```", text, re.S)
+    texts = [(ROOT / "clients/python" / name).read_text() for name in ("README.md", "pysoem.md")]
+    return re.findall(r"```python\n(.*?)```", "".join(texts), re.S)
 
 
 @pytest.mark.parametrize("number", range(len(snippets())))
-def test_snippets_of_the_readme_run(number, ecaxis_open):
+def test_snippets_of_the_documents_run(number, ecaxis_open, monkeypatch):
+    # Snippets call the program by its name.
+    folder = os.path.dirname(os.path.abspath(os.environ.get("ECAXIS") or shutil.which("ecaxis") or ""))
+    monkeypatch.setenv("PATH", folder, prepend=os.pathsep)
     names = {"__name__": "snippet"}
     exec(compile(snippets()[number], f"snippet {number}", "exec"), names)
     for name, test in names.items():
@@ -80,6 +84,18 @@ def test_objects_are_read_and_written(ecaxis_open):
     before = machine.sdo_read("x", 0x6083)
     machine.sdo_write("x", 0x6083, 0, before + 1)
     assert machine.sdo_read("x", 0x6083) == before + 1
+
+
+def test_outputs_are_set_and_inputs_read(ecaxis_open):
+    machine = ecaxis_open(ROOT / "configs/square.toml")
+    for value in (1, 0):
+        machine.set_output("io", "Output 3", value)
+        machine.sleep(0.05)
+        assert machine.input("io", "Input 3") == value
+    with pytest.raises(ecaxis.EcaxisError, match="Output 9"):
+        machine.set_output("io", "Output 9", 1)
+    with pytest.raises(KeyError, match="Input 9"):
+        machine.input("io", "Input 9")
 
 
 def test_a_fault_is_reset(ecaxis_open, tmp_path):
@@ -202,8 +218,21 @@ def test_a_server_that_ends_is_reported():
     with ecaxis.open(DEMO, sim=True) as machine:
         machine.enable()
         move = machine.x.move(50.0, speed=0.02)
-        os.kill(machine._process.pid, 9)
+        os.kill(machine._server.process.pid, 9)
         with pytest.raises(ecaxis.ConnectionLost):
             move.wait(timeout=5)
         with pytest.raises(ecaxis.ConnectionLost):
             machine.state
+
+
+def test_the_square_is_moved_also_with_a_fault(tmp_path):
+    script = tmp_path / "faults.toml"
+    script.write_text('[[fault]]\nkind = "drive-fault"\ndevice = 0\nat = "4s"\ncode = 0x4210\n')
+    example = ROOT / "clients/python/examples/square.py"
+    for faults in ([], [str(script)]):
+        command = [sys.executable, str(example), "configs/square.toml", *faults]
+        done = subprocess.run(command, capture_output=True, text=True)
+        lines = done.stdout.splitlines()
+        assert done.returncode == 0, done.stderr
+        assert lines[-1] == f"input: 1; faults: {len(faults)}"
+        assert sum(line.startswith("corner") for line in lines) == 8

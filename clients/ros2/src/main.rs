@@ -7,7 +7,9 @@
 //! | [`lease`], [`cycle`] | the thread that keeps the lease, and the one that writes set-points |
 //! | [`command`], [`trajectory`] | messages as set-points, checked as a whole |
 //! | [`follower`] | what a joint follows: commands or a trajectory, and when it stops |
-//! | [`node`], [`services`], [`status`] | topics, services, `/diagnostics` |
+//! | [`node`], [`publish`] | subscriptions and threads; joint states, `/diagnostics` |
+//! | [`services`], [`status`] | services; the texts of `/diagnostics` |
+//! | [`signals`] | inputs and outputs |
 //! | [`messages`] | the ROS 2 messages |
 
 mod command;
@@ -18,8 +20,10 @@ mod lease;
 mod messages;
 mod node;
 mod options;
+mod publish;
 mod server;
 mod services;
+mod signals;
 mod status;
 mod trajectory;
 

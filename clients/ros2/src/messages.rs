@@ -72,6 +72,12 @@ pub struct JointTrajectory {
     pub points: Vec<JointTrajectoryPoint>,
 }
 
+/// `std_msgs/Float64`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Float64 {
+    pub data: f64,
+}
+
 /// The `level` of a [`DiagnosticStatus`].
 pub mod level {
     pub const OK: u8 = 0;

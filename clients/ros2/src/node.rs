@@ -1,43 +1,39 @@
 //! The node: its topics, services and threads.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, Sender, TryRecvError, channel};
+use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, sleep};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use futures::channel::{mpsc as futures_mpsc, oneshot};
 use futures::executor::{LocalPool, LocalSpawner};
 use futures::future::LocalFutureObj;
 use futures::task::LocalSpawn;
 use futures::{StreamExt, pin_mut};
-use ros2_client::log::LogLevel;
 use ros2_client::qos::{History, WhenFull};
 use ros2_client::{
-    Context, ContextOptions, MessageTypeName, Name, Node, NodeLoggingHandle, NodeName, NodeOptions,
-    Publisher, QosProfile, Server, ServiceMapping, ServiceTypeName, Subscription, rosout,
+    Context, ContextOptions, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher,
+    QosProfile, Server, ServiceMapping, ServiceTypeName, Subscription,
 };
 use serde_json::{Value, json};
 
 use crate::command::read_command;
-use crate::cycle::{Message, Report, monotonic_ns, value, wait_for_row};
+use crate::cycle::Message;
 use crate::joints::Joint;
 use crate::lease::{Shared, keep_lease};
-use crate::messages::{
-    DiagnosticArray, DiagnosticStatus, Header, JointState, JointTrajectory, Time, TriggerRequest,
-    TriggerResponse, level,
-};
+use crate::messages::{Float64, JointState, JointTrajectory, TriggerRequest, TriggerResponse};
 use crate::options::Options;
+use crate::publish::{publish_diagnostics, publish_states};
 use crate::server::Connection;
 use crate::services::{Service, Worker, services};
-use crate::status::{NodeStatus, describe, of_server};
+use crate::signals::{InputPublisher, Signal};
+use crate::status::NodeStatus;
 use crate::trajectory::{Start, plan};
 
 const TIMEOUT: Duration = Duration::from_secs(10);
-/// The pause between attempts to connect, and between states without the area.
+/// The pause between attempts to connect.
 const PAUSE: Duration = Duration::from_millis(50);
-/// The longest time between two diagnostics.
-const DIAGNOSTICS: Duration = Duration::from_secs(1);
 
 /// Runs the node until a signal.
 ///
@@ -70,19 +66,21 @@ pub fn run(options: Options) -> Result<(), String> {
         joints,
         options: Arc::new(options),
     };
-    let threads = start(shared.clone(), events, &stop)?;
+    let threads = start(shared.clone(), &machine, events, &stop)?;
     let mut pool = threads.pool;
     let result = pool.run_until(stopped.next()).unwrap_or(Ok(()));
     ends.store(true, Ordering::Relaxed);
-    // Axes that move stop while the node still answers.
-    let _ = threads.lease.join();
+    // Axes that move stop while the node still answers, and DDS announces its end.
+    for thread in threads.threads {
+        let _ = thread.join();
+    }
     shared.connection.close();
     result
 }
 
 struct Threads {
     pool: LocalPool,
-    lease: thread::JoinHandle<()>,
+    threads: [thread::JoinHandle<()>; 3],
     /// The node lives as long as its topics.
     _node: Node,
 }
@@ -126,6 +124,7 @@ fn machine(connection: &Connection, options: &Options) -> Result<Value, String> 
 
 fn start(
     shared: Shared,
+    machine: &Value,
     events: Receiver<Value>,
     stop: &futures_mpsc::UnboundedSender<Result<(), String>>,
 ) -> Result<Threads, String> {
@@ -205,12 +204,42 @@ fn start(
         follow_trajectories(trajectories, shared.clone(), to_cycle),
     );
 
+    let mut inputs = Vec::new();
+    for signal in Signal::of_machine(machine, "inputs") {
+        let topic = below_node(&options, &signal.topic);
+        let publisher = publisher(&mut node, &topic, "std_msgs", "Float64", &reliable)?;
+        inputs.push(InputPublisher::new(signal, publisher));
+    }
+    let (to_outputs, outputs) = channel();
+    for signal in Signal::of_machine(machine, "outputs") {
+        let topic = below_node(&options, &signal.topic);
+        let values = subscription::<Float64>(&mut node, &topic, "std_msgs", "Float64", &reliable)?;
+        spawn(&spawner, take_outputs(values, signal, to_outputs.clone()));
+    }
+    let connection = Arc::clone(&shared.connection);
+    let for_outputs = shared.clone();
+    thread::spawn(move || {
+        for (Signal { device, name, .. }, value) in outputs {
+            let request = json!({"op": "output", "device": device, "output": name, "value": value});
+            let error = connection.request(request, TIMEOUT).err();
+            let error = error.map(|error| format!("{device}.{name}: {error}"));
+            for_outputs.update(|status| status.output = error);
+        }
+    });
+
     let log = node.logging_handle();
     let (for_states, for_diagnostics) = (shared.clone(), shared.clone());
     let ended = stop.clone();
-    thread::spawn(move || publish_states(&for_states, &states));
-    thread::spawn(move || {
-        let result = publish_diagnostics(&for_diagnostics, &diagnostics, &log, &events, &reports);
+    let states = thread::spawn(move || publish_states(&for_states, &states));
+    let diagnostics = thread::spawn(move || {
+        let result = publish_diagnostics(
+            &for_diagnostics,
+            &diagnostics,
+            inputs,
+            &log,
+            &events,
+            &reports,
+        );
         let _ = ended.unbounded_send(result);
     });
     let ended = stop.clone();
@@ -220,7 +249,7 @@ fn start(
     });
     Ok(Threads {
         pool,
-        lease,
+        threads: [lease, states, diagnostics],
         _node: node,
     })
 }
@@ -268,13 +297,18 @@ fn subscription<M: 'static>(
         .map_err(wrong)
 }
 
+/// Returns the name of a topic or service below the node.
+fn below_node(options: &Options, name: &str) -> String {
+    let namespace = options.namespace.trim_end_matches('/');
+    format!("{namespace}/{}/{name}", options.name)
+}
+
 fn server(
     node: &mut Node,
     options: &Options,
     service: &Service,
 ) -> Result<Server<TriggerRequest, TriggerResponse>, String> {
-    let namespace = options.namespace.trim_end_matches('/');
-    let name = format!("{namespace}/{}/{}", options.name, service.name);
+    let name = below_node(options, &service.name);
     let qos = QosProfile::publisher_default().history(History::KeepLast { depth: 10 });
     let made = node.create_server(
         ServiceMapping::Enhanced,
@@ -299,6 +333,20 @@ async fn serve(server: Server<TriggerRequest, TriggerResponse>, service: Service
         });
         let Ok(response) = answer.await else { continue };
         let _ = server.async_send_response(id, response).await;
+    }
+}
+
+async fn take_outputs(
+    values: Subscription<Float64>,
+    signal: Signal,
+    outputs: Sender<(Signal, f64)>,
+) {
+    let stream = values.async_stream();
+    pin_mut!(stream);
+    while let Some(received) = stream.next().await {
+        if let Ok((Float64 { data }, _)) = received {
+            let _ = outputs.send((signal.clone(), data));
+        }
     }
 }
 
@@ -378,229 +426,5 @@ async fn follow_trajectories(
             Ok(())
         });
         shared.update(|status| status.trajectory = read.err());
-    }
-}
-
-/// Returns the header of a message. `monotonic` is its time in ns of CLOCK_MONOTONIC.
-fn header(monotonic: u64) -> Header {
-    let unix = SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .unwrap_or_default();
-    let unix = u64::try_from(unix.as_nanos()).unwrap_or(u64::MAX);
-    let age = monotonic_ns().saturating_sub(monotonic);
-    Header {
-        stamp: Time::from_ns(unix.saturating_sub(age)),
-        frame_id: String::new(),
-    }
-}
-
-fn publish_states(shared: &Shared, states: &Publisher<JointState>) {
-    let joints = &shared.joints;
-    let mut values = Vec::new();
-    let (mut row, mut next) = (0, 0);
-    while !shared.ends.load(Ordering::Relaxed) {
-        let known = shared
-            .samples
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .clone();
-        let Some((samples, columns)) = known else {
-            if let Some(state) = state_of_server(shared) {
-                let _ = states.publish(state);
-            }
-            sleep(PAUSE);
-            continue;
-        };
-        let Some(written) = wait_for_row(&samples, row, &shared.ends) else {
-            continue;
-        };
-        row = written;
-        let every = (1e9 / (shared.options.rate * samples.cycle_ns as f64))
-            .round()
-            .max(1.0);
-        if row < next || !samples.read_newest(&mut values) {
-            continue;
-        }
-        next = row + every as u64;
-        let columns = joints.iter().zip(columns.iter());
-        let mut state = joint_state(joints, values.get(1).copied().unwrap_or_default());
-        for (joint, columns) in columns {
-            state
-                .position
-                .push(value(&values, columns.position) * joint.scale);
-            state
-                .velocity
-                .push(value(&values, columns.velocity) * joint.scale);
-            state
-                .effort
-                .push(joint.effort(value(&values, columns.torque)));
-        }
-        let _ = states.publish(without_unknown_effort(state));
-    }
-}
-
-fn joint_state(joints: &[Joint], time_ns: u64) -> JointState {
-    JointState {
-        header: header(time_ns),
-        name: joints.iter().map(|joint| joint.name.clone()).collect(),
-        ..JointState::default()
-    }
-}
-
-fn without_unknown_effort(mut state: JointState) -> JointState {
-    if state.effort.iter().all(|effort| effort.is_nan()) {
-        state.effort.clear();
-    }
-    state
-}
-
-/// Returns the joint states without the area: until the node has the lease for the first time.
-fn state_of_server(shared: &Shared) -> Option<JointState> {
-    let answer = shared
-        .connection
-        .request(json!({"op": "state"}), TIMEOUT)
-        .ok()?;
-    let mut state = joint_state(&shared.joints, answer["time_ns"].as_u64()?);
-    for joint in shared.joints.iter() {
-        let axis = &answer["axes"][joint.index];
-        state
-            .position
-            .push(axis["position"].as_f64()? * joint.scale);
-        state
-            .velocity
-            .push(axis["velocity"].as_f64()? * joint.scale);
-        state.effort.push(joint.effort(axis["torque"].as_f64()?));
-    }
-    Some(without_unknown_effort(state))
-}
-
-fn publish_diagnostics(
-    shared: &Shared,
-    publisher: &Publisher<DiagnosticArray>,
-    log: &NodeLoggingHandle,
-    events: &Receiver<Value>,
-    reports: &Receiver<(usize, Report)>,
-) -> Result<(), String> {
-    let mut published = Instant::now() - DIAGNOSTICS;
-    let mut said: Vec<DiagnosticStatus> = Vec::new();
-    while !shared.ends.load(Ordering::Relaxed) {
-        let mut news = false;
-        while let Ok((index, report)) = reports.try_recv() {
-            take_report(shared, index, report);
-            news = true;
-        }
-        loop {
-            match events.try_recv() {
-                Ok(event) => news |= take_event(shared, &event),
-                Err(TryRecvError::Empty) => break,
-                Err(TryRecvError::Disconnected) => {
-                    return Err("the connection to the server is lost".to_owned());
-                }
-            }
-        }
-        let node = shared.options.name.as_str();
-        let status = shared
-            .status
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .clone();
-        let own = status.diagnostics(node, &shared.joints);
-        news |= own != said;
-        if news || published.elapsed() >= DIAGNOSTICS {
-            published = Instant::now();
-            log_changes(log, &said, &own);
-            said.clone_from(&own);
-            let parts = server_diagnostics(shared, node)
-                .into_iter()
-                .chain(own)
-                .collect();
-            let _ = publisher.publish(DiagnosticArray {
-                header: header(monotonic_ns()),
-                status: parts,
-            });
-        }
-        sleep(PAUSE);
-    }
-    Ok(())
-}
-
-fn server_diagnostics(shared: &Shared, node: &str) -> Vec<DiagnosticStatus> {
-    match shared
-        .connection
-        .request(json!({"op": "diagnostics"}), TIMEOUT)
-    {
-        Ok(answer) => {
-            let parts = answer["diagnostics"].as_array().into_iter().flatten();
-            parts.map(|part| of_server(node, part)).collect()
-        }
-        Err(error) => vec![DiagnosticStatus {
-            level: level::ERROR,
-            name: format!("{node}: server"),
-            message: error.to_string(),
-            ..DiagnosticStatus::default()
-        }],
-    }
-}
-
-fn take_report(shared: &Shared, index: usize, report: Report) {
-    let Some(joint) = shared.joints.get(index) else {
-        return;
-    };
-    let Options {
-        stale_ms,
-        start_tolerance,
-        ..
-    } = *shared.options;
-    let described = describe(report, joint, stale_ms, start_tolerance);
-    shared.update(|status| {
-        if let Some(state) = status.joints.get_mut(index) {
-            *state = described;
-        }
-    });
-}
-
-/// Returns true if the event changes diagnostics.
-fn take_event(shared: &Shared, event: &Value) -> bool {
-    let kind = event["event"].as_str().unwrap_or_default();
-    if kind == "area" {
-        let axis = event["axis"].as_str().unwrap_or_default();
-        let why = event["why"].as_str().unwrap_or_default();
-        if let Some(index) = shared.joints.iter().position(|joint| joint.axis == axis) {
-            shared.update(|status| {
-                if let Some(state) = status.joints.get_mut(index) {
-                    *state = (level::WARN, format!("stopped: {why}"));
-                }
-            });
-        }
-    }
-    let changes = [
-        "area",
-        "bus",
-        "fault",
-        "lease",
-        "device_lost",
-        "device_returned",
-        "done",
-    ];
-    changes.contains(&kind)
-}
-
-/// Logs problems that are new or over.
-fn log_changes(log: &NodeLoggingHandle, before: &[DiagnosticStatus], now: &[DiagnosticStatus]) {
-    for status in now {
-        let old = before.iter().find(|old| old.name == status.name);
-        if old.is_some_and(|old| old.message == status.message)
-            || (old.is_none() && status.level == level::OK)
-        {
-            continue;
-        }
-        let text = format!("{}: {}", status.name, status.message);
-        eprintln!("{text}");
-        let level = if status.level == level::OK {
-            LogLevel::Info
-        } else {
-            LogLevel::Warn
-        };
-        rosout!(*log, level, "{text}");
     }
 }

@@ -96,7 +96,7 @@ pub fn name_token(name: &str) -> String {
     let token = words.join("_");
     match token.starts_with(|c: char| c.is_ascii_alphabetic()) {
         true => token,
-        false => format!("joint_{token}"),
+        false => format!("n_{token}"),
     }
 }
 

@@ -17,6 +17,8 @@ pub struct NodeStatus {
     pub command: Option<String>,
     /// Why the last trajectory was refused.
     pub trajectory: Option<String>,
+    /// Why the last value of an output was refused.
+    pub output: Option<String>,
 }
 
 impl NodeStatus {
@@ -47,6 +49,7 @@ impl NodeStatus {
             ("lease", problem(&self.no_lease, level::WARN)),
             ("commands", problem(&self.command, level::WARN)),
             ("trajectory", problem(&self.trajectory, level::WARN)),
+            ("outputs", problem(&self.output, level::WARN)),
         ];
         let parts = parts
             .into_iter()

@@ -25,6 +25,7 @@ from ._errors import (
     TimedOut,
 )
 from ._machine import Axis, Machine, Motion, Recording, attach, open
+from ._mcap import read_recording
 
 __all__ = [
     "Aborted",
@@ -46,4 +47,5 @@ __all__ = [
     "TimedOut",
     "attach",
     "open",
+    "read_recording",
 ]

@@ -18,7 +18,7 @@ Answer = Dict[str, Any]
 
 # Outcomes that came before the answer that names their request.
 _KEPT = 1024
-_OUTCOMES = frozenset({"done", "failed", "refused", "replaced", "let_go"})
+OUTCOMES = frozenset({"done", "failed", "refused", "replaced", "let_go"})
 
 
 class Outcome:
@@ -163,7 +163,7 @@ class Connection:
             if answers:
                 answers.put(dict(message))
             return
-        if message.get("event") in _OUTCOMES and "request" in message:
+        if message.get("event") in OUTCOMES and "request" in message:
             with self._lock:
                 outcome = self._outcomes.setdefault(int(message["request"]), Outcome())
                 while len(self._outcomes) > _KEPT:

@@ -16,7 +16,7 @@ from ._errors import ConnectionLost, EcaxisError, TimedOut
 
 _ROWS_AT, _ROW_WORDS, _ROWS, _CYCLE_NS, _WRITTEN, _NEXT_NS, _TEXT_AT, _TEXT_BYTES = range(2, 10)
 _AXES_AT, _AXIS_WORDS, _AXES, _SEQUENCE, _COUNTER, _FROM_ROW, _, _USED, _STALE, _REFUSED = range(2, 12)
-_POSITION, _VELOCITY, _TORQUE = 1, 2, 3
+_NOTHING, _POSITION, _VELOCITY, _TORQUE = range(4)
 _POLL_S = 20e-6
 _NO_CYCLE_S = 1.0
 
@@ -53,6 +53,10 @@ class CyclicAxis:
     @torque.setter
     def torque(self, value: float) -> None:
         self._cyclic.set(self._number, _TORQUE, value)
+
+    def release(self) -> None:
+        """The axis decelerates and holds; it follows no set-points until the next one."""
+        self._cyclic.set(self._number, _NOTHING, 0.0)
 
     @property
     def target_position(self) -> float:
@@ -115,6 +119,10 @@ class Cyclic:
         error: Optional[BaseException],
         trace: Optional[TracebackType],
     ) -> None:
+        # What still moves decelerates and holds: an end is not a program that is late.
+        for axis in self.axes.values():
+            axis.release()
+        self.publish()
         for view in (self._samples, self._commands, self._floats):
             view.release()
         for area in self._maps:

@@ -71,3 +71,15 @@ def of_answer(error: Mapping[str, Any]) -> EcaxisError:
     if code == "aborted":
         return Aborted(message, code, help, int(error.get("abort_code", 0)))
     return _KINDS.get(code, EcaxisError)(message, code, help)
+
+
+def of_outcome(what: str, event: Mapping[str, Any]) -> Optional[EcaxisError]:
+    """Returns the exception for the outcome of a command; None if it is done."""
+    kind = str(event.get("event"))
+    if kind == "done":
+        return None
+    if kind == "lost":
+        return ConnectionLost(str(event.get("text")))
+    why = event.get("why") or event.get("error") or "another command has replaced it"
+    error = Refused if kind == "refused" else Failed
+    return error(f"{what}: {why}", kind)

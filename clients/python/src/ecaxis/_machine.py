@@ -16,14 +16,19 @@ from typing import Any, Dict, Iterator, List, Mapping, NamedTuple, Optional, Seq
 
 from ._connection import Connection, Event, Outcome
 from ._cyclic import Cyclic
-from ._errors import EcaxisError, Failed, Refused, StartFailed, TimedOut
+from ._errors import EcaxisError, StartFailed, TimedOut, of_outcome
 
 Path = Union[str, "os.PathLike[str]"]
 
 # In virtual time, the steps in which time advances while something is awaited, in seconds.
-_STEP_S = 0.01
+STEP_S = 0.01
 # The pause between two looks at the server, and at most a third of the lease, in seconds.
 _POLL_S = 0.1
+
+
+def client_name() -> str:
+    """Returns the name under which this program appears in events and in the change log."""
+    return os.path.basename(sys.argv[0]) or "python"
 
 
 class Motion:
@@ -47,13 +52,9 @@ class Motion:
             raise TimedOut(f"{self.what}: not over within {timeout:g} s", "timeout")
         if self._outcome.lost:
             raise self._outcome.lost
-        event = self._outcome.event or {}
-        kind = event.get("event")
-        if kind == "done":
-            return
-        why = event.get("why") or event.get("error") or "another command has replaced it"
-        error = Refused if kind == "refused" else Failed
-        raise error(f"{self.what}: {why}", str(kind))
+        error = of_outcome(self.what, self._outcome.event or {})
+        if error is not None:
+            raise error
 
 
 class Axis:
@@ -165,6 +166,80 @@ class Recording(NamedTuple):
         return array
 
 
+def input_of(state: Mapping[str, Any], device: str, name: str) -> float:
+    """Returns an input from the state of a machine."""
+    for signal in state["inputs"]:
+        if (signal["device"], signal["name"]) == (device, name):
+            return float(signal["value"])
+    raise KeyError(f"the machine has no input `{name}` of `{device}`")
+
+
+def recording_of(batches: Sequence[Event], signals: Sequence[str], begin: int, end: int) -> Recording:
+    """Returns the samples of a time from events `samples`."""
+    times = [at for batch in batches for at in batch["time_ns"]]
+    rows = [row for batch in batches for row in batch["rows"]]
+    kept = [n for n, at in enumerate(times) if begin < at <= end]
+    columns = {name: [rows[n][c] for n in kept] for c, name in enumerate(signals)}
+    return Recording([times[n] for n in kept], columns, sum(int(batch["missed"]) for batch in batches))
+
+
+class Server:
+    """A server that this program has started."""
+
+    def __init__(self, process: "subprocess.Popen[str]", folder: str, path: str) -> None:
+        self.process, self._folder, self.path = process, folder, path
+
+    @classmethod
+    def start(
+        cls,
+        file: Path,
+        sim: bool = False,
+        virtual: bool = False,
+        faults: Optional[Path] = None,
+        program: Optional[Path] = None,
+        timeout: float = 60.0,
+    ) -> "Server":
+        """Starts `ecaxis serve` and waits until it listens."""
+        binary = os.fspath(program or os.environ.get("ECAXIS") or "ecaxis")
+        folder = tempfile.mkdtemp(prefix="ecaxis-")
+        path = os.path.join(folder, "socket")
+        command = [binary, "serve", os.fspath(file), "--quiet", "--socket", path]
+        command += ["--sim"] if sim or virtual else []
+        command += ["--virtual"] if virtual else []
+        command += ["--faults", os.fspath(faults)] if faults is not None else []
+        try:
+            with tempfile.TemporaryFile("w+") as messages:
+                process = subprocess.Popen(
+                    command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=messages, text=True
+                )
+                deadline = time.monotonic() + timeout
+                while not _accepts(path):
+                    if process.poll() is not None or time.monotonic() > deadline:
+                        process.kill()
+                        process.wait()
+                        messages.seek(0)
+                        raise StartFailed(f"ecaxis serve has not started: {messages.read().strip()}")
+                    time.sleep(0.01)
+        except OSError as error:
+            shutil.rmtree(folder, ignore_errors=True)
+            hint = "install ecaxis, or set ECAXIS to its path"
+            raise StartFailed(f"cannot start {binary}: {error.strerror}", help=hint) from error
+        except StartFailed:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        return cls(process, folder, path)
+
+    def close(self) -> None:
+        """Ends the server: all axes stop and lose power."""
+        self.process.terminate()
+        try:
+            self.process.wait(30)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
 class Machine:
     """A machine that `ecaxis serve` runs. Use it in a `with` statement.
 
@@ -176,8 +251,7 @@ class Machine:
         self.connection = connection
         self._path = path
         self._lease_s = lease
-        self._process: Optional[subprocess.Popen[str]] = None
-        self._folder: Optional[str] = None
+        self._server: Optional[Server] = None
         self._closed = False
         self._owns = False
         self.about: Dict[str, Any] = {}
@@ -211,20 +285,12 @@ class Machine:
             return
         self._closed = True
         self.connection.close()
-        if self._process is not None:
-            self._process.terminate()
-            try:
-                self._process.wait(30)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-        if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
+        if self._server is not None:
+            self._server.close()
 
     def _begin(self, take: bool, timeout: float) -> None:
         request = self.connection.request
-        name = os.path.basename(sys.argv[0]) or "python"
-        hello = request("hello", name=name)
+        hello = request("hello", name=client_name())
         self.virtual = bool(hello.get("virtual"))
         request("subscribe", topics=["events"])
         request("await", bus="op", timeout_ms=int(timeout * 1000), timeout=timeout + 1)
@@ -240,9 +306,8 @@ class Machine:
 
     def take(self, force: bool = False) -> None:
         """Gets the lease. With `force`, from another client, whose axes stop first."""
-        name = os.path.basename(sys.argv[0]) or "python"
         ttl = int(self._lease_s * 1000)
-        self.connection.request("take", name=name, ttl_ms=ttl, force=force or None)
+        self.connection.request("take", name=client_name(), ttl_ms=ttl, force=force or None)
         self._owns = True
 
     def release(self) -> None:
@@ -275,13 +340,10 @@ class Machine:
         self.connection.request("emergency_stop")
 
     def input(self, device: str, name: str) -> float:
-        for signal in self.state["inputs"]:
-            if (signal["device"], signal["name"]) == (device, name):
-                return float(signal["value"])
-        raise KeyError(f"the machine has no input `{name}` of `{device}`")
+        return input_of(self.state, device, name)
 
     def set_output(self, device: str, name: str, value: float) -> None:
-        self.command("output", f"{device}.{name}", device=device, output=name, value=value).wait()
+        self._await("output", device=device, output=name, value=value)
 
     def sdo_read(self, device: str, index: int, sub: int = 0) -> Any:
         """Reads an object: its value where the type is known, else its bytes."""
@@ -327,9 +389,9 @@ class Machine:
             # Counted in steps: a sum of seconds would drift.
             steps = 0
             while not condition():
-                if timeout is not None and steps * _STEP_S >= timeout:
+                if timeout is not None and steps * STEP_S >= timeout:
                     return False
-                left = _STEP_S if timeout is None else min(_STEP_S, timeout - steps * _STEP_S)
+                left = STEP_S if timeout is None else min(STEP_S, timeout - steps * STEP_S)
                 self.advance(left)
                 steps += 1
             return True
@@ -362,15 +424,11 @@ class Machine:
 
     def record(self, signals: Sequence[str], seconds: float) -> Recording:
         """Records signals in every cycle for some seconds of the machine's time."""
-        rows: List[Sequence[Optional[float]]] = []
-        recording = Recording([], {name: [] for name in signals}, 0)
-        missed = [0]
+        batches: List[Event] = []
 
         def take(event: Event) -> None:
-            if event.get("event") == "samples":
-                missed[0] += int(event["missed"])
-                recording.time_ns.extend(event["time_ns"])
-                rows.extend(event["rows"])
+            if event.get("event") == "samples" and event["time_ns"]:
+                batches.append(event)
 
         subscriber = Connection(self._path)
         try:
@@ -379,13 +437,10 @@ class Machine:
             begin = int(self.state["time_ns"])
             end = begin + int(seconds * 1e9)
             self.sleep(seconds)
-            last = lambda: bool(recording.time_ns) and recording.time_ns[-1] >= end  # noqa: E731
-            self.wait_until(last, 1.0)
+            self.wait_until(lambda: bool(batches) and batches[-1]["time_ns"][-1] >= end, 1.0)
         finally:
             subscriber.close()
-        kept = [n for n, at in enumerate(recording.time_ns) if begin < at <= end]
-        columns = {name: [rows[n][c] for n in kept] for c, name in enumerate(signals)}
-        return Recording([recording.time_ns[n] for n in kept], columns, missed[0])
+        return recording_of(batches, signals, begin, end)
 
     def cyclic(self) -> Cyclic:
         """Set-points in every cycle, in shared memory. Use it in a `with` statement."""
@@ -423,39 +478,11 @@ def open(
 
     `sim`: on the simulated bus, with the fault script `faults`. `virtual`: in virtual time, which
     advances while the program waits. `program`: the path of `ecaxis`, else from `ECAXIS` or `PATH`."""
-    binary = os.fspath(program or os.environ.get("ECAXIS") or "ecaxis")
-    folder = tempfile.mkdtemp(prefix="ecaxis-")
-    path = os.path.join(folder, "socket")
-    command = [binary, "serve", os.fspath(file), "--quiet", "--socket", path]
-    command += ["--sim"] if sim or virtual else []
-    command += ["--virtual"] if virtual else []
-    command += ["--faults", os.fspath(faults)] if faults is not None else []
+    server = Server.start(file, sim, virtual, faults, program, timeout)
     try:
-        with tempfile.TemporaryFile("w+") as messages:
-            process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=messages, text=True
-            )
-            deadline = time.monotonic() + timeout
-            while not _accepts(path):
-                if process.poll() is not None or time.monotonic() > deadline:
-                    process.kill()
-                    process.wait()
-                    messages.seek(0)
-                    raise StartFailed(f"ecaxis serve has not started: {messages.read().strip()}")
-                time.sleep(0.01)
-    except OSError as error:
-        shutil.rmtree(folder, ignore_errors=True)
-        hint = "install ecaxis, or set ECAXIS to its path"
-        raise StartFailed(f"cannot start {binary}: {error.strerror}", help=hint) from error
-    except StartFailed:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
-    try:
-        machine = attach(path, lease, True, timeout)
+        machine = attach(server.path, lease, True, timeout)
     except BaseException:
-        process.terminate()
-        process.wait()
-        shutil.rmtree(folder, ignore_errors=True)
+        server.close()
         raise
-    machine._process, machine._folder = process, folder
+    machine._server = server
     return machine
