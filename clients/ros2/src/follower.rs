@@ -17,6 +17,8 @@ const STRETCH: f64 = 1.5;
 const NEWEST: f64 = 0.2;
 /// A leader at this part of a cycle's motion from its command stands.
 const NEAR: f64 = 1e-3;
+/// Commands that differ by this many times that distance move the joint.
+const STEPS: f64 = 10.0;
 
 /// Who sends the commands.
 pub type Publisher = [u8; 16];
@@ -30,6 +32,13 @@ pub struct FollowerConfig {
     pub smoothing_s: f64,
     pub stale_cycles: u64,
     pub dt_s: f64,
+}
+
+impl FollowerConfig {
+    /// Returns the distance at which a joint counts as there.
+    fn near(&self) -> f64 {
+        self.limits.velocity * self.dt_s * NEAR
+    }
 }
 
 /// What the cycle says about the axis.
@@ -47,7 +56,7 @@ pub struct AxisInput {
 /// Why a joint follows no longer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum End {
-    /// The commands stay away while the joint moves.
+    /// The commands stay away, and the last ones moved the joint.
     Stale,
     /// The commands stay away; the joint stands.
     Silent,
@@ -100,12 +109,15 @@ struct Leader {
     period: f64,
     /// The cycles to the command.
     left: f64,
+    /// The last command was not where the one before was.
+    moves: bool,
 }
 
 impl Leader {
-    fn command(&mut self, position: f64, since: u64, most: f64) {
+    fn command(&mut self, position: f64, since: u64, most: f64, near: f64) {
         let since = (since as f64).clamp(1.0, most);
         self.period += (since - self.period) * NEWEST;
+        self.moves = (position - self.command).abs() > near * STEPS;
         self.command = position;
         self.left = (self.period * STRETCH).max(1.0);
     }
@@ -204,10 +216,11 @@ impl Follower {
         }
         let since = self.cycle.saturating_sub(self.commanded);
         let most = self.config.stale_cycles as f64;
+        let near = self.config.near();
         match (&mut self.source, wanted) {
             (Source::Trajectory { .. }, _) => return Err(Refusal::Trajectory),
             (Source::Position { leader, .. }, Wanted::Position(position)) => {
-                leader.command(position, since, most);
+                leader.command(position, since, most, near);
             }
             (Source::Constant(now), Wanted::Velocity(_) | Wanted::Torque(_)) => {
                 // The mode cannot change while the joint follows.
@@ -258,6 +271,7 @@ impl Follower {
                     command: target_position,
                     period,
                     left: 0.0,
+                    moves: false,
                 };
                 Source::Position {
                     leader,
@@ -343,10 +357,14 @@ impl Follower {
                 motion,
             } => {
                 if silent {
-                    let near = self.config.limits.velocity * dt_s * NEAR;
+                    let near = self.config.near();
                     let left = (leader.command - motion.position).abs();
                     let stands = left <= near && (motion.velocity * dt_s).abs() <= near;
-                    Some(if stands { End::Silent } else { End::Stale })
+                    Some(if stands && !leader.moves {
+                        End::Silent
+                    } else {
+                        End::Stale
+                    })
                 } else {
                     for _ in 0..steps {
                         leader.advance(dt_s);

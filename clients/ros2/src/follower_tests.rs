@@ -177,6 +177,18 @@ fn joints_without_commands_end() {
     rig.follower.command(Wanted::Position(5.0), ME).unwrap();
     let ends: Vec<_> = (0..=STALE + 1).filter_map(|_| rig.step(1)).collect();
     assert_eq!(ends, [End::Silent]);
+    // A joint that has reached its last command says so as well, if the commands moved it.
+    let mut rig = Rig::new(0.0);
+    for cycle in 0..200 {
+        let position = f64::from(cycle) * 0.02;
+        rig.follower
+            .command(Wanted::Position(position), ME)
+            .unwrap();
+        rig.step(1);
+    }
+    let ends: Vec<_> = (0..=STALE + 1).filter_map(|_| rig.step(1)).collect();
+    assert_eq!(ends, [End::Stale]);
+    assert_eq!(rig.velocity, 0.0);
     // Velocities stop, and a standstill is silent.
     for (velocity, end) in [(10.0, End::Stale), (0.0, End::Silent)] {
         let mut rig = Rig::new(0.0);

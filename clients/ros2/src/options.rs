@@ -21,6 +21,7 @@ pub struct Options {
     pub namespace: String,
     /// The DDS domain
     #[arg(long, env = "ROS_DOMAIN_ID", default_value_t = 0)]
+    #[arg(value_parser = clap::value_parser!(u16).range(0..=232))]
     pub domain: u16,
     /// The topic of the joint states
     #[arg(long, default_value = "/joint_states")]

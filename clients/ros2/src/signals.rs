@@ -21,7 +21,7 @@ pub struct Signal {
 }
 
 impl Signal {
-    /// Returns the signals `inputs` or `outputs` of a machine. Those of drives belong to their joints.
+    /// Returns the signals `inputs` or `outputs` of a machine. Those of drives belong to joints.
     #[must_use]
     pub fn of_machine(machine: &Value, kind: &str) -> Vec<Self> {
         let devices = machine["devices"].as_array().into_iter().flatten();
