@@ -86,13 +86,6 @@ impl DatagramClient {
         self.ring.map_or((0, 0), RingStatus::breaks)
     }
 
-    /// Counts the breaks of the ring from now on.
-    pub(crate) fn forget_breaks(&self) {
-        if let Some(ring) = self.ring {
-            ring.forget_breaks();
-        }
-    }
-
     /// Returns true if the cables of both interfaces of a ring are exchanged.
     #[must_use]
     pub fn swapped(&self) -> bool {

@@ -4,6 +4,7 @@
 #![allow(clippy::print_stdout, reason = "what was measured")]
 
 mod bench;
+mod chain;
 mod first_steps;
 mod interruptions;
 mod link;

@@ -12,4 +12,5 @@ mod limits;
 mod optional;
 mod redundancy;
 mod returns;
+mod ring_members;
 mod unknown;

@@ -9,7 +9,7 @@ use crate::datagram::DatagramClient;
 use crate::link::redundant::RingState;
 use crate::report::{Cause, Error};
 
-const STEP: &str = "measuring propagation delays";
+pub(crate) const STEP: &str = "measuring propagation delays";
 /// The number of measurements for a mean: receive times have a resolution of 10 ns.
 const LATCHES: u32 = 8;
 
@@ -75,7 +75,14 @@ pub async fn measure(
                 last.dl_status |= 1 << (8 + 2 * end.port);
             }
             let measured = Box::pin(measure_lines(wire, &line, line.len())).await;
+            let status = enumerate::at(wire, end.device, STEP, registers::DL_STATUS).await;
             write_loops(wire, end, control).await?;
+            let open = open_ports(u16::from_le_bytes(status?));
+            if is_open(&open, end.port) {
+                // The device has opened it again by itself: the measurement took too long.
+                let late = Cause::Scan("the ring was not open long enough".to_owned());
+                return Err(Error::from(late).with_action(STEP));
+            }
             measured
         }
         Some(RingState::Broken { behind, .. }) => {

@@ -20,7 +20,6 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
-use crate::acyclic::delays;
 use crate::acyclic::{AlState, DeviceRef, StateTimeouts, Transition, al, enumerate, topology};
 use crate::clock;
 use crate::concurrent::try_join_all;
@@ -48,6 +47,7 @@ mod limits;
 mod mailbox;
 mod mapping;
 mod output_defaults;
+pub(crate) mod ring;
 mod times;
 pub(crate) use identify::{compare as compare_identity, known as known_identity, name_at};
 mod watchdog;
@@ -56,6 +56,7 @@ pub use crate::report::bring_up::{Step, StepTime};
 use device::StartupPhase;
 pub(crate) use device::enable_op_only;
 pub use device::{SdoOutcome, write_startup_sdo};
+pub use ring::RingDelays;
 pub use times::StepTimes;
 
 /// The size of ethercrab's own process image, which is not used.
@@ -93,10 +94,6 @@ pub struct BusDevice {
     /// The activation bytes that are 1 in Op only: SyncManagers, then FMMUs.
     pub op_only: Vec<u16>,
 }
-
-/// The devices of a ring in the order of the segment, each with its propagation delay in ns if the ring
-/// is closed; `None` without a clock.
-pub type RingDelays = Vec<(DeviceIndex, Option<u32>)>;
 
 /// A segment in SafeOp, ready for cyclic exchange.
 #[derive(Debug)]
@@ -143,6 +140,24 @@ impl Bus {
     }
 }
 
+impl Bus {
+    /// Returns the position of the device in front of another one, on the way from the MainDevice. The
+    /// number of devices stands for the second interface of a ring.
+    pub(crate) fn in_front_of(&self, position: u16) -> Option<u16> {
+        let present = self.devices.iter().filter(|device| device.present);
+        let mut status: Vec<_> = present.map(|d| (d.at.position, d.dl_status)).collect();
+        status.sort_unstable();
+        let status = status.iter().map(|(_, status)| *status);
+        match topology::parents(status.clone()).get(usize::from(position)) {
+            Some(parent) => parent.map(|parent| parent.device),
+            None => match topology::ring_end(status) {
+                Some(end) => Some(end.device),
+                None => position.checked_sub(1),
+            },
+        }
+    }
+}
+
 /// Brings the segment from any state to SafeOp. Passes emergencies of the devices to the listener,
 /// on success and on failure. `answers` are those of the MainDevice's PDU loop.
 pub async fn bring_up(
@@ -163,14 +178,14 @@ pub async fn bring_up(
                 Cause::Datagram(_) => error.with_action("scanning"),
                 _ => error,
             })?;
-        if enters_at_last_port(&wire).await? {
+        if ring::enters_at_last_port(&wire).await? {
             wire.exchange_ends();
         }
         al::acknowledge_errors_in_init(&wire).await;
         let ahead = Box::pin(eeproms::read_ahead(&wire, machine, count));
         let mut ahead = times.measure("EEPROMs", None, ahead).await?;
         ahead.as_line = match wire.ring() {
-            // ethercrab does not know rings; `measure_delays` measures them.
+            // ethercrab does not know rings; `ring::measure` measures them.
             Some(_) => Some(identify::stations(count)),
             None => identify::tolerate_reversed(&wire, machine, count, progress).await,
         };
@@ -217,19 +232,11 @@ pub async fn bring_up(
     // From here on, ethercrab only carries datagrams; see docs/decisions/0001.
     drop(group);
     let mut devices = found;
-    let mut ring_delays = None;
-    let ring = wire.ring();
-    if let Some(ring) = ring {
-        progress(ring_step(machine, ring));
-        if wire.swapped() {
-            let text = "the cables of `nic` and `redundant` are exchanged: `redundant` leads to the first device";
-            progress(Step::Warning(text.to_owned()));
-        }
-        let measure = measure_delays(&wire, ring, &mut devices);
+    let (mut ring, mut ring_delays) = (wire.ring(), None);
+    if let Some(state) = ring {
+        let measure = ring::measure(&wire, machine, state, &mut devices, progress);
         let measured = times.measure("propagation delays", None, measure).await?;
-        ring_delays = Some(measured);
-        // The measurement has opened it.
-        wire.forget_breaks();
+        (ring, ring_delays) = (Some(measured.state), Some(measured.closed));
     }
     let reference = clocks::reference(&devices);
     let set_up = Box::pin(set_up(
@@ -261,53 +268,6 @@ pub async fn bring_up(
         ring,
         times,
     })
-}
-
-/// Returns true if the cables of a broken ring are exchanged at the computer. The first device of
-/// the line of the first interface has its port 0 open. That of the second one has lost the link of
-/// its port 0. In a closed ring the frames show it (`link::redundant`).
-async fn enters_at_last_port(wire: &DatagramClient) -> Result<bool, Error> {
-    const STEP: &str = "looking at the ends of the ring";
-    let Some(RingState::Broken { behind, .. }) = wire.ring() else {
-        return Ok(false);
-    };
-    let status = enumerate::at(wire, 0, STEP, registers::DL_STATUS).await?;
-    let [open, ..] = topology::open_ports(u16::from_le_bytes(status));
-    Ok(open != (behind > 0))
-}
-
-/// Returns the report on the ring at the start.
-fn ring_step(machine: &Machine, ring: RingState) -> Step {
-    let text = ring.text(machine.devices.len(), |position| name_at(machine, position));
-    match ring {
-        RingState::Closed => Step::Ring(text),
-        RingState::Broken { .. } | RingState::Silent | RingState::OneDirection => {
-            Step::Warning(text)
-        }
-    }
-}
-
-/// Measures the delays of a ring, which ethercrab has taken for a line.
-async fn measure_delays(
-    wire: &DatagramClient,
-    ring: RingState,
-    devices: &mut [BusDevice],
-) -> Result<RingDelays, Error> {
-    let (stations, measured) = delays::devices(wire).await?;
-    let delays = delays::measure(wire, &measured).await?;
-    let closed = match ring.split() {
-        Some(first) => delays::joined(&delays, usize::from(first)),
-        None => delays.clone(),
-    };
-    let mut of_ring = Vec::new();
-    for ((station, delay), closed) in stations.into_iter().zip(delays).zip(closed) {
-        let mut numbered = (0..).map(DeviceIndex).zip(&mut *devices);
-        if let Some((index, device)) = numbered.find(|(_, d)| d.at.station == station) {
-            device.propagation_delay = delay.unwrap_or(0);
-            of_ring.push((index, closed));
-        }
-    }
-    Ok(of_ring)
 }
 
 /// Reads what bring-up needs to know of one device.

@@ -1,8 +1,8 @@
 //! Brings the segment from a machine file to SafeOp and prepares everything that the cycle needs.
 
 use std::collections::VecDeque;
-use std::sync::Arc;
 use std::sync::mpsc::Sender;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use ecaxis_axis::Axis;
@@ -162,6 +162,8 @@ impl RunBuilder<'_> {
                     end: rt_end,
                 };
                 let ring = RingWatch::new(bus.ring);
+                let ring_delays = bus.ring_delays.clone();
+                let ring_delays = ring_delays.map(|delays| Arc::new(Mutex::new(delays)));
                 let supervisor = Supervisor {
                     machine: Arc::clone(machine),
                     bus,
@@ -192,6 +194,7 @@ impl RunBuilder<'_> {
                     returns: None,
                     ring,
                     variables: Vec::new(),
+                    ring_delays,
                     device_log: DeviceLog::default(),
                 };
                 Ok(Prepared { parts, supervisor })

@@ -3,7 +3,7 @@
 //! gone, and their clocks would run ahead by its round-trip delay.
 
 use std::future::Future;
-use std::sync::Arc;
+use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
@@ -11,9 +11,10 @@ use ecaxis_ecat::registers;
 use tokio::sync::{Mutex, watch};
 
 use super::Supervisor;
-use crate::acyclic::delays;
 use crate::acyclic::topology::open_ports;
+use crate::acyclic::{delays, enumerate};
 use crate::bringup::RingDelays;
+use crate::bringup::ring::measure_once;
 use crate::clock;
 use crate::datagram::DatagramClient;
 use crate::link::redundant::RingState;
@@ -71,7 +72,7 @@ impl Supervisor {
             clocks: devices
                 .map(|device| (device.at.station, device.follows))
                 .collect(),
-            ring: self.bus.ring_delays.clone(),
+            ring: self.ring_delays.clone(),
             latch,
         }
     }
@@ -107,8 +108,8 @@ pub(super) struct Delays {
     wire: DatagramClient,
     /// The station address of each device, and whether its clock follows the reference clock.
     clocks: IndexVec<DeviceIndex, (u16, bool)>,
-    /// Known in a ring: a measurement would open it.
-    ring: Option<RingDelays>,
+    /// Known in a ring: a measurement opens it.
+    ring: Option<Arc<std::sync::Mutex<RingDelays>>>,
     /// Held while the receive times of all devices belong to one frame.
     latch: Arc<Mutex<()>>,
 }
@@ -162,19 +163,10 @@ impl Delays {
                 }
                 (before.0, measured)
             }
-            Some(ring) => {
-                let station = |device| self.clocks.get(device).map_or(0, |(station, _)| *station);
-                let stations = ring.iter().map(|(device, _)| station(*device)).collect();
-                let closed: Vec<_> = ring.iter().map(|(_, delay)| *delay).collect();
-                let now = match wire.ring() {
-                    Some(RingState::Broken { behind, devices }) => {
-                        let missing = closed.len().saturating_sub(usize::from(devices));
-                        delays::split(&closed, usize::from(behind) + missing)
-                    }
-                    _ => closed,
-                };
-                (stations, now)
-            }
+            Some(ring) => match self.delays_of_ring(ring).await? {
+                Some(delays) => delays.into_iter().unzip(),
+                None => return Ok(false),
+            },
         };
         let measured = || stations.iter().copied().zip(&measured);
         let find = |wanted| measured().find(|(station, _)| *station == wanted);
@@ -206,5 +198,46 @@ impl Delays {
             write.map_err(failed)?;
         }
         Ok(true)
+    }
+    /// Returns the delays in the ring as it is. They are measured only if other devices are in it than
+    /// before. Returns `None` if it has changed meanwhile.
+    async fn delays_of_ring(
+        &self,
+        ring: &std::sync::Mutex<RingDelays>,
+    ) -> Result<Option<RingDelays>, Error> {
+        let wire = &self.wire;
+        let count = enumerate::count(wire).await?;
+        let there = enumerate::words(wire, count, STEP, registers::STATION_ADDRESS).await?;
+        let lock = || ring.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = lock().clone();
+        let stations = || known.iter().map(|(station, _)| *station);
+        let own = |station: &u16| {
+            self.clocks
+                .iter()
+                .any(|(of_device, _)| of_device == station)
+        };
+        let state = wire.ring();
+        let new = there
+            .iter()
+            .any(|station| own(station) && !stations().any(|s| s == *station));
+        // Devices in a gap of a broken ring are expected back.
+        let left = state == Some(RingState::Closed) && !stations().eq(there.iter().copied());
+        if new || left {
+            let _held = self.latch.lock().await;
+            let measured = measure_once(wire).await?;
+            return Ok(measured.map(|measured| {
+                *lock() = measured.closed;
+                measured.now
+            }));
+        }
+        let closed: Vec<_> = known.iter().map(|(_, delay)| *delay).collect();
+        let now = match state {
+            Some(RingState::Broken { behind, devices }) => {
+                let missing = closed.len().saturating_sub(usize::from(devices));
+                delays::split(&closed, usize::from(behind) + missing)
+            }
+            _ => closed,
+        };
+        Ok(Some(stations().zip(now).collect()))
     }
 }

@@ -16,7 +16,7 @@ use ecaxis_ecat::registers;
 use tokio::sync::{Mutex, watch};
 
 use crate::acyclic::{AlState, DeviceRef, Transition, al};
-use crate::bringup::{Bus, BusDevice, enable_op_only};
+use crate::bringup::{Bus, BusDevice, RingDelays, enable_op_only};
 use crate::cancel::CancelToken;
 use crate::clock::{self, Nanos};
 use crate::config::steps::enables;
@@ -116,6 +116,8 @@ pub struct Supervisor {
     pub(crate) returns: Option<ReturnPort>,
     /// What was reported of the ring, with cable redundancy.
     pub(crate) ring: RingWatch,
+    /// The propagation delays in the closed ring, with cable redundancy.
+    pub(crate) ring_delays: Option<Arc<std::sync::Mutex<RingDelays>>>,
 }
 
 /// The result of the machine's program.
@@ -222,15 +224,17 @@ impl Supervisor {
             return self.follow_controller(ended).await;
         }
         if !enables(&self.machine.steps) {
-            let axes = self.machine.axes.indices();
-            let steady = axes.filter(|axis| {
-                let device = self.machine.axes[*axis].device;
-                !self.machine.devices[device].optional
-            });
-            let steady: Vec<_> = steady.collect();
+            let steady = self.steady_axes();
             self.enable_axes(None, &steady).await?;
         }
         self.run_program(ended).await
+    }
+
+    /// Returns the axes of the devices that are always there.
+    fn steady_axes(&self) -> Vec<AxisIndex> {
+        let machine = &self.machine;
+        let steady = |axis: &AxisIndex| !machine.devices[machine.axes[*axis].device].optional;
+        machine.axes.indices().filter(steady).collect()
     }
 
     /// Requests Op from all devices with one datagram, and waits while the cycle's broadcast read of

@@ -87,6 +87,9 @@ impl Supervisor {
         let Some(ring) = self.wire.ring_status() else {
             return;
         };
+        if ring.is_open_for_measurement() {
+            return;
+        }
         let now = clock::now();
         if now >= self.ring.read_at {
             self.ring.read_at = now.saturating_add(LINK_PERIOD);
@@ -107,7 +110,7 @@ impl Supervisor {
             device.map_or_else(|| format!("device {position}"), |d| d.at.name.clone())
         };
         if let Some(count) = short {
-            let behind = match place.checked_sub(1) {
+            let behind = match self.bus.in_front_of(place) {
                 Some(before) => format!("behind `{}`", name(before)),
                 None => "in front of the first device".to_owned(),
             };
@@ -119,7 +122,8 @@ impl Supervisor {
         let Some(Seen { state, no_link }) = changed else {
             return;
         };
-        let mut text = state.text(self.bus.devices.len(), name);
+        let in_front = |position| self.bus.in_front_of(position);
+        let mut text = state.text(self.bus.devices.len(), name, in_front);
         for ((nic, _), _) in ring.links().zip(no_link).filter(|(_, no_link)| *no_link) {
             text += &format!("; `{nic}` has no link");
         }

@@ -41,9 +41,14 @@ impl RingState {
     }
 
     /// Returns a sentence about the ring of a number of devices. `name` returns the device at a
-    /// position.
+    /// position, `in_front` the position of the one in front of it.
     #[must_use]
-    pub fn text(self, all: usize, name: impl Fn(u16) -> String) -> String {
+    pub fn text(
+        self,
+        all: usize,
+        name: impl Fn(u16) -> String,
+        in_front: impl Fn(u16) -> Option<u16>,
+    ) -> String {
         match self {
             Self::Silent => "no frame comes back to either end of the ring".to_owned(),
             Self::OneDirection => {
@@ -55,7 +60,7 @@ impl RingState {
             Self::Broken { behind, devices } => {
                 let all = u16::try_from(all).unwrap_or(u16::MAX).max(devices);
                 let missing = all - devices;
-                let before = match behind.checked_sub(1) {
+                let before = match in_front(behind) {
                     None => "the first interface (`nic`)".to_owned(),
                     Some(before) => format!("`{}`", name(before)),
                 };
@@ -84,6 +89,8 @@ pub struct RingStatus {
     /// Of each interface's copy: [`ARRIVED`], [`RETURNED`] and the number of devices.
     copies: [AtomicU64; 2],
     swapped: AtomicBool,
+    /// A measurement opens the ring.
+    open: AtomicBool,
     /// The network interfaces, first and second.
     carriers: OnceLock<[Carrier; 2]>,
     /// The number of breaks and, in the low 16 bits, the place of the last one.
@@ -111,7 +118,8 @@ impl RingStatus {
             ARRIVED | if returned { RETURNED } else { 0 } | u64::from(devices)
         });
         let before = self.copies[from as usize].swap(word, Relaxed);
-        if from == End::First && before & (ARRIVED | RETURNED) == ARRIVED && word != before {
+        let breaks = before & (ARRIVED | RETURNED) == ARRIVED && word != before;
+        if from == End::First && breaks && !self.is_open_for_measurement() {
             let (count, _) = self.breaks();
             let place = word & 0xffff;
             self.breaks
@@ -187,9 +195,14 @@ impl RingStatus {
         carriers.map(|carrier| (carrier.nic.as_str(), carrier.has_link()))
     }
 
-    /// Counts the breaks from now on.
-    pub(crate) fn forget_breaks(&self) {
-        self.breaks.store(0, Relaxed);
+    /// Counts no breaks until the result is dropped: a measurement opens the ring.
+    pub(crate) fn open_for_measurement(&self) -> OpenRing<'_> {
+        self.open.store(true, Relaxed);
+        OpenRing(self)
+    }
+
+    pub(crate) fn is_open_for_measurement(&self) -> bool {
+        self.open.load(Relaxed)
     }
 
     /// Returns how often the ring was broken, and behind how many devices it was the last time.
@@ -197,5 +210,15 @@ impl RingStatus {
     pub fn breaks(&self) -> (u32, u16) {
         let word = self.breaks.load(Relaxed);
         ((word >> 16) as u32, (word & 0xffff) as u16)
+    }
+}
+
+/// A ring during a measurement.
+#[derive(Debug)]
+pub(crate) struct OpenRing<'a>(&'a RingStatus);
+
+impl Drop for OpenRing<'_> {
+    fn drop(&mut self) {
+        self.0.open.store(false, Relaxed);
     }
 }
