@@ -467,3 +467,41 @@ fn compare_reports_another_machine() {
     assert!(ran.err.contains("no ESI file describes it"), "{}", ran.err);
     assert_eq!(bench.read("machine.toml"), text);
 }
+
+/// Of the three tools at one port, one is there.
+#[test]
+fn absent_optional_devices_are_shown_and_are_no_difference() {
+    let bench = Bench::new();
+    bench.copy("tool-changer.toml", "m.toml");
+    let absent = "`mill` (id 12) is absent; it is optional\n\
+        `tilt` (place 1 behind id 12) is absent; it is optional\n\
+        `gripper` (id 13) is absent; it is optional\n";
+    let equal = bench.well(&["compare", "m.toml"]);
+    assert_eq!(equal, format!("as in the file\n{absent}"));
+    let json = bench.ecaxis(&["compare", "m.toml", "--json"]).json();
+    assert_eq!(json["equal"], true);
+    assert_eq!(
+        json["absent"],
+        serde_json::json!(["mill", "tilt", "gripper"])
+    );
+    let scanned = bench.ecaxis(&["scan", "--sim", "m.toml"]).exits(0);
+    assert!(scanned.err.contains(absent), "{}", scanned.err);
+
+    // The mill is there without its second drive.
+    let text = bench.read("m.toml");
+    let devices = only_devices(&text.replace("[[stop.group]]", "[stop]"));
+    let drill = section(&devices, "drill");
+    let short = devices
+        .replace(section(&devices, "tilt"), "")
+        .replace(drill, "");
+    bench.write("short.toml", &short);
+    let found = bench.ecaxis(&["compare", "m.toml", "--sim", "short.toml"]);
+    assert_eq!(found.code, 1, "{}{}", found.out, found.err);
+    let missing = "`tilt` (place 1 behind id 12) is missing";
+    assert!(found.out.contains(missing), "{}", found.out);
+    assert!(
+        found.out.contains("`drill` (id 11) is absent"),
+        "{}",
+        found.out
+    );
+}

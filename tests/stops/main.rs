@@ -13,4 +13,5 @@ mod optional;
 mod redundancy;
 mod returns;
 mod ring_members;
+mod segments;
 mod unknown;

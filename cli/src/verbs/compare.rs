@@ -99,14 +99,17 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         .iter()
         .map(|difference| difference.display(&machine, &seen.scan).to_string())
         .collect();
+    let absent = absent(&machine, &comparison);
     if args.json {
         print_json(&as_json(&machine, &comparison, &seen.scan, complete))?;
     } else if differences.is_empty() && comparison.unknown.is_empty() {
-        page("as in the file\n")?;
+        page(&format!("as in the file\n{absent}"))?;
     } else if differences.is_empty() {
-        page("as in the file, as far as it could be compared\n")?;
+        page(&format!(
+            "as in the file, as far as it could be compared\n{absent}"
+        ))?;
     } else {
-        page(&(differences.join("\n") + "\n"))?;
+        page(&(differences.join("\n") + "\n" + &absent))?;
     }
     if differences.is_empty() {
         return if complete {
@@ -119,6 +122,21 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return rewrite(args, &machine, &seen, &comparison);
     }
     Err(differs(&args.file, differences.len()))
+}
+
+/// Returns a line for each optional device that is absent.
+pub(crate) fn absent(machine: &Machine, comparison: &Comparison) -> String {
+    let devices = comparison
+        .absent
+        .iter()
+        .map(|index| &machine.devices[*index]);
+    let lines = devices.map(|device| {
+        format!(
+            "`{}` ({}) is absent; it is optional\n",
+            device.name, device.at
+        )
+    });
+    lines.collect()
 }
 
 fn load(file: &Path) -> Result<Machine, Failure> {
@@ -153,6 +171,7 @@ fn look(bus: Bus, machine: &Machine, args: &Args) -> Result<(Scan, Comparison), 
         let options = scan::Options {
             ask: true,
             intrude,
+            identify: scan::needs_identification(&machine),
             heard,
         };
         let mut report = |step: scan::ScanStep| {
@@ -290,6 +309,7 @@ fn as_json(machine: &Machine, comparison: &Comparison, scan: &Scan, complete: bo
     json!({
         "equal": each.is_empty() && complete,
         "differences": each,
+        "absent": comparison.absent.iter().map(|index| name(*index)).collect::<Vec<_>>(),
         "not_compared": comparison.unknown,
     })
 }

@@ -6,6 +6,7 @@ use super::DatagramClient;
 use super::eeprom::{EepromAccess, EepromError, with_eeprom};
 use super::enumerate::{EnumeratedDevice, address, enumerate, select};
 use super::mailbox::{self, MailboxSession};
+use super::topology::{nth_behind, parents};
 use crate::acyclic::{AlState, DeviceRef, al};
 use crate::config::Locator;
 use crate::mailbox::MailboxTransport;
@@ -22,14 +23,30 @@ pub async fn locate(
 ) -> Result<(EnumeratedDevice, DeviceRef), Error> {
     let mut all = enumerate(wire).await?;
     address(wire, &mut all).await?;
-    let at = match at {
+    let (wanted, place) = match at {
+        Locator::Behind(head, place) => (head.locator(), place),
+        at => (at, 0),
+    };
+    let wanted = match wanted {
         Locator::Id(id) => {
             let found = find_explicit_id(wire, &all, id).await;
-            found.map_or(at, |found| Locator::Position(found.position))
+            found.map_or(wanted, |found| Locator::Position(found.position))
         }
-        at => at,
+        wanted => wanted,
     };
-    let found = select(&all, at)?;
+    let mut found = select(&all, wanted)?;
+    if place > 0 {
+        let parents = parents(all.iter().map(|found| found.dl_status));
+        let behind = nth_behind(&parents, found.position, place);
+        let behind = behind.and_then(|position| all.get(usize::from(position)));
+        found = behind.ok_or_else(|| {
+            let head = found.position;
+            Error::from(Cause::NotFound {
+                wanted: at.to_string(),
+                found: format!("the segment at position {head} is shorter"),
+            })
+        })?;
+    }
     let name = name.map_or_else(|| format!("device {}", found.position), ToOwned::to_owned);
     Ok((found.clone(), found.named(name)))
 }

@@ -83,7 +83,7 @@ pub fn select(all: &[EnumeratedDevice], at: Locator) -> Result<&EnumeratedDevice
     let fits = |found: &&EnumeratedDevice| match at {
         Locator::Position(position) => found.position == position,
         Locator::Alias(alias) => found.alias == alias,
-        Locator::Id(_) => false,
+        Locator::Id(_) | Locator::Behind(..) => false,
     };
     let fitting: Vec<&EnumeratedDevice> = all.iter().filter(fits).collect();
     let list = |values: &mut dyn Iterator<Item = u16>| {
@@ -95,7 +95,7 @@ pub fn select(all: &[EnumeratedDevice], at: Locator) -> Result<&EnumeratedDevice
         [] => Err(Error::from(Cause::NotFound {
             wanted: at.to_string(),
             found: match (at, all.len()) {
-                (Locator::Id(_), n) => format!("{n} were asked"),
+                (Locator::Id(_) | Locator::Behind(..), n) => format!("{n} were asked"),
                 (_, 1) => "1 answers, at position 0".to_owned(),
                 (Locator::Alias(_), n) if all.iter().all(|found| found.alias == 0) => {
                     format!("none of the {n} has one")

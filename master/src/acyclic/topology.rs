@@ -69,6 +69,21 @@ pub fn parents(dl_status: impl IntoIterator<Item = u16>) -> Vec<Option<ParentPor
     parents
 }
 
+/// Returns the position of the n-th device behind another one, on the same branch, in segment order.
+#[must_use]
+pub fn nth_behind(parents: &[Option<ParentPort>], head: u16, nth: u16) -> Option<u16> {
+    let position = head.checked_add(nth)?;
+    is_behind(parents, position, head).then_some(position)
+}
+
+/// Returns true if frames pass another device on their way to the one at a position.
+#[must_use]
+pub fn is_behind(parents: &[Option<ParentPort>], position: u16, other: u16) -> bool {
+    let above = |at: u16| Some(parents.get(usize::from(at)).copied()??.device);
+    // A parent is always nearer to the MainDevice.
+    std::iter::successors(above(position), |at| above(*at)).any(|at| at == other)
+}
+
 /// Returns the DL status of the device at a position as if a broken ring were a line: the ports at
 /// the break are open. The port in front of it is taken to be the usual one.
 #[must_use]

@@ -258,7 +258,7 @@ pub(super) async fn assign(
     let mut missing = false;
     for config in &machine.devices {
         let position = match config.at {
-            Locator::Position(_) => None,
+            Locator::Position(_) | Locator::Behind(..) => None,
             Locator::Alias(alias) => found.iter().position(|f| f.alias == alias),
             Locator::Id(id) => {
                 let stations = found.iter().map(|f| {
@@ -275,10 +275,17 @@ pub(super) async fn assign(
         let locator = match config.at {
             Locator::Alias(alias) => format!("alias {alias}"),
             Locator::Id(id) => format!("device identification {id}"),
-            Locator::Position(_) => continue,
+            Locator::Position(_) | Locator::Behind(..) => continue,
         };
         if position.is_none() && !config.optional {
             return Err(not_located(&config.name, locator));
+        }
+    }
+    if let Some(segments) = segments(wire, machine, &order, found.len()).await? {
+        for (order, place) in order.iter_mut().zip(segments) {
+            elsewhere.extend(place);
+            optional.extend(place);
+            *order = order.or(place);
         }
     }
     // Positions do not count optional devices.
@@ -342,6 +349,45 @@ pub(super) async fn assign(
         }
     }
     Ok(order)
+}
+
+/// Returns the positions of the devices behind the heads of segments. `None` if the file has none.
+async fn segments(
+    wire: &DatagramClient,
+    machine: &Machine,
+    order: &[Option<u16>],
+    count: usize,
+) -> Result<Option<Vec<Option<u16>>>, report::Error> {
+    const STEP: &str = "reading the ports of segments";
+    let behind = |config: &DeviceConfig| match config.at {
+        Locator::Behind(head, place) => Some((head.locator(), place)),
+        _ => None,
+    };
+    if machine
+        .devices
+        .iter()
+        .all(|config| behind(config).is_none())
+    {
+        return Ok(None);
+    }
+    let count = u16::try_from(count).unwrap_or(u16::MAX);
+    let status = enumerate::words(wire, count, STEP, DL_STATUS).await?;
+    let status = (0..).zip(status);
+    let parents = topology::parents(
+        status.map(|(position, status)| topology::in_line(position, status, wire.ring())),
+    );
+    let located = || machine.devices.iter().zip(order);
+    let place = |config: &DeviceConfig| {
+        let (head, place) = behind(config)?;
+        let (_, head) = located().find(|(other, _)| other.at == head)?;
+        let (head, position) = ((*head)?, topology::nth_behind(&parents, (*head)?, place)?);
+        // A device with a number of its own ends the segment.
+        let mut between = (head + 1)..=position;
+        between
+            .all(|at| !order.contains(&Some(at)))
+            .then_some(position)
+    };
+    Ok(Some(machine.devices.iter().map(place).collect()))
 }
 
 /// Compares identity and serial number of a device with the machine file.
@@ -418,7 +464,7 @@ fn positions(machine: &Machine) -> impl Iterator<Item = (u16, &DeviceConfig)> {
         .iter()
         .filter_map(|config| match config.at {
             Locator::Position(position) => Some((position, config)),
-            Locator::Alias(_) | Locator::Id(_) => None,
+            Locator::Alias(_) | Locator::Id(_) | Locator::Behind(..) => None,
         })
         .collect();
     devices.sort_by_key(|(position, _)| *position);

@@ -268,7 +268,7 @@ async fn repair_one(wire: &DatagramClient, machine: &Machine, position: u16) -> 
     let here = |config: &&DeviceConfig| match config.at {
         Locator::Position(at) => at == position,
         Locator::Alias(at) => at == found.alias,
-        Locator::Id(_) => false,
+        Locator::Id(_) | Locator::Behind(..) => false,
     };
     let config = machine.devices.iter().find(here);
     match config.and_then(|config| Some((config.mailbox, EsiMailbox::of(config)?))) {

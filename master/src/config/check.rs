@@ -11,7 +11,7 @@ use super::device::{self, CheckedDevice, EsiFiles};
 use super::duration::show;
 use super::fields::KeyExt;
 use super::optional::OptionalPlaces;
-use super::problem::{Problems, Span};
+use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawBus, RawDevice, RawMachine};
 use super::sim;
 use super::steps::{self, Resolved, ResolvedAxis, ResolvedDevice};
@@ -19,8 +19,8 @@ use super::steps::{self, Resolved, ResolvedAxis, ResolvedDevice};
 use crate::file_digest::{FileDigest, UsedFile};
 
 use super::{
-    AxisSetup, Bus, GroupStopScope, Locator, MAX_SUBDEVICES, Machine, Nic, ServerSetup, Signal,
-    Spin, StopSetup, signal,
+    AxisSetup, Bus, GroupStopScope, Locator, MAX_SUBDEVICES, Machine, Nic, SegmentHead,
+    ServerSetup, Signal, Spin, StopSetup, signal,
 };
 
 /// Returns `None` only if a problem has been reported.
@@ -393,7 +393,7 @@ fn unique_names(devices: &[RawDevice], p: &mut Problems<'_>) {
 fn places(devices: &[RawDevice], p: &mut Problems<'_>) -> Vec<Option<Locator>> {
     let mut places: Vec<Option<(Locator, Span)>> = Vec::new();
     for device in devices {
-        let placed = ["position", "alias", "id"];
+        let placed = ["position", "alias", "id", "behind"];
         let placed = placed.iter().any(|key| device.written.has(key));
         let given = [
             (&device.position, Locator::Position as fn(u16) -> Locator),
@@ -401,20 +401,32 @@ fn places(devices: &[RawDevice], p: &mut Problems<'_>) -> Vec<Option<Locator>> {
             (&device.id, Locator::Id),
         ];
         let given = given.into_iter();
-        let mut given = given.filter_map(|(n, at)| Some((at(n.value()?), n.place()?)));
+        let given = given.filter_map(|(n, at)| Some((at(n.value()?), n.place()?)));
+        let behind = device.behind.as_ref();
+        let mut given = given.chain(behind.and_then(|name| {
+            let place = places.iter().flatten();
+            let head = head(devices, name, p)?;
+            let before =
+                place.filter(|(at, _)| matches!(at, Locator::Behind(of, _) if *of == head));
+            let number = u16::try_from(before.count() + 1).unwrap_or(u16::MAX);
+            Some((Locator::Behind(head, number), name.span()))
+        }));
         let place = match (given.next(), given.next()) {
             (Some(place), None) => Some(place),
             (Some(_), Some((_, span))) => {
                 p.add(
                     span,
-                    "a device is found by one of `position`, `alias` and `id`, not by two",
+                    "a device is found by one of `position`, `alias`, `id` and `behind`, not by two",
                 );
                 None
             }
             (None, _) if placed => None,
             (None, _) => {
                 let message = "the position on the bus is missing";
-                let hint = format!("add `position = {}`, or `alias` or `id`", places.len());
+                let hint = format!(
+                    "add `position = {}`, or `alias`, `id` or `behind`",
+                    places.len()
+                );
                 p.add_hint(device.span.clone(), message, hint);
                 None
             }
@@ -432,6 +444,51 @@ fn places(devices: &[RawDevice], p: &mut Problems<'_>) -> Vec<Option<Locator>> {
         .into_iter()
         .map(|place| place.map(|(at, _)| at))
         .collect()
+}
+
+/// Returns the head of a segment with this name.
+fn head(
+    devices: &[RawDevice],
+    name: &Spanned<String>,
+    p: &mut Problems<'_>,
+) -> Option<SegmentHead> {
+    let names = || devices.iter().filter_map(|device| device.name.as_ref());
+    let named =
+        |device: &&RawDevice| device.name.as_ref().map(Spanned::get_ref) == Some(name.get_ref());
+    let Some(device) = devices.iter().find(named) else {
+        let known = names().map(|name| name.get_ref().as_str());
+        let hint = suggestion(name.get_ref(), known, "devices");
+        p.add_hint(
+            name.span(),
+            format!("there is no device \"{}\"", name.get_ref()),
+            hint,
+        );
+        return None;
+    };
+    let alias = device
+        .alias
+        .as_ref()
+        .map(|n| SegmentHead::Alias(*n.get_ref()));
+    let id = device.id.as_ref().map(|n| SegmentHead::Id(*n.get_ref()));
+    let head = alias.or(id);
+    if head.is_none() {
+        let (message, hint) = match &device.behind {
+            Some(first) => (
+                format!("`{}` is not the head of its segment", name.get_ref()),
+                format!("write `behind = \"{}\"`", first.get_ref()),
+            ),
+            None => (
+                format!(
+                    "the head of a segment has an `alias` or `id`, and `{}` has none",
+                    name.get_ref()
+                ),
+                "locate the head by `alias` or `id`, and this device by its place behind it"
+                    .to_owned(),
+            ),
+        };
+        p.add_hint(name.span(), message, hint);
+    }
+    head
 }
 
 /// Checks that positions have no gaps, because every SubDevice must be described.

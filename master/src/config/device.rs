@@ -103,7 +103,7 @@ pub(crate) fn check(
             identity: identity?,
             serial: raw.serial.value(),
             parameters: parameters?,
-            optional: raw.optional.value().unwrap_or(false),
+            optional: raw.optional.value().unwrap_or(false) || raw.behind.is_some(),
             sim,
             gateway,
             line: p.line(&raw.span),

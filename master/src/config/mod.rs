@@ -10,6 +10,7 @@
 //! | `check.rs` | raw → [`Machine`]: bus, names, positions |
 //! | `copy.rs` | inputs that are copied to outputs |
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
+//! | `locator.rs` | how a device is located on the bus |
 //! | `optional.rs` | devices that may be absent |
 //! | `sdo.rs` | values of start-up SDOs as bytes |
 //! | `startup.rs` | which start-up SDOs are verified or skipped |
@@ -43,6 +44,7 @@ pub mod duration;
 #[macro_use]
 mod fields;
 mod gateway;
+mod locator;
 mod optional;
 mod problem;
 mod program;
@@ -67,6 +69,7 @@ pub(crate) use device::unused_axis;
 pub use drive_limits::LimitConflict;
 pub use drive_units::{AdoptedUnits, UnitProblem};
 pub use gateway::{GatewaySetup, NodeSetup};
+pub use locator::{Locator, SegmentHead};
 pub use problem::{ConfigError, Problem};
 pub use program::{
     Action, AxisValue, NamedSignal, Step, StopGroup, StopSetup, Subject, SwitchedInput, TableFile,
@@ -301,27 +304,6 @@ pub enum MailboxSource {
     Esi,
     /// As SOEM, the IgH master and ethercrab do.
     Eeprom,
-}
-
-/// How a device is located on the bus.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Locator {
-    /// The position; the first device after the MainDevice has 0.
-    Position(u16),
-    /// The configured station alias (register 0x0012).
-    Alias(u16),
-    /// The explicit device identification (requested through AL control, or ID switch).
-    Id(u16),
-}
-
-impl fmt::Display for Locator {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Position(n) => write!(f, "position {n}"),
-            Self::Alias(n) => write!(f, "alias {n}"),
-            Self::Id(n) => write!(f, "id {n}"),
-        }
-    }
 }
 
 #[derive(Debug, Clone, PartialEq)]

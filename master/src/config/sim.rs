@@ -87,7 +87,7 @@ pub(crate) fn check(
 }
 
 /// Returns the devices in the order in which frames pass them. Devices located by alias or
-/// identification fill the gaps in file order.
+/// identification fill the gaps in file order, each with its segment.
 #[must_use]
 pub fn bus_order(devices: &[DeviceConfig]) -> Vec<&DeviceConfig> {
     let mut placed: Vec<Option<&DeviceConfig>> = devices.iter().map(|_| None).collect();
@@ -98,8 +98,16 @@ pub fn bus_order(devices: &[DeviceConfig]) -> Vec<&DeviceConfig> {
             *place = Some(device);
         }
     }
-    let is_elsewhere = |d: &&DeviceConfig| !matches!(d.at, Locator::Position(_));
-    let mut others = devices.iter().filter(is_elsewhere);
+    let is_elsewhere = |(_, d): &(usize, &DeviceConfig)| !matches!(d.at, Locator::Position(_));
+    let mut others: Vec<_> = devices.iter().enumerate().filter(is_elsewhere).collect();
+    others.sort_by_key(|(n, device)| match device.at {
+        Locator::Behind(head, place) => {
+            let head = devices.iter().position(|d| d.at == head.locator());
+            (head.unwrap_or(*n), place)
+        }
+        _ => (*n, 0),
+    });
+    let mut others = others.into_iter().map(|(_, device)| device);
     let filled = placed
         .into_iter()
         .map(|place| place.or_else(|| others.next()));

@@ -300,7 +300,7 @@ fn sim_device(
         ..usual
     };
     match device.at {
-        Locator::Position(_) => {}
+        Locator::Position(_) | Locator::Behind(..) => {}
         Locator::Alias(alias) | Locator::Id(alias) => options.alias = alias,
     }
     let mut plants = vec![PlantParams::default()];

@@ -95,8 +95,8 @@ impl Supervisor {
         ended: &mut ProgramOutcome,
     ) -> Result<(), Error> {
         let start = clock::now();
-        let all: Vec<_> = self.machine.axes.indices().collect();
-        self.enable_axes(None, &all).await?;
+        let steady = self.steady_axes();
+        self.enable_axes(None, &steady).await?;
         while !self.over(start) {
             if self.poll_and_query().await?.finished {
                 ended.runs += 1;

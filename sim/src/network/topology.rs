@@ -264,8 +264,12 @@ impl Topology {
                     let (device, port) = (request.after, request.port?);
                     Some(Uplink { device, port })
                 });
-            if shared.is_some() && uplinks.contains(&shared) {
+            if let Some(uplink) = shared.filter(|_| uplinks.contains(&shared)) {
                 uplinks.push(shared);
+                // The devices behind it follow.
+                let entry = open.path.iter().position(|(d, _)| *d == uplink.device);
+                open.path.truncate(entry.map_or(0, |entry| entry + 1));
+                open.path.push((device, 0));
                 continue;
             }
             let granted = match request {

@@ -92,6 +92,8 @@ pub struct Comparison {
     pub differences: Vec<Difference>,
     /// The bus position of each file device.
     pub places: Positions,
+    /// Optional devices that are not there; no difference.
+    pub absent: Vec<DeviceIndex>,
     /// Items that could not be compared.
     pub unknown: Vec<String>,
 }
@@ -106,14 +108,23 @@ pub fn compare(machine: &Machine, scan: &Scan) -> Comparison {
     let mut free: Vec<bool> = vec![true; scan.devices.len()];
     by_serial(machine, scan, &mut comparison.places, &mut free);
     by_alias(machine, scan, &mut comparison.places, &mut free);
+    by_segment(machine, scan, &mut comparison.places, &mut free);
     by_order(machine, scan, &mut comparison.places, &mut free);
     match_moved(machine, scan, &mut comparison, &mut free);
 
-    let missing = comparison.places.enumerate();
-    let missing = missing.filter(|(_, place)| place.is_none());
-    comparison
-        .differences
-        .extend(missing.map(|(device, _)| Difference::Missing { device }));
+    for (device, config) in machine.devices.enumerate() {
+        if comparison.places.get(device) != Some(&None) {
+            continue;
+        }
+        // A segment is absent as a whole.
+        let incomplete =
+            head(machine, config).is_some_and(|head| comparison.places[head].is_some());
+        if config.optional && !incomplete {
+            comparison.absent.push(device);
+        } else {
+            comparison.differences.push(Difference::Missing { device });
+        }
+    }
     for (device, _) in scan.devices.iter().zip(&free).filter(|(_, free)| **free) {
         let position = device.position();
         comparison.differences.push(Difference::Added { position });
@@ -151,11 +162,40 @@ fn by_serial(machine: &Machine, scan: &Scan, places: &mut Positions, free: &mut 
 fn by_alias(machine: &Machine, scan: &Scan, places: &mut Positions, free: &mut [bool]) {
     assign(machine, scan, places, free, |config, device| {
         match config.at {
-            Locator::Position(_) => false,
+            Locator::Position(_) | Locator::Behind(..) => false,
             Locator::Alias(alias) => device.found.alias == alias,
             Locator::Id(id) => device.id == Some(id),
         }
     });
+}
+
+/// Returns the head of the segment of a device.
+fn head(machine: &Machine, config: &DeviceConfig) -> Option<DeviceIndex> {
+    let Locator::Behind(head, _) = config.at else {
+        return None;
+    };
+    let mut all = machine.devices.enumerate();
+    let found = all.find(|(_, other)| other.at == head.locator());
+    found.map(|(index, _)| index)
+}
+
+/// Assigns the devices behind the heads of segments.
+fn by_segment(machine: &Machine, scan: &Scan, places: &mut Positions, free: &mut [bool]) {
+    let parents: Vec<_> = scan.devices.iter().map(|device| device.uplink).collect();
+    for (index, config) in machine.devices.enumerate() {
+        let (Locator::Behind(_, place), None) = (config.at, places[index]) else {
+            continue;
+        };
+        let head = head(machine, config).and_then(|head| places[head]);
+        let at = head.and_then(|head| topology::nth_behind(&parents, head, place));
+        let found = at.and_then(|at| Some((at, free.get_mut(usize::from(at)).filter(|f| **f)?)));
+        if let Some((at, free)) = found
+            && is_product(config, &scan.devices[usize::from(at)])
+        {
+            *free = false;
+            places[index] = Some(at);
+        }
+    }
 }
 
 /// Assigns each remaining file device the first free bus device that has its product and satisfies
@@ -218,7 +258,10 @@ fn by_order(machine: &Machine, scan: &Scan, places: &mut Positions, free: &mut [
 /// Assigns the remaining devices of a product to other positions or aliases.
 fn match_moved(machine: &Machine, scan: &Scan, comparison: &mut Comparison, free: &mut [bool]) {
     let before = comparison.places.clone();
-    assign(machine, scan, &mut comparison.places, free, |_, _| true);
+    // An optional device is known by its own number only.
+    assign(machine, scan, &mut comparison.places, free, |config, _| {
+        !config.optional
+    });
     for (index, config) in machine.devices.enumerate() {
         let now = comparison.places.get(index).copied().flatten();
         let (Some(None), Some(position)) = (before.get(index), now) else {

@@ -23,6 +23,7 @@ use ecaxis_master::acyclic::device::{read_image, with_mailbox};
 use ecaxis_master::acyclic::eeprom::EepromAccess;
 use ecaxis_master::acyclic::enumerate::{self, EnumeratedDevice};
 use ecaxis_master::acyclic::topology::{ParentPort, parents};
+use ecaxis_master::config::{Locator, Machine};
 use ecaxis_master::mailbox::MailboxTransport;
 use ecaxis_master::report::{Cause, Error};
 
@@ -49,8 +50,17 @@ pub struct Options {
     pub ask: bool,
     /// Use the mailboxes even if another MainDevice drives the segment.
     pub intrude: bool,
+    /// Request the identification of each device, even if its EEPROM does not say that it has one.
+    pub identify: bool,
     /// Foreign frames that the interface received before the first transmission.
     pub heard: u64,
+}
+
+/// Returns true if a machine locates devices by their identification.
+#[must_use]
+pub fn needs_identification(machine: &Machine) -> bool {
+    let mut devices = machine.devices.iter();
+    devices.any(|device| matches!(device.at, Locator::Id(_)))
 }
 
 /// The progress of the scan for display.
@@ -209,7 +219,7 @@ pub async fn scan(
     };
     if quiet || options.intrude {
         for device in &mut scan.devices {
-            device.id = explicit_id(wire, device).await?;
+            device.id = explicit_id(wire, device, options.identify).await?;
         }
     }
     if options.ask && (quiet || options.intrude) {
@@ -303,10 +313,18 @@ async fn measure_delays(
     Ok(())
 }
 
-/// Reads the explicit device identification if the EEPROM declares it. It is requested by AL
+/// Reads the explicit device identification if the EEPROM declares it, or `always`. It is requested by AL
 /// control in the present state.
-async fn explicit_id(wire: &DatagramClient, device: &Device) -> Result<Option<u16>, Error> {
+async fn explicit_id(
+    wire: &DatagramClient,
+    device: &Device,
+    always: bool,
+) -> Result<Option<u16>, Error> {
     const STEP: &str = "reading its device identification";
+    let read = async |timeout| {
+        let id = al::read_explicit_id(wire, device.found.station, timeout).await;
+        id.map_err(|error| Error::from(Cause::Datagram(error)).with_action(STEP))
+    };
     let Ok(Sii {
         general: Some(general),
         ..
@@ -315,14 +333,16 @@ async fn explicit_id(wire: &DatagramClient, device: &Device) -> Result<Option<u1
         return Ok(None);
     };
     if general.flags & General::IDENTIFICATION_AL_STATUS != 0 && !device.found.error {
-        let id = al::read_explicit_id(wire, device.found.station, al::IDENTIFICATION_TIMEOUT).await;
-        return id.map_err(|error| Error::from(Cause::Datagram(error)).with_action(STEP));
+        return read(al::IDENTIFICATION_TIMEOUT).await;
     }
     if general.flags & General::IDENTIFICATION_ADDRESS != 0 {
         let mut bytes = [0; 2];
         let register = general.identification_address;
         let answer = wire.read(device.found.station, register, &mut bytes).await;
         return Ok(matches!(answer, Ok(1..)).then(|| u16::from_le_bytes(bytes)));
+    }
+    if always && !device.found.error {
+        return read(al::SHORT_IDENTIFICATION_TIMEOUT).await;
     }
     Ok(None)
 }

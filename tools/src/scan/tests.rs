@@ -113,7 +113,7 @@ fn scan_detects_a_main_device_by_its_clock_writes() {
         let options = Options {
             ask: true,
             intrude,
-            heard: 0,
+            ..Options::default()
         };
         let (scan, link) = on("demo.toml", async move |wire| {
             let mut found = enumerate(&wire).await.expect("two");

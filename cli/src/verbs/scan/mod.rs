@@ -4,11 +4,13 @@ use std::path::{Path, PathBuf};
 
 use ecaxis_master::config::{self, Nic};
 use ecaxis_master::esi_library::{self, Library};
+use ecaxis_tools::compare;
 use ecaxis_tools::scan::{self, EsiMatch, MainDeviceEvidence, Scan, esi_match};
 
 use crate::access::bus::{self, Bus};
 use crate::hints::{self, Failure};
 use crate::render::{note, print_json, print_page, shown};
+use crate::verbs;
 
 mod report;
 mod text;
@@ -66,11 +68,14 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         write::refuse(path, args.force)?;
     }
     let library = library(args)?;
+    let mut simulated = None;
     let bus = match (&args.sim, &args.nic) {
         (Some(file), _) => {
             let mut machine = config::load(file).map_err(|e| hints::config(file, &e))?;
             machine.bus.nic = Nic::Sim;
-            Bus::of(&machine)
+            let bus = Bus::of(&machine);
+            simulated = Some(machine);
+            bus
         }
         (None, Some(nic)) => Bus::interface(nic),
         (None, None) => {
@@ -80,9 +85,22 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         }
     };
     let nic = bus.nic();
-    let scan = look(bus, args.ask || args.write.is_some(), args.intrude)?;
+    let identify = simulated.as_ref().is_some_and(scan::needs_identification);
+    let options = scan::Options {
+        ask: args.ask || args.write.is_some(),
+        intrude: args.intrude,
+        identify,
+        heard: 0,
+    };
+    let scan = look(bus, options)?;
     let seen = ScanResult::new(&nic, scan, library.as_ref());
     seen.warn(args.intrude);
+    if let Some(machine) = &simulated {
+        let comparison = compare::compare(machine, &seen.scan);
+        for line in verbs::compare::absent(machine, &comparison).lines() {
+            note(line);
+        }
+    }
     if library.is_none() && args.write.is_none() {
         note(
             "note: no folder `esi` here: put the vendors' ESI files there, or name it with `--esi`",
@@ -101,14 +119,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 }
 
 /// Scans a bus and shows the progress.
-pub(crate) fn look(bus: Bus, ask: bool, intrude: bool) -> Result<Scan, Failure> {
+pub(crate) fn look(bus: Bus, options: scan::Options) -> Result<Scan, Failure> {
     let nic = bus.nic();
     let done = bus.visit(async move |wire, heard| {
-        let options = scan::Options {
-            ask,
-            intrude,
-            heard,
-        };
+        let options = scan::Options { heard, ..options };
         let mut report = |step: scan::ScanStep| {
             let (what, position, of) = (step.what, step.position, step.of);
             bus::passing(&format!("{what} position {position}, {of} in all"));

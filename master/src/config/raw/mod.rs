@@ -182,12 +182,15 @@ table! { "[[device]]",
         sii: Key<String>,
         /// Source of the mailboxes if both differ (`"esi"`, `"eeprom"`; default `"esi"`)
         mailbox: Key<MailboxSource> [MAILBOXES],
-        /// Position on the bus, from 0 (0 to 65535; default one of these three)
+        /// Position on the bus, from 0 (0 to 65535; default one of these four)
         position: Key<u16>,
         /// Configured station alias (0x0012) (1 to 65535)
         alias: Key<u16> [1..=u16::MAX],
         /// Explicit device identification (1 to 65535)
         id: Key<u16> [1..=u16::MAX],
+        /// Name of the optional device that is the head of its segment: it is the next device behind the
+        /// head and the devices before it with this key (text)
+        behind: Key<String>,
         /// The device may be absent, and appear during the run at any port; needs `alias` or `id`
         /// (`true`, `false`; default `false`)
         optional: Key<bool>,

@@ -169,7 +169,7 @@ impl RunningSegment {
             return Err(Cause::Serial { expected, found }.with_device(at));
         }
         let located = match config.at {
-            Locator::Position(_) => true,
+            Locator::Position(_) | Locator::Behind(..) => true,
             Locator::Id(_) if kept => true,
             Locator::Alias(wanted) => alias == wanted,
             Locator::Id(id) => {

@@ -90,17 +90,21 @@ impl RunningSegment {
                 Some((Some(device), port)) => Some((device, port)),
                 Some((None, _)) => continue,
             };
+            let locator = |index: DeviceIndex| self.machine.devices[index].at;
             let here = |index: &DeviceIndex| {
-                searches[*index].place.is_some_and(|before| match place {
-                    None => before.parent.is_none() && before.position == position,
-                    place => before.parent == place,
-                })
+                let in_segment = matches!(locator(*index), Locator::Behind(..));
+                !in_segment
+                    && searches[*index].place.is_some_and(|before| match place {
+                        None => before.parent.is_none() && before.position == position,
+                        place => before.parent == place,
+                    })
             };
             // The device that was here comes first. Others are found by alias or identification.
-            let expected = wanted.iter().copied().find(here);
+            let in_segment = self.find_in_segment(&answering, index, wanted);
+            let expected = in_segment.or_else(|| wanted.iter().copied().find(here));
             let moved = wanted.iter().copied().filter(|index| {
-                let by_position = matches!(self.machine.devices[*index].at, Locator::Position(_));
-                !by_position && Some(*index) != expected
+                let has_number = matches!(locator(*index), Locator::Alias(_) | Locator::Id(_));
+                has_number && Some(*index) != expected
             });
             let candidates: Vec<_> = expected.into_iter().chain(moved).collect();
             if expected.is_none() && !unknown.is_due(place) {
@@ -141,6 +145,29 @@ impl RunningSegment {
         }
         unknown.end_survey();
         Ok(found)
+    }
+}
+
+impl RunningSegment {
+    /// Returns the missing device that the file locates at this place behind the head of a segment.
+    fn find_in_segment(
+        &self,
+        answering: &[Answering],
+        index: usize,
+        wanted: &[DeviceIndex],
+    ) -> Option<DeviceIndex> {
+        let devices = &self.machine.devices;
+        let parent = |at: usize| Some(usize::from(answering.get(at)?.parent?.device));
+        let above = std::iter::successors(parent(index), |at| parent(*at));
+        let mut heads = above.filter_map(|at| Some((devices[answering.get(at)?.device?].at, at)));
+        heads.find_map(|(head, at)| {
+            let place = index - at;
+            let mut wanted = wanted.iter().copied();
+            wanted.find(|device| match devices[*device].at {
+                Locator::Behind(of, n) => of.locator() == head && usize::from(n) == place,
+                _ => false,
+            })
+        })
     }
 }
 
