@@ -7,25 +7,7 @@ use ecaxis_axis::CommandError;
 use ecaxis_axis::setpoint::{Knot, SetpointError, StreamConfig};
 use ecaxis_master::sys::shared_memory::SharedMemory;
 
-/// The words of the commands, see docs/server.md.
-pub mod words {
-    pub const MAGIC: [u8; 8] = *b"ECAXCMDS";
-    pub const VERSION: u64 = 1;
-    pub const VERSION_AT: usize = 1;
-    pub const AXES_AT: usize = 2;
-    pub const AXIS_WORDS: usize = 3;
-    pub const AXES: usize = 4;
-    pub const SEQUENCE: usize = 5;
-    pub const COUNTER: usize = 6;
-    pub const LAST_USED: usize = 8;
-    pub const USED: usize = 9;
-    pub const LATE: usize = 10;
-    pub const REFUSED: usize = 11;
-    pub const BLOCKED: usize = 12;
-    pub const HEADER: usize = 16;
-    /// The words of one axis.
-    pub const OF_AXIS: usize = 4;
-}
+pub use ecaxis_client::layout::commands as words;
 
 /// A point of a stream.
 #[derive(Debug, Clone, Copy, PartialEq)]

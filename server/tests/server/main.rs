@@ -13,6 +13,7 @@ mod hostile;
 mod http;
 mod lease;
 mod ros2;
+mod rust_client;
 mod samples;
 mod streams;
 mod websocket;
