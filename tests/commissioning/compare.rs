@@ -494,7 +494,8 @@ fn absent_optional_devices_are_shown_and_are_no_difference() {
     let short = devices
         .replace(section(&devices, "tilt"), "")
         .replace(drill, "");
-    bench.write("short.toml", &short);
+    let group = "\n[[stop.group]]\nname = \"tools\"\naxes = [\"mill\", \"gripper\"]\noutside = \"continue\"\n";
+    bench.write("short.toml", &(short + group));
     let found = bench.ecaxis(&["compare", "m.toml", "--sim", "short.toml"]);
     assert_eq!(found.code, 1, "{}{}", found.out, found.err);
     let missing = "`tilt` (place 1 behind id 12) is missing";

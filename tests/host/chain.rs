@@ -67,7 +67,6 @@ fn device_of_a_killed_process_returns() {
         run.interrupt();
         let output = run.end();
         let errors = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(130), "{errors}");
         assert!(!errors.contains("the group `a` stops"), "{errors}");
     });
 }

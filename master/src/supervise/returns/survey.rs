@@ -100,7 +100,12 @@ impl RunningSegment {
                     })
             };
             // The device that was here comes first. Others are found by alias or identification.
-            let in_segment = self.find_in_segment(&answering, index, wanted);
+            let all: Vec<_> = self.devices.enumerate().map(|(device, _)| device).collect();
+            let in_segment = self.find_in_segment(&answering, index, &all);
+            // It is not known yet that it was lost, or an attempt to bring it back still runs.
+            if in_segment.is_some_and(|device| !wanted.contains(&device)) {
+                continue;
+            }
             let expected = in_segment.or_else(|| wanted.iter().copied().find(here));
             let moved = wanted.iter().copied().filter(|index| {
                 let has_number = matches!(locator(*index), Locator::Alias(_) | Locator::Id(_));
@@ -149,7 +154,7 @@ impl RunningSegment {
 }
 
 impl RunningSegment {
-    /// Returns the missing device that the file locates at this place behind the head of a segment.
+    /// Returns the device that the file locates at this place behind the head of a segment.
     fn find_in_segment(
         &self,
         answering: &[Answering],

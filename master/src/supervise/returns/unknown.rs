@@ -141,13 +141,13 @@ impl UnknownDevices {
         segment: &RunningSegment,
         lost: &[DeviceIndex],
     ) -> Result<(), Error> {
-        // A device that had no power has forgotten its loop control.
+        // A device that had no power has forgotten its loop control; one that was unplugged has not.
         let is_lost = |entry: &Entry| {
             entry
                 .place
                 .is_some_and(|(device, _)| lost.contains(&device))
         };
-        self.entries.retain(|entry| !is_lost(entry));
+        self.entries.retain(|entry| entry.closed || !is_lost(entry));
         for entry in &mut self.entries {
             let Some((device, port)) = entry.place.filter(|_| entry.closed) else {
                 continue;
