@@ -237,7 +237,9 @@ fn steps_without_duration_let_the_cycle_run() {
     let (outcome, heard) = run(machine(&text), options);
     outcome.result.expect("the time limit ends it");
     assert!(steps(&heard).len() > 3);
-    let nothing = format!("repeat = 1000000\n{HEAD}[[step]]\nrepeat = 1000000\nstep = []\n");
+    let nothing = format!(
+        "repeat = 1000000\n{HEAD}[variables]\nn = 0\n[[step]]\nrepeat = 1000000\nstep = [{{ add = {{ n = 1 }} }}]\n"
+    );
     let mut options = virtual_time();
     options.limit = Some(50_000_000);
     let (outcome, _) = run(machine(&nothing), options);
