@@ -446,17 +446,19 @@ fn reports_overwrite_only_with_force() {
 fn packages_depend_in_one_direction() {
     let below_master = ["ecaxis-ecat", "ecaxis-esi", "ecaxis-axis", "ecaxis-sim"];
     let below_tools = [&below_master[..], &["ecaxis-master"]].concat();
+    let below_server = [&below_tools[..], &["ecaxis-client"]].concat();
     let below_support = [&below_tools[..], &["ecaxis-tools"]].concat();
     let below_cli = [&below_support[..], &["ecaxis-server"]].concat();
-    let allowed: [(&str, &[&str]); 9] = [
+    let allowed: [(&str, &[&str]); 10] = [
         ("ecat", &[]),
         ("esi", &["ecaxis-ecat"]),
         ("axis", &[]),
         ("sim", &["ecaxis-esi"]),
         ("master", &below_master),
-        ("server", &below_tools),
+        ("server", &below_server),
         ("tools", &below_tools),
         ("cli", &below_cli),
+        ("clients/rust", &[]),
         ("tests/support", &below_support),
     ];
     let root = root();
