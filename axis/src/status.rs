@@ -351,6 +351,11 @@ pub enum CommandError {
         /// The limit.
         limit: f64,
     },
+    /// The drive moves with its own speed and ramp.
+    #[error(
+        "the drive moves with its own speed and ramp: their objects are not in the process data"
+    )]
+    ProfileFixed,
     /// The torque exceeds the limit.
     #[error("torque {percent} % exceeds the limit of {limit} %")]
     TooMuchTorque {

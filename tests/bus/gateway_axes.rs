@@ -10,17 +10,17 @@ use ecaxis_test_support::{
     assert_contains, faults, load, machine, recorded, root, run_badly, run_well, virtual_time,
 };
 
-const GATEWAY: DeviceIndex = DeviceIndex(2);
+pub(super) const GATEWAY: DeviceIndex = DeviceIndex(2);
 /// The places of the three nodes in the gateway's process data: Controlword and 0x2062, or
 /// Statusword and 0x6064. The Controlword of PDO 3 follows.
 const NODES: [usize; 3] = [2, 11, 20];
 
-fn mixed() -> String {
+pub(super) fn mixed() -> String {
     std::fs::read_to_string(root().join("configs/mixed.toml")).expect("our file")
 }
 
 /// Returns the mixed machine with another program.
-fn with_program(program: &str) -> Machine {
+pub(super) fn with_program(program: &str) -> Machine {
     let text = mixed();
     let end = text.find("[[step]]").expect("a program");
     machine(&format!("{}{program}", &text[..end]))
@@ -78,6 +78,80 @@ fn axes_of_both_networks_run_one_program() {
         assert_eq!(axis.final_state, State::SwitchOnDisabled.to_string());
         assert_eq!((&axis.fault, &axis.trip), (&None, &None));
     }
+}
+
+/// The mixed machine whose first node has the set-points of both position modes.
+fn with_profiles(program: &str) -> String {
+    let text = mixed();
+    let end = text.find("[[step]]").expect("a program");
+    // 0x607A arrives with the Controlword whose bit 4 validates it; 0x2062 has a PDO of its own.
+    let outputs =
+        "objects = [\"0x6040\", \"0x607A\"] }, { pdo = 2, at = 29, objects = [\"0x2062\"] }, ";
+    let text = text[..end].replacen("objects = [\"0x6040\", \"0x2062\"] }, ", outputs, 1);
+    format!("{text}{program}")
+}
+
+#[test]
+fn a_profile_move_passes_the_handshake_over_the_dead_time() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (options, path) = recorded(virtual_time(), folder.path());
+    let machine = machine(&with_profiles(
+        "[[step]]\nmove = { feed = 5.0 }\n[[step]]\nmode = { feed = \"pp\" }\n\
+         [[step]]\nmove = { feed = 25.0, lift = 10.0 }\n[[step]]\nmove_by = { feed = -12.0 }\n\
+         [[step]]\nmode = { feed = \"csp\" }\n[[step]]\nmove = { feed = 3.0 }\nspeed = 0.5\n",
+    ));
+    let summary = run_well(machine.clone(), options);
+    let feed = summary.axes.iter().find(|axis| axis.name == "feed");
+    assert!((feed.expect("an axis").final_position - 3.0).abs() < 0.05);
+    let cycles = cycles(&machine, &path);
+    let raised = |cycle: &Cycle| cycle.controlwords(0)[0] & 0x10 != 0;
+    let edges = cycles.windows(2).enumerate();
+    let edges: Vec<_> = edges
+        .filter(|(_, pair)| !raised(&pair[0]) && raised(&pair[1]))
+        .map(|(n, pair)| (n, pair[1].target(0)))
+        .collect();
+    assert_eq!(
+        edges.iter().map(|edge| edge.1).collect::<Vec<_>>(),
+        [10_000, 5_200]
+    );
+    // Each edge waits for the answer to the one before: at least one SYNC each.
+    for (n, _) in edges {
+        let length = cycles[n + 1..]
+            .iter()
+            .take_while(|cycle| raised(cycle))
+            .count();
+        println!("bit 4 for {length} ms");
+        assert!((4..=40).contains(&length), "{length} ms");
+    }
+    // The drive's own profile holds the limits of the axis: 50 mm/s are 20 counts a ms.
+    let (first, last) = (
+        cycles.iter().position(raised),
+        cycles.iter().rposition(raised),
+    );
+    let own = &cycles[first.expect("an edge")..=last.expect("an edge")];
+    let fastest = own
+        .windows(5)
+        .map(|w| (w[4].actual(0) - w[0].actual(0)).abs())
+        .max();
+    let fastest = fastest.unwrap_or(0);
+    assert!((60..=160).contains(&fastest), "{fastest} counts in 4 ms");
+}
+
+#[test]
+fn a_stop_halts_a_profile_of_the_drive() {
+    let machine = machine(&with_profiles(
+        "[[step]]\nmode = { feed = \"pp\" }\n[[step]]\nmove = { feed = 50.0 }\n",
+    ));
+    let options = Options {
+        limit: Some(1_000_000_000),
+        ..virtual_time()
+    };
+    let summary = run_well(machine, options);
+    let feed = summary.axes.iter().find(|axis| axis.name == "feed");
+    let feed = feed.expect("an axis");
+    println!("stopped at {}", feed.final_position);
+    assert!((1.0..49.0).contains(&feed.final_position), "{feed:?}");
+    assert_eq!(feed.final_state, State::SwitchOnDisabled.to_string());
 }
 
 /// The drives have no interpolation: every step that they receive is within the limits at the

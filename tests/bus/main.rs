@@ -17,6 +17,7 @@ mod eeproms;
 mod flow;
 mod fsoe;
 mod gateway_axes;
+mod gateway_stops;
 mod homing;
 mod long_segment;
 mod lrw;

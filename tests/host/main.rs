@@ -6,6 +6,7 @@
 mod bench;
 mod chain;
 mod first_steps;
+mod gateway;
 mod interruptions;
 mod link;
 mod redundancy;

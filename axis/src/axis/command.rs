@@ -303,6 +303,9 @@ impl Axis {
         }
         self.check_ready()?;
         if self.mode == Mode::Pp {
+            if self.config.profile_fixed && (speed, ramp) != (1.0, 1.0) {
+                return Err(CommandError::ProfileFixed);
+            }
             // The drive plans this move itself, with 32-bit positions.
             let Counts(counts) = scale.position_to_counts(UserUnits(position));
             if i32::try_from(counts).is_err() {

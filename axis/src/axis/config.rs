@@ -54,6 +54,9 @@ pub struct AxisConfig {
     pub follows_bit: bool,
     /// True if the drive keeps home without power: an absolute encoder.
     pub absolute: bool,
+    /// True if no profile values (0x6081, 0x6083, 0x6084) are in the process data: a move in PP
+    /// runs with those that the drive has, and takes no other speed or ramp.
+    pub profile_fixed: bool,
 }
 
 impl AxisConfig {
@@ -84,6 +87,7 @@ impl AxisConfig {
             stop_timeout_s: None,
             follows_bit: true,
             absolute: false,
+            profile_fixed: false,
         }
     }
 

@@ -1,6 +1,7 @@
 //! Arguments that several subcommands share, and the files they name.
 
 pub(crate) mod bus;
+pub(crate) mod can_log;
 pub(crate) mod files;
 pub(crate) mod numbers;
 pub(crate) mod record;

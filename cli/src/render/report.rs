@@ -5,11 +5,11 @@ use std::time::Duration;
 use ecaxis_master::config::duration;
 use ecaxis_master::rt::stats::Percentiles;
 use ecaxis_master::session::{
-    AxisSummary, DeviceErrors, EmergencyLine, EventLine, Summary, ThreadSummary,
+    AxisSummary, DeviceErrors, EmergencyLine, EventLine, GatewaySummary, Summary, ThreadSummary,
 };
 use ecaxis_master::text::{pluralize, positive_zero};
 use ecaxis_tools::cells;
-use ecaxis_tools::document::format::{hex_bytes, hex16};
+use ecaxis_tools::document::format::{self, hex_bytes, hex16};
 use ecaxis_tools::document::{Document, Table};
 
 /// The number of events shown.
@@ -48,6 +48,7 @@ pub(crate) fn summary(summary: &Summary) -> Document {
     }
     out.gap();
     out.table(errors(&summary.errors));
+    gateways(&summary.gateways, &mut out);
     emergencies(&summary.emergencies, summary.more_emergencies, &mut out);
     if summary.events.iter().any(|event| event.failure) {
         out.gap();
@@ -210,6 +211,25 @@ fn errors(devices: &[DeviceErrors]) -> Table {
         }
     }
     table
+}
+
+fn gateways(gateways: &[GatewaySummary], out: &mut Document) {
+    let mut table = Table::new("gateway|node|drive|state|lost");
+    for gateway in gateways {
+        for node in &gateway.nodes {
+            let lost = match node.losses {
+                0 => String::new(),
+                count => format::times(count),
+            };
+            table.row(cells![gateway.name, node.id, node.drive, node.state, lost]);
+        }
+    }
+    out.gap();
+    out.table(table);
+    for gateway in gateways.iter().filter(|gateway| !gateway.errors.is_empty()) {
+        let errors = gateway.errors.join(", ");
+        out.line(format!("`{}` has reported: {errors}", gateway.name));
+    }
 }
 
 fn emergencies(emergencies: &[EmergencyLine], more: u64, out: &mut Document) {
@@ -384,6 +404,16 @@ mod tests {
                 data: [1, 2, 3, 4, 0xff],
             }],
             more_emergencies: 2,
+            gateways: vec![GatewaySummary {
+                name: "can".into(),
+                errors: vec!["CAN error passive"],
+                nodes: vec![ecaxis_master::session::NodeSummary {
+                    id: 5,
+                    drive: "EPOS 24/5",
+                    state: "PRE-OPERATIONAL".into(),
+                    losses: 1,
+                }],
+            }],
             events: vec![
                 EventLine {
                     at_s: 1.25,
@@ -434,6 +464,10 @@ m.toml: 1 SubDevice, 12.500 s in virtual time, 2 complete runs of the program
 
   SubDevice  port  invalid frames  receive errors  found bad before  lost links
   x          1     3               4               0                 1
+
+  gateway  node  drive      state            lost
+  can      5     EPOS 24/5  PRE-OPERATIONAL  once
+  `can` has reported: CAN error passive
 
   time      device  emergency  register  data            what
   -0.250 s  x       0x8611     0x20      01 02 03 04 ff  following error

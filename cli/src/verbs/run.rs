@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 use crate::access::{rights, signals};
 use crate::args::LogArgs;
 use crate::args::bus::BusArgs;
+use crate::args::can_log::CanLog;
 use crate::args::files::{Inputs, check_output};
 use crate::args::record;
 use crate::args::report::ReportArgs;
@@ -69,6 +70,9 @@ pub(crate) struct Args {
     /// Record all frames to this pcapng file
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
+    /// Write the frames of the simulated CAN networks to this file at the end, as candump does
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["nic", "replay"])]
+    can_log: Option<PathBuf>,
     /// Limit the recording to this size, such as 100MB; keep the beginning and the newest frames,
     /// in parts
     #[arg(long, value_name = "SIZE", requires = "record", value_parser = record::size)]
@@ -110,6 +114,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             "note: the file says `enable = false`: the axes get no power; `--enable` gives it to them",
         );
     }
+    let inputs = Inputs::from_machine(&machine).with("the fault script", &args.bus.faults);
+    let can_log = args.can_log.as_deref();
+    let mut can_log = can_log
+        .map(|path| CanLog::create(&mut machine, path, args.force, &inputs))
+        .transpose()
+        .inspect_err(|f| print_failure(args, &f.message, &f.hints, json!([])))?;
     let needed = rights::of_machine(&machine);
     let outputs = args.report.files(&machine.bus.nic);
     let mut needed = rights::with_outputs(needed, args.record.iter().chain(&outputs));
@@ -126,6 +136,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         ..
     } = session::run(machine, options, stop, &mut teller);
     drop(teller);
+    if let Some(error) = can_log.as_mut().and_then(|log| log.write().err()) {
+        note(&format!("warning: writing the CAN log: {error}"));
+    }
 
     let mut failure = ended.err().map(|error| {
         let mut failure = hints::failure(&error, &nic);

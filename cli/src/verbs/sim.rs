@@ -20,6 +20,7 @@ use ecaxis_master::text::pluralize;
 
 use crate::access::signals;
 use crate::args::bus;
+use crate::args::can_log::CanLog;
 use crate::args::files::{Inputs, check_output, unwritable, write_new};
 use crate::args::trace::Trace;
 use crate::hints::{self, Failure};
@@ -63,11 +64,14 @@ pub(crate) struct Args {
     /// second; times are CLOCK_MONOTONIC
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,
+    /// Write the frames of the simulated CAN networks to this file, as candump does
+    #[arg(long, value_name = "FILE")]
+    can_log: Option<PathBuf>,
     /// Write every device's EEPROM image to this folder first: 0.bin, 1.bin …; never overwrites
     /// other files
     #[arg(long, value_name = "FOLDER")]
     sii: Option<PathBuf>,
-    /// Overwrite an existing trace
+    /// Overwrite an existing trace or log
     #[arg(long)]
     force: bool,
     /// Print the statistics as JSON
@@ -88,8 +92,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::new(hints::WRONG, message)
             .hint("`ecaxis run FILE --sim` needs no interface; `ip link add veth0 type veth peer name veth1` makes two that are connected"));
     }
-    let machine = config::load(&args.file).map_err(|e| hints::config(&args.file, &e))?;
+    let mut machine = config::load(&args.file).map_err(|e| hints::config(&args.file, &e))?;
     let devices = machine.devices.len();
+    let inputs = Inputs::from_machine(&machine).with("the fault script", &args.faults);
+    let can_log = args.can_log.as_deref();
+    let mut can_log = can_log
+        .map(|path| CanLog::create(&mut machine, path, args.force, &inputs))
+        .transpose()?;
     let ring = args.nic2.as_ref().map(|_| SecondPort::Listens);
     let faults = args.faults.as_deref();
     let faults = faults.map(|f| bus::faults(f, &machine, ring)).transpose()?;
@@ -141,7 +150,6 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         write_images(&segment, folder)?;
     }
     let trace = args.trace.as_deref();
-    let inputs = Inputs::from_machine(&machine).with("the fault script", &args.faults);
     let mut trace = trace
         .map(|path| create_trace(path, args.force, &inputs))
         .transpose()?;
@@ -168,6 +176,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
                     && signalled.swap(false, Ordering::Relaxed)
                 {
                     segment.start_faults(script.clone(), now);
+                }
+                if let Some(log) = &mut can_log
+                    && let Err(e) = log.write()
+                {
+                    note(&format!("warning: writing the CAN log: {e}; it ends here"));
+                    can_log = None;
                 }
                 if let Some(to) = &mut trace
                     && let Err(e) = to.sample(segment, now)

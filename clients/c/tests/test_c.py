@@ -142,7 +142,7 @@ def test_a_server_that_ends_is_reported(programs):
         command = [str(programs["square"]), machine._path, "100"]
         child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment())
         assert child.stdout.readline() == "homed\n"
-        machine._process.kill()
+        machine._server.process.kill()
         _, errors = child.communicate(timeout=30)
         assert child.returncode == 1 and "(lost)\nhelp: attach again" in errors, errors
 

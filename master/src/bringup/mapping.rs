@@ -149,10 +149,15 @@ fn difference(expected: &[Contents], actual: &[Contents]) -> Option<Difference> 
     for n in 0..wanted.len().max(found.len()) {
         let (wanted, found) = (wanted.get(n), found.get(n));
         if wanted.map(on_wire) != found.map(on_wire) {
+            // If one side ends first, the sizes say more.
+            let size = |bits: u32| match wanted.is_none() || found.is_none() {
+                true => format!(", {} bytes in all", bits.div_ceil(8)),
+                false => String::new(),
+            };
             return Some(Difference {
                 place: found.or(wanted)?.place,
-                expected: MappedObject::show(wanted),
-                actual: MappedObject::show(found),
+                expected: MappedObject::show(wanted) + &size(wanted_bits),
+                actual: MappedObject::show(found) + &size(found_bits),
             });
         }
     }
@@ -227,7 +232,11 @@ mod tests {
         );
         assert_eq!(
             differs(&[pdo(0x1a00, &[STATUS])]),
-            ((0x1a00, 3), position, "nothing".to_owned())
+            (
+                (0x1a00, 3),
+                position + ", 8 bytes in all",
+                "nothing, 2 bytes in all".to_owned()
+            )
         );
         assert_eq!(
             differs(&[pdo(0x1a00, &[STATUS, 0x0000_0010, POSITION, 0x0000_0008])]),

@@ -41,6 +41,8 @@ pub(crate) fn check(
     let image = files.image(&raw, p);
     let file = files.file(&raw, image.as_deref(), p);
     let device = file.as_ref().and_then(|(_, file)| find(&raw, file, p));
+    let sized = device.and_then(|device| gateway::with_sizes(&raw, device));
+    let device = sized.as_ref().or(device);
     let mut chosen = match (&file, device, mode, &files.cycle) {
         (Some((_, file)), Some(device), Ok(mode), Some((cycle_ns, cycle))) => {
             let wanted = DeviceQuery {

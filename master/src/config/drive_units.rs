@@ -242,7 +242,7 @@ impl AdoptedUnits {
 
 impl HomingSetup {
     /// Converts the SDOs' values to the drive's units.
-    fn rescale(&mut self, scale: &Scale, axis: u16) {
+    pub(super) fn rescale(&mut self, scale: &Scale, axis: u16) {
         // An axis has only one of the two object sets.
         for maxon in [false, true] {
             for object in self.homing.objects(scale, maxon) {

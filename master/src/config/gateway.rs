@@ -14,9 +14,14 @@ use super::device::CheckedAxis;
 use super::duration::show;
 use super::fields::{Domain, Field, Key, KeyExt, Ns, Read, Table, TableKey, Value, Written};
 use super::problem::{Problems, Span, list, suggestion};
-use super::raw::{AxisTables, RawAxis, RawDevice, RawEntry};
+use super::raw::{AxisTables, RawAxis, RawDevice, RawEntry, RawSdo};
 use super::schema::{self, Schema};
-use super::{AxisSetup, axis};
+use super::{AxisSetup, axis, sdo};
+
+mod load;
+mod mode;
+
+use load::{MAX_LOAD, load};
 
 const MS: Ns = 1_000_000;
 
@@ -27,6 +32,22 @@ table! { "[device.can]",
         /// Period of the gateway's SYNC, whole cycles; the axes step with it (time, 1 ms to 100 ms;
         /// default `"4ms"`)
         sync: Key<Ns> [MS..=100 * MS],
+        /// Input data of the gateway with its status word, as in 0x3000 (bytes, 2 to 512; default as
+        /// in the ESI)
+        inputs: Key<u16> [2..=512],
+        /// Output data of the gateway with its control word, as in 0x3001 (bytes, 2 to 512; default
+        /// as in the ESI)
+        outputs: Key<u16> [2..=512],
+        /// Node-ID of the gateway (1 to 127; default 99)
+        node_id: Key<u8> [1..=127],
+        /// Period of the gateway's own heartbeat (time, 10 ms to 65 s; default none)
+        heartbeat: Option<Heartbeat>,
+        /// Start-up behaviour as in 0x1F80: bit 0 is the NMT master, bit 3 leaves the start of the
+        /// nodes to ecaxis (0 to 127; default 1)
+        start_up: Key<u8> [0..=127],
+        /// Further objects of the simulated gateway, as `[[device.sdo]]` (list of tables; default
+        /// none)
+        objects: Vec<RawSdo>,
     }
 }
 
@@ -36,10 +57,28 @@ table! { "[[device.node]]",
         id: u8 [1..=127] = "1",
         /// Model of the drive (`"EPOS 24/1"`, `"EPOS 24/5"`, `"EPOS 70/10"`)
         drive: Spanned<Epos> = "\"EPOS 24/5\"",
+        /// Mode of operation of its axis (`"csp"`, `"pp"`; default `"csp"`)
+        mode: Option<Spanned<String>>,
         /// Period of the heartbeat (time, 10 ms to 65 s; default `"50ms"`)
         heartbeat: Option<Heartbeat>,
+        /// Period of node guarding, instead of a heartbeat (time, 10 ms to 65 s; default none)
+        guarding: Option<Heartbeat>,
+        /// Unanswered requests of node guarding until the node is missing (1 to 255; default 3)
+        retries: Option<u8>,
         /// If true, the gateway starts its network with this node only (true, false; default false)
         mandatory: Option<bool>,
+        /// If true, the gateway configures and starts the node when it comes back, as in 0x1F81 bit 2
+        /// (true, false; default true)
+        restart: Option<bool>,
+        /// If true, the gateway resets the node to factory values first, as in 0x1F81 bit 7 (true,
+        /// false; default false)
+        factory: Option<bool>,
+        /// Expected date and time of the node's configuration, as in 0x1F26 and 0x1F27 (two numbers;
+        /// default none: always configured)
+        configured: Option<[u32; 2]>,
+        /// Further objects that the gateway writes to the node at boot, as `[[device.sdo]]` (list of
+        /// tables; default none)
+        objects: Vec<RawSdo>,
         /// PDOs from the node to the gateway (list of tables; default none)
         inputs: Vec<RawLink>,
         /// PDOs from the gateway to the node (list of tables; default none)
@@ -74,6 +113,9 @@ pub struct NodeSetup {
     /// The PDOs: first byte in the gateway's process data, number, objects as mapped.
     pub outputs: Vec<PdoLink>,
     pub inputs: Vec<PdoLink>,
+    /// The objects that the drive must hold: index, subindex, value. The configuration tool of the
+    /// gateway writes them.
+    pub objects: Vec<(u16, u8, Vec<u8>)>,
 }
 
 /// A gateway's network, checked, with the axes of its nodes.
@@ -253,52 +295,36 @@ impl NodeSetup {
             selection,
             outputs,
             inputs,
+            objects: Vec::new(),
         }
     }
 }
 
-/// Returns the bits of a frame with this number of data bytes and most stuff bits, gap included.
-const fn frame_bits(bytes: u64) -> u64 {
-    47 + 8 * bytes + (34 + 8 * bytes - 1) / 4
-}
-
-/// The highest load of a CAN network: above it, frames with high identifiers wait for others.
-const MAX_LOAD: f64 = 0.6;
-
-/// Returns the share of time for which frames occupy the network. Each PDO passes once per SYNC.
-fn load(setup: &GatewaySetup, simulated: &GatewayOptions, sync_ns: u64) -> f64 {
-    let links = setup
-        .nodes
-        .iter()
-        .flat_map(|n| n.outputs.iter().chain(&n.inputs));
-    let pdos: u64 = links.map(|link| frame_bits(bytes(link).into())).sum();
-    let per_sync = frame_bits(0) + pdos;
-    let heartbeats = simulated.nodes.iter().map(|node| match node.supervision {
-        Supervision::Heartbeat { period_ms } => {
-            frame_bits(1) as f64 * 1e3 / f64::from(period_ms.max(1))
-        }
-        _ => 0.0,
-    });
-    let rate = per_sync as f64 * 1e9 / sync_ns as f64 + heartbeats.sum::<f64>();
-    rate / f64::from(setup.bit_rate)
-}
-
-impl GatewaySetup {
-    /// Returns the time from a set-point to the report of its position: it is held for one SYNC
-    /// period; the cycle that carries it, the gateway's exchange, the longest PDO and SYNC add to
-    /// that.
-    #[must_use]
-    pub fn dead_time_ns(&self, cycle_ns: u64) -> u64 {
-        const EXCHANGE_NS: u64 = MS;
-        let links = self
-            .nodes
-            .iter()
-            .flat_map(|n| n.outputs.iter().chain(&n.inputs));
-        let longest = links.map(|link| frame_bits(bytes(link).into())).max();
-        let bits = frame_bits(0) + longest.unwrap_or(0);
-        let frames = bits * 1_000_000_000 / u64::from(self.bit_rate.max(1));
-        self.sync_ns + cycle_ns + EXCHANGE_NS + frames
+/// Returns the device with the data sizes of the file.
+pub(super) fn with_sizes(raw: &RawDevice, device: &esi::Device) -> Option<esi::Device> {
+    let (inputs, outputs) = (raw.can.inputs.value(), raw.can.outputs.value());
+    if inputs.or(outputs).is_none() || !ecaxis_sim::gateway::is_gateway(device) {
+        return None;
     }
+    let known = ecaxis_sim::gateway::default_sizes(device);
+    let (inputs, outputs) = (inputs.unwrap_or(known.0), outputs.unwrap_or(known.1));
+    Some(ecaxis_sim::gateway::with_sizes(device, inputs, outputs))
+}
+
+/// Returns objects that the configuration tool writes.
+fn objects(raw: &[RawSdo], p: &mut Problems<'_>) -> Vec<(u16, u8, Vec<u8>)> {
+    let mut objects = Vec::new();
+    for raw in raw {
+        let name = raw.type_name.as_ref().map(|name| name.get_ref().as_str());
+        match sdo::encode(raw.value.get_ref(), name, None) {
+            Ok(data) => objects.push((raw.index, raw.sub.unwrap_or(0), data)),
+            Err((message, hint)) => {
+                let hint = hint.unwrap_or("give its type: `type = \"u32\"`".to_owned());
+                p.add_hint(raw.value.span(), message, hint);
+            }
+        }
+    }
+    objects
 }
 
 /// Checks the gateway's network. Returns `None` without one, or if it is invalid and reported.
@@ -323,6 +349,12 @@ pub(super) fn check(
             p.add_hint(rate.span(), "no such bit rate", hint);
         }
     }
+    (simulated.input_size, simulated.output_size) =
+        (raw.can.inputs.value(), raw.can.outputs.value());
+    simulated.node_id = raw.can.node_id.value().unwrap_or(simulated.node_id);
+    simulated.heartbeat_ms = raw.can.heartbeat.as_ref().map_or(0, |period| period.0);
+    simulated.start_up = raw.can.start_up.value().map_or(1, u32::from);
+    simulated.objects = objects(&raw.can.objects, p);
     let sync_ns = raw.can.sync.value().unwrap_or(4 * MS);
     simulated.sync_period_us = u32::try_from(sync_ns / 1000).unwrap_or(u32::MAX);
     let (device, selection) = (device?, selection?);
@@ -347,8 +379,26 @@ pub(super) fn check(
     for raw in &raw.node {
         let mut node = NodeOptions::new(raw.id, *raw.drive.get_ref());
         let period_ms = raw.heartbeat.as_ref().map_or(50, |heartbeat| heartbeat.0);
-        node.supervision = Supervision::Heartbeat { period_ms };
+        node.supervision = match &raw.guarding {
+            Some(Heartbeat(period_ms)) => Supervision::Guarding {
+                period_ms: *period_ms,
+                retries: raw.retries.unwrap_or(3).max(1),
+            },
+            None => Supervision::Heartbeat { period_ms },
+        };
+        if let (Some(_), Some(_)) = (&raw.guarding, &raw.heartbeat) {
+            let message = "a node has either a heartbeat or node guarding";
+            p.add_hint(
+                raw.span.clone(),
+                message,
+                "leave `heartbeat` or `guarding` out",
+            );
+        }
         node.mandatory = raw.mandatory.unwrap_or(false);
+        node.restart = raw.restart.unwrap_or(true);
+        node.factory = raw.factory.unwrap_or(false);
+        node.configured = raw.configured.unwrap_or_default();
+        node.objects = objects(&raw.objects, p);
         node.inputs = raw.inputs.iter().map(|raw| link(raw, true)).collect();
         node.outputs = raw.outputs.iter().map(|raw| link(raw, false)).collect();
         let setup = NodeSetup::new(&node, selection);
@@ -468,44 +518,15 @@ impl CheckedNetwork {
             p.add_hint(axis.span.clone(), message, "name it: `name = \"x\"`");
             return;
         };
-        let layout = &node.selection.layout;
-        let lacks = |output: bool, index| match output {
-            true => layout.rx_field(index, 0).is_none(),
-            false => layout.tx_field(index, 0).is_none(),
-        };
-        // The index in the file, its alias, and what it is.
-        let needed = [
-            (true, 0x6040, 0x6040, "Controlword"),
-            (true, 0x607a, 0x2062, "position mode setting value"),
-            (true, 0x6060, 0x6060, "modes of operation, in PDO 3"),
-            (false, 0x6041, 0x6041, "Statusword"),
-            (false, 0x6064, 0x6064, "position actual value"),
-            (
-                false,
-                0x6061,
-                0x6061,
-                "modes of operation display, in PDO 3",
-            ),
-        ];
-        let mapped = |index: u16| {
-            let links = &node.outputs;
-            links
-                .iter()
-                .any(|l| l.contents.iter().any(|c| c.0 == index))
-        };
-        for (output, index, own, what) in needed {
-            if lacks(output, index) || output && !mapped(own) {
-                let way = if output { "outputs" } else { "inputs" };
-                let message = format!(
-                    "an axis behind a gateway needs {} ({what}) in the `{way}` of its node",
-                    esi::address(own, 0)
-                );
-                let hint =
-                    "its mode is \"csp\": PDO 1 with Controlword and 0x2062, PDO 3 for the mode";
-                p.add_hint(raw.span.clone(), message, hint);
-                return;
-            }
+        if self.simulated.start_up & 1 == 0 {
+            let at = device.can.start_up.place().unwrap_or(raw.span.clone());
+            let message = "an axis behind a gateway needs the gateway as the NMT master";
+            p.add_hint(at, message, "set bit 0: `start_up = 1`");
+            return;
         }
+        let Some(mode) = mode::start(raw, node, p) else {
+            return;
+        };
         if let Some((cycle_ns, place)) = cycle
             && !self.setup.sync_ns.is_multiple_of(*cycle_ns)
         {
@@ -519,7 +540,8 @@ impl CheckedNetwork {
             p.add_hint(at, message, hint);
             return;
         }
-        let setup = self.axis(n, axis, cycle.map_or(MS, |(cycle, _)| *cycle), p);
+        let cycle_ns = cycle.map_or(MS, |(cycle, _)| *cycle);
+        let setup = self.axis(n, axis, mode, cycle_ns, p);
         self.axes.push(CheckedAxis {
             setup: setup.map(|setup| AxisSetup {
                 name: name.get_ref().clone(),
@@ -534,22 +556,26 @@ impl CheckedNetwork {
         &mut self,
         n: usize,
         raw: &RawAxis,
+        mode: esi::Mode,
         cycle_ns: u64,
         p: &mut Problems<'_>,
     ) -> Option<AxisSetup> {
         let node = self.setup.nodes.get(n)?;
-        let mut setup = axis::setup(raw, &[], esi::Mode::Csp, Some(&node.selection), p)?;
+        let mut setup = axis::setup(raw, &[], mode, Some(&node.selection), p)?;
         setup.node = Some(n);
+        mode::adopt_units(&mut setup);
+        setup.config.modes = mode::modes(node, setup.config.mode);
+        setup.config.profile_fixed = true;
         // These drives do not serve Statusword bit 12 in position mode.
         setup.config.follows_bit = raw.follows_bit.value().unwrap_or(false);
         if raw.dead_time.is_none() {
             setup.config.dead_time_s = self.setup.dead_time_ns(cycle_ns) as f64 * 1e-9;
         }
+        let objects = mode::objects(&setup);
+        self.setup.nodes.get_mut(n)?.objects.clone_from(&objects);
         let simulated = self.simulated.nodes.get_mut(n)?;
         simulated.plant.counts_per_turn = setup.config.scale.counts_per_turn().round() as u32;
         // The gateway writes these objects when the node boots.
-        let homing = setup.homing.iter().flat_map(|homing| &homing.startup);
-        let objects = homing.map(|sdo| (sdo.index, sdo.sub, sdo.data.clone()));
         simulated.objects.extend(objects);
         Some(setup)
     }

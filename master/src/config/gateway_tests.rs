@@ -57,6 +57,16 @@ fn axes_behind_a_gateway_reject_what_cannot_work() {
         ("\"0x2062\"] }, { pdo = 3, at = 8 }", "\"0x607A\"] }, { pdo = 3, at = 8 }", "needs 0x2062:00 (position mode setting value)", "\"csp\""),
         (", { pdo = 3, at = 8 }]\ninputs", "]\ninputs", "needs 0x6060:00 (modes of operation, in PDO 3) in the `outputs`", "PDO 3"),
         ("\"0x6064\"] }, { pdo = 3, at = 8 }]", "\"0x606C\"] }, { pdo = 3, at = 8 }]", "needs 0x6064:00", ""),
+        ("id      = 1\n", "id = 1\nmode = \"csv\"\n", "mode \"csv\" is not safe behind a gateway", "`velocity` steps"),
+        ("id      = 1\n", "id = 1\nmode = \"pv\"\n", "the drive would go on", "\"csp\""),
+        ("id      = 1\n", "id = 1\nmode = \"csb\"\n", "unknown mode \"csb\"", "did you mean `csp`?"),
+        ("id      = 1\n", "id = 1\nmode = \"pp\"\n", "needs 0x607a:00 (target position", "Controlword and 0x607A"),
+        ("id      = 1\n", "id = 1\nheartbeat = \"50ms\"\nguarding = \"50ms\"\n", "either a heartbeat or node guarding", ""),
+        ("sync     = \"4ms\"", "sync = \"4ms\"\nstart_up = 0", "as the NMT master", "`start_up = 1`"),
+        ("sync     = \"4ms\"", "sync = \"4ms\"\ninputs = 16", "do not lie between", ""),
+        ("sync     = \"4ms\"", "sync = \"4ms\"\noutputs = 1", "a whole number from 2 to 512", ""),
+        ("sync     = \"4ms\"", "sync = \"4ms\"\nobjects = [{ index = 0x1F89, value = 5 }]", "no such object", "type"),
+        ("[[step]]\nhome = [\"feed\"]", "[[step]]\nmode = { feed = \"pv\" }\n[[step]]\nhome = [\"feed\"]", "cannot switch to \"pv\"", "csp"),
         ("name     = \"feed\"\n", "", "the axis of a node needs a `name`", "name = "),
         ("name     = \"feed\"", "name = \"x\"", "the name \"x\" is taken", ""),
         ("homing   = { method = 35", "homing = { method = 99", "99", ""),
@@ -65,6 +75,42 @@ fn axes_behind_a_gateway_reject_what_cannot_work() {
         // Steps that name the axis may report it as well.
         let fits = |(said, hinted): &(String, String)| said.contains(message) && hinted.contains(hint);
         assert!(found.iter().any(fits), "{from} → {to}: {found:?}");
+    }
+}
+
+/// No PDO can carry the speed of a drive's own profile.
+#[test]
+fn a_profile_move_behind_a_gateway_takes_no_speed() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/mixed.toml");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let end = text.find("[[step]]").unwrap();
+    let text = text[..end].replacen("id      = 1\n", "id = 1\nmode = \"pp\"\n", 1);
+    let text = text.replacen("\"0x2062\"", "\"0x607A\"", 1);
+    let with = |step: &str| {
+        parse(
+            &path,
+            &format!("{text}[[step]]\nmove = {{ feed = 5.0 }}\n{step}"),
+        )
+    };
+    let machine = with("").unwrap();
+    let node = &machine.devices[machine.axes[ecaxis_ecat::index::AxisIndex(2)].device];
+    let objects = &node.gateway.as_ref().unwrap().nodes[0].objects;
+    // 50 mm/s and 250 mm/s² are 10 turns/s and 50 turns/s².
+    let profile = [(0x6081, 600_u32), (0x6083, 3000), (0x6084, 3000)];
+    for (index, value) in profile {
+        assert!(
+            objects.contains(&(index, 0, value.to_le_bytes().to_vec())),
+            "{objects:x?}"
+        );
+    }
+    for step in ["speed = 0.5\n", "ramp = 0.5\n"] {
+        let Err(ConfigError::Problems(problems)) = with(step) else {
+            panic!("{step}")
+        };
+        assert!(
+            problems[0].message.contains("speed and ramp of its drive"),
+            "{problems:?}"
+        );
     }
 }
 

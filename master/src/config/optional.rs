@@ -95,26 +95,25 @@ impl OptionalPlaces {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::super::{ConfigError, Locator, Machine, SegmentHead, parse};
 
-    const ESI: &str = r##"<?xml version="1.0"?>
-<EtherCATInfo><Vendor><Id>#x1</Id><Name>Test</Name></Vendor><Descriptions><Devices>
-<Device Physics="YY"><Type ProductCode="#x3" RevisionNo="#x1">B</Type><Name>Box</Name></Device>
-</Devices></Descriptions></EtherCATInfo>
-"##;
-
-    /// Loads devices by name and keys, with a group of all but the first.
+    /// Loads drives by name and keys, with a group of all but the first.
     fn load(devices: &[(&str, &str)]) -> Result<Machine, ConfigError> {
-        let folder = tempfile::tempdir().expect("folder");
-        std::fs::write(folder.path().join("b.xml"), ESI).expect("file");
         let mut text = "[bus]\ncycle = \"1ms\"\n".to_owned();
         for (name, keys) in devices {
-            text += &format!("[[device]]\nname = \"{name}\"\nesi = \"b.xml\"\n{keys}\n");
+            let limits = "limits = { velocity = 50.0, acceleration = 500.0 }";
+            text += &format!(
+                "[[device]]\nname = \"{name}\"\nesi = \"esi/EPOS4.xml\"\nmode = \"csp\"\n{keys}\n\
+                 [device.axis]\nencoder = 2000\n{limits}\n"
+            );
         }
         let names: Vec<_> = devices.iter().skip(1).map(|(name, _)| name).collect();
         text +=
-            &format!("[[stop.group]]\nname = \"g\"\ndevices = {names:?}\noutside = \"continue\"\n");
-        parse(&folder.path().join("m.toml"), &text)
+            &format!("[[stop.group]]\nname = \"g\"\naxes = {names:?}\noutside = \"continue\"\n");
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
+        parse(&folder.join("m.toml"), &text)
     }
 
     const FIRST: (&str, &str) = ("a", "position = 0");

@@ -20,8 +20,7 @@ pub struct Step {
     pub action: Action,
 }
 
-/// The action of a step. Targets are pairs of an axis and a value
-/// in user units.
+/// The action of a step. Targets are pairs of an axis and a value in user units.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Action {
     Enable {

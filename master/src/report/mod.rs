@@ -27,4 +27,6 @@ pub use events::EventLine;
 pub use progress::{
     AxisLine, DevicePlace, Home, Observer, ProbeCapture, Progress, Status, StepRef, UnknownDevice,
 };
-pub use summary::{AxisSummary, DeviceErrors, GroupStop, Summary, ThreadSummary};
+pub use summary::{
+    AxisSummary, DeviceErrors, GatewaySummary, GroupStop, NodeSummary, Summary, ThreadSummary,
+};

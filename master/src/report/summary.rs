@@ -11,6 +11,7 @@ use crate::link::LinkStats;
 use crate::link::capture::RecordStats;
 use crate::rt::axis::RtAxis;
 use crate::rt::exchange::{ErrorCounters, SubDeviceDiagnostics};
+use crate::rt::gateway::Gateway;
 use crate::rt::stats::{Counters, Percentiles, Stats};
 use crate::sys::process::ThreadUsage;
 
@@ -54,6 +55,8 @@ pub struct Summary {
     pub probes: Vec<ProbeCapture>,
     /// SubDevices whose error counters have grown.
     pub errors: Vec<DeviceErrors>,
+    /// The CANopen gateways and the nodes behind them, in the order of the file.
+    pub gateways: Vec<GatewaySummary>,
     /// The last events of the cycle, oldest first.
     pub events: Vec<EventLine>,
     /// The emergencies of the devices, oldest first, up to a fixed number.
@@ -101,6 +104,50 @@ pub(crate) fn device_errors(
         .collect()
 }
 
+/// A CANopen gateway at the end.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct GatewaySummary {
+    pub name: String,
+    /// The errors that its general status has reported in this run.
+    pub errors: Vec<&'static str>,
+    pub nodes: Vec<NodeSummary>,
+}
+
+/// A node behind a gateway at the end.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct NodeSummary {
+    pub id: u8,
+    pub drive: &'static str,
+    /// The last state that the gateway has reported, before the end of the run if it ended in order.
+    pub state: String,
+    /// The number of times that the node was lost.
+    pub losses: u32,
+}
+
+pub(crate) fn gateways(machine: &Machine, gateways: &[Gateway]) -> Vec<GatewaySummary> {
+    let summaries = gateways.iter().filter_map(|gateway| {
+        let device = machine.devices.get(gateway.device())?;
+        let drive = |id: u8| {
+            let mut nodes = device.gateway.iter().flat_map(|gateway| &gateway.nodes);
+            nodes
+                .find(|node| node.id == id)
+                .map_or("?", |node| node.drive)
+        };
+        let nodes = gateway.nodes().map(|(id, state, losses)| NodeSummary {
+            id,
+            drive: drive(id),
+            state: state.to_string(),
+            losses,
+        });
+        Some(GatewaySummary {
+            name: device.name.clone(),
+            errors: gateway.general_seen().texts().collect(),
+            nodes: nodes.collect(),
+        })
+    });
+    summaries.collect()
+}
+
 /// The real-time thread from the first to the last cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ThreadSummary {
@@ -137,6 +184,7 @@ pub(crate) struct SummaryInputs {
     pub thread: Option<ThreadSummary>,
     pub record: Option<RecordStats>,
     pub errors: Vec<DeviceErrors>,
+    pub gateways: Vec<GatewaySummary>,
     pub events: Vec<EventLine>,
     /// The kept emergencies and the number of further ones.
     pub emergencies: (Vec<EmergencyLine>, u64),
@@ -263,6 +311,7 @@ impl Summary {
             axes,
             probes: aside.captures,
             errors: aside.errors,
+            gateways: aside.gateways,
             events: aside.events,
             emergencies: aside.emergencies.0,
             more_emergencies: aside.emergencies.1,

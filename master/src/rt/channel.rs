@@ -49,6 +49,8 @@ pub enum RtCommand {
     /// Stops the bus monitor: the segment is about to leave Op, so wrong working counters are
     /// expected.
     StopBusMonitor,
+    /// Ends the exchange of process data between gateways and their nodes.
+    EndGateways,
     /// Brings every axis of the machine to rest within its limits, then disables it.
     Stop,
     /// Reports a drive's error code that was read outside the cycle.
@@ -132,6 +134,8 @@ pub struct Snapshot {
     pub groups: IndexVec<GroupIndex, GroupStatus>,
     /// Events dropped because the queue was full.
     pub events_lost: u64,
+    /// True if no gateway exchanges process data with its nodes any more.
+    pub gateways_ended: bool,
     /// Commands taken so far.
     pub commands_taken: u64,
 }

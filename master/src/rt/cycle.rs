@@ -123,6 +123,7 @@ pub struct EngineReport {
     pub link: Box<dyn Link>,
     pub port: PduLoop,
     pub axes: IndexVec<AxisIndex, RtAxis>,
+    pub gateways: Box<[Gateway]>,
     pub stats: Stats,
     /// The spin time before a release, at the end of the run.
     pub spin_ns: Nanos,
@@ -225,6 +226,7 @@ impl Engine {
             link: self.link,
             port: self.port,
             axes: self.axes,
+            gateways: self.gateways,
             stats: self.stats,
             spin_ns: self.margin.get(),
             diagnoses: self.exchange.diagnoses().clone(),
@@ -340,9 +342,12 @@ impl Engine {
                 let gateway = self.gateways.get(at.gateway);
                 gateway.map_or((true, false), |gateway| {
                     let state = gateway.state(at.node);
-                    (gateway.is_due(), state == NodeState::Operational)
+                    let exchanges = state == NodeState::Operational || gateway.has_ended();
+                    (gateway.is_due(), exchanges)
                 })
             });
+            // A gateway that restarts has no data of its nodes yet.
+            let reported = slot.node.is_none() || slot.bits.statusword.get(image) != 0;
             let fresh = reachable && answer == Some(&DeviceAnswer::Fresh);
             if fresh {
                 slot.heard = Some(self.next);
@@ -352,7 +357,7 @@ impl Engine {
             slot.acted = !due;
             if due {
                 let (fresh, late) = std::mem::take(&mut slot.arrived);
-                let inputs = slot.read(image, fresh, late);
+                let inputs = slot.read(image, fresh && reported, late);
                 slot.axis.observe(&inputs, slot.dt_s(self.config.cycle_ns));
             }
         }
@@ -448,6 +453,7 @@ impl Engine {
             }
         }
         snapshot.events_lost = self.events_lost;
+        snapshot.gateways_ended = self.gateways.iter().all(Gateway::has_ended);
         snapshot.commands_taken = self.commands_taken;
         let number = self.stats.counters.cycles;
         let cycle = flight_recorder::Cycle::new(
@@ -537,6 +543,7 @@ pub fn first_snapshot(
         stop_ended: false,
         groups: vec![GroupStatus::default(); groups].into(),
         events_lost: 0,
+        gateways_ended: false,
         commands_taken: 0,
     }
 }

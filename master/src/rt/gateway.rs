@@ -6,7 +6,9 @@
 //!
 //! The control word (Anybus X-gateway, manual §6.2.1) carries a toggle bit, a command and a node.
 //! The gateway echoes toggle bit and command in the status word. The first command starts the
-//! gateway; the commands after it ask for the state of one node after another.
+//! gateway; the commands after it ask for its general status and the state of one node after
+//! another. A node that waits to be started gets a command of its own. The last command leads all
+//! nodes to PRE-OPERATIONAL, in which they exchange no process data.
 
 use std::ops::Range;
 
@@ -92,7 +94,46 @@ const TOGGLE: u8 = 0x80;
 const COMMAND: u8 = 0x70;
 /// Set NMT state OPERATIONAL, of the gateway itself. It then starts its nodes.
 const START: [u8; 2] = [0x01, 0];
+/// Set NMT state PRE-OPERATIONAL, of all nodes and the gateway.
+const END: [u8; 2] = [0x00, 128];
 const GET_NODE_STATE: u8 = 0x10;
+const GET_GENERAL_STATUS: u8 = 0x20;
+/// Set NMT state OPERATIONAL, of one node.
+const START_NODE: u8 = 0x01;
+
+/// The general status of the CANopen module (manual §6.2.2).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct GeneralStatus(pub u8);
+
+impl GeneralStatus {
+    /// The bits and their meaning.
+    const BITS: [(u8, &'static str); 4] = [
+        (1 << 0, "CAN bus off"),
+        (1 << 1, "CAN error passive"),
+        (1 << 2, "node guarding or heartbeat error"),
+        (1 << 3, "SYNC error"),
+    ];
+
+    /// Returns the meaning of each bit that is set.
+    pub fn texts(self) -> impl Iterator<Item = &'static str> {
+        Self::BITS
+            .into_iter()
+            .filter(move |(bit, _)| self.0 & bit != 0)
+            .map(|(_, text)| text)
+    }
+}
+
+/// The part of a run that a gateway is in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+enum Stage {
+    /// The module is not started yet.
+    #[default]
+    Starting,
+    Running,
+    /// The command to all nodes waits for its acknowledgement.
+    Ending,
+    Ended,
+}
 
 /// A gateway in the cycle. All functions: RT, O(nodes + bytes).
 #[derive(Debug)]
@@ -102,11 +143,17 @@ pub struct Gateway {
     command: Option<[u8; 2]>,
     /// Cycles since the command was issued.
     waiting: u32,
-    started: bool,
+    stage: Stage,
     states: Box<[NodeState]>,
     /// The nodes that have been Operational in this Op.
     reached: Box<[bool]>,
+    /// The times that each node was lost.
+    losses: Box<[u32]>,
+    /// The node of the next question; beyond the last: the general status, then the module.
     asked: usize,
+    /// The general status at the last answer, and all bits of this run.
+    general: GeneralStatus,
+    general_seen: GeneralStatus,
     previous: Box<[u8]>,
     sync: SyncPhase,
 }
@@ -122,10 +169,13 @@ impl Gateway {
         Self {
             command: None,
             waiting: 0,
-            started: false,
+            stage: Stage::default(),
             states: vec![NodeState::default(); config.nodes.len()].into(),
             reached: vec![false; config.nodes.len()].into(),
+            losses: vec![0; config.nodes.len()].into(),
             asked: 0,
+            general: GeneralStatus::default(),
+            general_seen: GeneralStatus::default(),
             previous: vec![0; config.inputs.len()].into(),
             sync: SyncPhase::new(config.sync_cycles),
             config,
@@ -148,9 +198,50 @@ impl Gateway {
         self.states.get(node).copied().unwrap_or_default()
     }
 
+    /// Returns the node-IDs with their states and the times that each was lost.
+    pub fn nodes(&self) -> impl Iterator<Item = (u8, NodeState, u32)> {
+        let counts = self.states.iter().zip(&self.losses);
+        let nodes = self.config.nodes.iter().zip(counts);
+        nodes.map(|(id, (state, losses))| (*id, *state, *losses))
+    }
+
+    /// Returns the general status at the last answer.
+    #[must_use]
+    pub fn general(&self) -> GeneralStatus {
+        self.general
+    }
+
+    /// Returns all bits of the general status in this run.
+    #[must_use]
+    pub fn general_seen(&self) -> GeneralStatus {
+        self.general_seen
+    }
+
+    /// Ends the exchange of process data with all nodes. The commands to the drives must have
+    /// arrived before.
+    pub fn end(&mut self) {
+        self.stage = match self.stage {
+            Stage::Starting => Stage::Ended,
+            Stage::Running => {
+                self.command = None;
+                Stage::Ending
+            }
+            ending => ending,
+        };
+    }
+
+    /// True once the gateway has acknowledged the end, or if it was never started.
+    #[must_use]
+    pub fn has_ended(&self) -> bool {
+        self.stage == Stage::Ended
+    }
+
     /// Returns the state of a node that was Operational before and is not now.
     #[must_use]
     pub fn lost(&self, node: usize) -> Option<NodeState> {
+        if matches!(self.stage, Stage::Ending | Stage::Ended) {
+            return None;
+        }
         let reached = self.reached.get(node).copied().unwrap_or(false);
         Some(self.state(node)).filter(|state| reached && *state != NodeState::Operational)
     }
@@ -172,9 +263,13 @@ impl Gateway {
         }
         self.sync.step(changed, powered);
         if !running {
-            (self.command, self.waiting, self.started) = (None, 0, false);
-            self.states.fill(NodeState::Unknown);
+            (self.command, self.waiting) = (None, 0);
             self.reached.fill(false);
+            // The states at the end of a run stay for its summary.
+            if self.stage != Stage::Ended {
+                self.stage = Stage::Starting;
+                self.states.fill(NodeState::Unknown);
+            }
             return;
         }
         self.waiting = self.waiting.saturating_add(1);
@@ -185,35 +280,89 @@ impl Gateway {
     }
 
     fn take_status(&mut self, status: u8, error: u8) {
-        match self.command {
-            None => self.issue(START, status),
-            Some([byte, _]) if (byte ^ status) & (TOGGLE | COMMAND) == 0 => {
-                if byte & COMMAND == GET_NODE_STATE {
-                    if let Some(state) = self.states.get_mut(self.asked) {
-                        *state = NodeState::from_code(status & 0x0f);
-                    }
-                    self.asked = (self.asked + 1) % self.states.len().max(1);
-                } else {
-                    self.started = true;
-                }
-                if let Some(&node) = self.config.nodes.get(self.asked) {
-                    self.issue([GET_NODE_STATE, node], status);
-                }
+        match (self.command, self.stage) {
+            (_, Stage::Ended) => return,
+            (None, Stage::Ending) => self.issue(END, status),
+            (None, _) => self.issue(START, status),
+            (Some([byte, node]), _) if (byte ^ status) & (TOGGLE | COMMAND) == 0 => {
+                self.take_answer([byte & COMMAND, node], status);
             }
-            Some(_) if self.started && self.waiting > self.config.timeout_cycles => {
-                self.states.fill(NodeState::NoAcknowledgement);
+            (Some(_), Stage::Running) if self.waiting > self.config.timeout_cycles => {
+                self.lose_all();
             }
-            Some(_) => {}
+            (Some(_), _) => {}
         }
         // Faster than the question, but it names the lowest node only.
         let mut nodes = self.config.nodes.iter();
         if let Some(node) = nodes.position(|node| *node == error)
-            && let Some(state @ NodeState::Operational) = self.states.get_mut(node)
+            && self.state(node) == NodeState::Operational
         {
-            *state = NodeState::InError;
+            self.set_state(node, NodeState::InError);
         }
         for (reached, state) in self.reached.iter_mut().zip(&self.states) {
             *reached |= *state == NodeState::Operational;
+        }
+    }
+
+    /// Takes an acknowledged command and issues the next one.
+    fn take_answer(&mut self, [command, of]: [u8; 2], status: u8) {
+        let code = status & 0x0f;
+        let state = NodeState::from_code(code);
+        let waits = matches!(state, NodeState::PreOperational | NodeState::Stopped);
+        let mut start = None;
+        match (self.stage, command) {
+            (Stage::Ending, _) => {
+                self.stage = Stage::Ended;
+                for state in &mut self.states {
+                    if *state == NodeState::Operational {
+                        *state = NodeState::PreOperational;
+                    }
+                }
+                return;
+            }
+            // The module itself, after a reset.
+            (Stage::Running, GET_NODE_STATE) if of == 0 => {
+                start = Some(START).filter(|_| waits);
+                self.asked = 0;
+            }
+            (Stage::Running, GET_NODE_STATE) => {
+                // The gateway starts most nodes itself: only a node that stays there is started.
+                let stays = waits && self.state(self.asked) == state;
+                start = Some([START_NODE, of]).filter(|_| stays);
+                self.set_state(self.asked, state);
+                self.asked += 1;
+            }
+            (Stage::Running, GET_GENERAL_STATUS) => {
+                self.general = GeneralStatus(code);
+                self.general_seen.0 |= self.general.0;
+                self.asked += 1;
+            }
+            (Stage::Running, _) => {}
+            _ => self.stage = Stage::Running,
+        }
+        let next = match self.config.nodes.get(self.asked) {
+            Some(node) => [GET_NODE_STATE, *node],
+            None if self.asked == self.config.nodes.len() => [GET_GENERAL_STATUS, 0],
+            None => [GET_NODE_STATE, 0],
+        };
+        self.issue(start.unwrap_or(next), status);
+    }
+
+    fn set_state(&mut self, node: usize, state: NodeState) {
+        let reached = self.reached.get(node).copied().unwrap_or(false);
+        let Some(before) = self.states.get_mut(node) else {
+            return;
+        };
+        let begins = *before == NodeState::Operational && state != NodeState::Operational;
+        *before = state;
+        if let Some(losses) = self.losses.get_mut(node).filter(|_| reached && begins) {
+            *losses = losses.saturating_add(1);
+        }
+    }
+
+    fn lose_all(&mut self) {
+        for node in 0..self.states.len() {
+            self.set_state(node, NodeState::NoAcknowledgement);
         }
     }
 

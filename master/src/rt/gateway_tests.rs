@@ -22,6 +22,9 @@ struct Peer {
     status: u8,
     error: u8,
     states: [u8; 3],
+    /// The state of the module, and its general status.
+    own: u8,
+    general: u8,
     /// The executed commands, without toggle bit.
     commands: Vec<[u8; 2]>,
     silent: bool,
@@ -33,6 +36,8 @@ impl Peer {
             status: 0x70,
             error: 0,
             states: [1; 3],
+            own: 1,
+            general: 0,
             commands: Vec::new(),
             silent: false,
         }
@@ -44,7 +49,9 @@ impl Peer {
         let [byte, node] = [image[4], image[5]];
         if !self.silent && (byte ^ self.status) & 0x80 != 0 {
             let extension = match byte & 0x70 {
+                0x10 if node == 0 => self.own,
                 0x10 => self.states[NODES.iter().position(|n| *n == node).unwrap()],
+                0x20 => self.general,
                 _ => byte & 0x0f,
             };
             self.status = byte & 0xf0 | extension;
@@ -66,7 +73,7 @@ fn gateway_is_started_then_each_node_is_asked() {
         peer.commands[..4],
         [[0x01, 0], [0x10, 1], [0x10, 2], [0x10, 100]]
     );
-    assert_eq!(peer.commands[4], [0x10, 1]);
+    assert_eq!(peer.commands[4..7], [[0x20, 0], [0x10, 0], [0x10, 1]]);
     for node in 0..3 {
         assert_eq!(
             (gateway.state(node), gateway.lost(node)),
@@ -136,6 +143,62 @@ fn a_missing_acknowledgement_loses_all_nodes_after_the_time_out() {
     for node in 0..3 {
         assert_eq!(gateway.lost(node), Some(NodeState::NoAcknowledgement));
     }
+}
+
+/// A node that the gateway leaves in PRE-OPERATIONAL is started alone, and so is a module that has
+/// been reset.
+#[test]
+fn a_waiting_node_and_a_reset_module_are_started() {
+    let (mut gateway, mut peer) = (gateway(), Peer::new());
+    peer.states[2] = 0;
+    for _ in 0..30 {
+        peer.cycle(&mut gateway);
+    }
+    let starts = |peer: &Peer, node: u8| peer.commands.iter().filter(|c| **c == [1, node]).count();
+    assert!(starts(&peer, 100) >= 1, "{:x?}", peer.commands);
+    assert_eq!(
+        (starts(&peer, 1), starts(&peer, 2), starts(&peer, 0)),
+        (0, 0, 1)
+    );
+    peer.own = 0;
+    for _ in 0..10 {
+        peer.cycle(&mut gateway);
+    }
+    let again = starts(&peer, 0);
+    assert!(again >= 2, "{:x?}", peer.commands);
+    peer.own = 1;
+    for _ in 0..20 {
+        peer.cycle(&mut gateway);
+    }
+    assert!(starts(&peer, 0) <= again + 1, "{:x?}", peer.commands);
+}
+
+#[test]
+fn the_end_leads_all_nodes_to_pre_operational_and_loses_none() {
+    let (mut gateway, mut peer) = (gateway(), Peer::new());
+    peer.general = 0x6;
+    for _ in 0..20 {
+        peer.cycle(&mut gateway);
+    }
+    gateway.end();
+    assert!(!gateway.has_ended());
+    for _ in 0..5 {
+        peer.cycle(&mut gateway);
+    }
+    assert!(gateway.has_ended());
+    assert_eq!(peer.commands.last(), Some(&[0x00, 128]));
+    let all: Vec<_> = gateway.nodes().collect();
+    let expected = NODES.map(|id| (id, NodeState::PreOperational, 0));
+    assert_eq!(all, expected);
+    assert_eq!(gateway.lost(0), None);
+    let texts: Vec<_> = gateway.general_seen().texts().collect();
+    assert_eq!(
+        texts,
+        ["CAN error passive", "node guarding or heartbeat error"]
+    );
+    // The summary still has the states when the bus has left Op.
+    gateway.observe(&[0; 12], true, false, false);
+    assert_eq!(gateway.state(1), NodeState::PreOperational);
 }
 
 #[test]

@@ -36,8 +36,8 @@ use crate::report::events;
 use crate::report::summary::{self, SummaryInputs};
 pub use crate::report::{
     AxisLine, AxisSummary, Cause, DeviceErrors, DiagnosisKind, DiagnosisMessage, DriveReport,
-    EmergencyLine, EmergencyLog, EmergencyReport, Error, EventLine, GroupStop, Observer,
-    ProbeCapture, Progress, Status, StepRef, Summary, ThreadSummary,
+    EmergencyLine, EmergencyLog, EmergencyReport, Error, EventLine, GatewaySummary, GroupStop,
+    NodeSummary, Observer, ProbeCapture, Progress, Status, StepRef, Summary, ThreadSummary,
 };
 use crate::sys::rights;
 use crate::text::panic_text;
@@ -301,6 +301,7 @@ fn run_on_link_thread(
         mut link,
         mut port,
         axes,
+        gateways,
         stats,
         spin_ns,
         diagnoses,
@@ -354,6 +355,7 @@ fn run_on_link_thread(
         thread,
         record,
         errors: summary::device_errors(machine, &diagnoses),
+        gateways: summary::gateways(machine, &gateways),
         events,
         emergencies: log.lines(started),
         started,

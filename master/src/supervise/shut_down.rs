@@ -12,6 +12,9 @@ use crate::report::{Cause, Error, Progress};
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::RtCommand;
 
+/// The time within which a gateway acknowledges the end of the exchange, in ns.
+const GATEWAY_END_NS: Nanos = 100_000_000;
+
 impl Supervisor {
     /// Stops the axes, removes power and sets the segment back to Init, as far as it answers.
     /// `failed`: the run already has an error.
@@ -122,6 +125,24 @@ impl Supervisor {
         changed
     }
 
+    /// Leads the nodes behind gateways out of OPERATIONAL. Their drives have no power any more.
+    async fn end_gateways(&mut self) {
+        let mut devices = self.machine.devices.iter();
+        if !devices.any(|device| device.gateway.is_some()) {
+            return;
+        }
+        self.send(RtCommand::EndGateways).await;
+        let asked = clock::now();
+        while !self.outer.snapshots.read().gateways_ended && !self.outer.commands.is_abandoned() {
+            if clock::now().saturating_sub(asked) > GATEWAY_END_NS {
+                let text = "a gateway does not acknowledge the end: its nodes stay OPERATIONAL";
+                self.report(Progress::Warning(text.to_owned()));
+                return;
+            }
+            clock::delay(TICK).await;
+        }
+    }
+
     /// Waits until nothing more can stop any axis. Each axis ends its stop in bounded time.
     async fn wait_for_standstill(&mut self, failed: bool) -> Result<(), Error> {
         loop {
@@ -132,6 +153,7 @@ impl Supervisor {
                 break;
             }
         }
+        self.end_gateways().await;
         // Until this point, anything the cycle finds is a failure of this run.
         self.send(RtCommand::StopBusMonitor).await;
         while self.outer.snapshots.read().commands_taken < self.commands_sent

@@ -5,6 +5,7 @@ use crate::Nanos;
 use crate::drive::State;
 use crate::esc::al::AlState;
 use crate::esc::ports::PORTS;
+use crate::gateway::GatewayFault;
 
 /// Every kind with its keys, in addition to `at`, `for` and `kind`.
 const KINDS: &[(&str, &[&str])] = &[
@@ -35,6 +36,11 @@ const KINDS: &[(&str, &[&str])] = &[
     ("link-break", &["device", "port"]),
     ("node-silent", &["device", "node"]),
     ("input", &["device", "index", "sub", "value"]),
+    ("heartbeat-lost", &["device", "node"]),
+    ("node-error", &["device", "node"]),
+    ("can-open", &["device"]),
+    ("gateway-reset", &["device"]),
+    ("control-ignored", &["device"]),
     ("silent", &[]),
 ];
 
@@ -156,22 +162,29 @@ fn kind(name: &str, raw: &RawFault) -> Result<FaultKind, String> {
             ..identity(raw)
         }),
         "link-break" => FaultKind::LinkBreak { port: port(raw)? },
-        "node-silent" => {
-            let node = raw.node.ok_or("`node` is missing")?;
-            if !(1..=127).contains(&node) {
-                return Err(format!("`node` {node}: nodes are 1 to 127"));
-            }
-            FaultKind::NodeSilent { node }
-        }
         "input" => FaultKind::Input {
             index: raw.index.ok_or("`index` is missing")?,
             sub: raw.sub.unwrap_or(0),
             value: raw.value.ok_or("`value` is missing")?,
         },
+        "node-silent" => FaultKind::Gateway(GatewayFault::NodeSilent(node(raw)?)),
+        "heartbeat-lost" => FaultKind::Gateway(GatewayFault::HeartbeatLost(node(raw)?)),
+        "node-error" => FaultKind::Gateway(GatewayFault::NodeError(node(raw)?)),
+        "can-open" => FaultKind::Gateway(GatewayFault::CanOpen),
+        "gateway-reset" => FaultKind::Gateway(GatewayFault::Reset),
+        "control-ignored" => FaultKind::Gateway(GatewayFault::ControlIgnored),
         "silent" => FaultKind::Silent,
         // `power-off` and `absent`: the last kinds in the table above.
         _ => FaultKind::PowerOff,
     })
+}
+
+fn node(raw: &RawFault) -> Result<u8, String> {
+    let node = raw.node.ok_or("`node` is missing")?;
+    match node {
+        1..=127 => Ok(node),
+        _ => Err(format!("`node` {node}: nodes are 1 to 127")),
+    }
 }
 
 fn identity(raw: &RawFault) -> NewIdentity {

@@ -45,6 +45,12 @@
 //! * `stuck` (`device`, `state`): the drive does not leave this CiA 402 state
 //! * `load` (`device`, `torque`): a torque (N·m) pulls the shaft towards negative positions
 //! * `blocked` (`device`): the shaft does not turn
+//! * `node-silent` (`device`, `node`): a node behind a gateway has no power
+//! * `heartbeat-lost` (`device`, `node`): a node sends no heartbeat
+//! * `node-error` (`device`, `node`): the status word names the node as the node in error
+//! * `can-open` (`device`): the CAN cable at the gateway is unplugged
+//! * `gateway-reset` (`device`): the CANopen side of the gateway restarts
+//! * `control-ignored` (`device`): the gateway executes and acknowledges no command
 //! * `emergency` (`device`, `code`): the device sends an emergency message and has no error
 //!
 //! ```
@@ -71,6 +77,7 @@ mod tests;
 
 use crate::Nanos;
 use crate::device::{Identification, SimDevice};
+use crate::gateway::GatewayFault;
 use crate::random::Random;
 pub(crate) use frames::BitFlip;
 pub(crate) use script::{Fault, FaultKind, FrameSelection};
@@ -301,7 +308,7 @@ impl ActiveFault {
             FaultKind::Load { torque } => load(device, torque),
             FaultKind::Blocked => block(device, true),
             FaultKind::Emergency { code } => device.inject_emergency(code),
-            FaultKind::NodeSilent { node } => silence(device, node, true),
+            FaultKind::Gateway(fault) => disturb(device, fault, true),
             FaultKind::Input { index, sub, value } => {
                 device.set_input(index, sub, value);
             }
@@ -321,7 +328,7 @@ impl ActiveFault {
             FaultKind::Identity(_) | FaultKind::Swap(_) => device.identify(&self.saved),
             FaultKind::Load { .. } => load(device, 0.0),
             FaultKind::Blocked => block(device, false),
-            FaultKind::NodeSilent { node } => silence(device, node, false),
+            FaultKind::Gateway(fault) => disturb(device, fault, false),
             FaultKind::Input { index, sub, .. } => {
                 device.set_input(index, sub, 0);
             }
@@ -346,8 +353,8 @@ fn block(device: &mut SimDevice, blocked: bool) {
     }
 }
 
-fn silence(device: &mut SimDevice, node: u8, silent: bool) {
+fn disturb(device: &mut SimDevice, fault: GatewayFault, begins: bool) {
     if let Some(gateway) = device.gateway_mut() {
-        gateway.set_node_silent(node, silent);
+        gateway.disturb(fault, begins);
     }
 }

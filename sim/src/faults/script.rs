@@ -7,6 +7,7 @@ use super::keys;
 use crate::Nanos;
 use crate::drive::State;
 use crate::esc::al::AlState;
+use crate::gateway::GatewayFault;
 use crate::network::topology::Topology;
 
 /// Faults with their times, parsed from TOML.
@@ -160,10 +161,8 @@ pub(crate) enum FaultKind {
     LinkBreak {
         port: u8,
     },
-    /// A node behind a gateway has no power. It boots again when the power returns.
-    NodeSilent {
-        node: u8,
-    },
+    /// Something on the CAN network behind a gateway.
+    Gateway(GatewayFault),
     Emergency {
         code: u16,
     },

@@ -5,6 +5,7 @@ use super::script::*;
 use crate::drive::State;
 use crate::esc::al::AlState;
 use crate::esc::ports::Medium;
+use crate::gateway::GatewayFault;
 use crate::network::topology::Topology;
 
 #[test]
@@ -49,6 +50,18 @@ fn script_with_every_kind_parses() {
         [[fault]]
         kind = "node-silent"
         node = 5
+        [[fault]]
+        kind = "heartbeat-lost"
+        node = 6
+        [[fault]]
+        kind = "node-error"
+        node = 7
+        [[fault]]
+        kind = "can-open"
+        [[fault]]
+        kind = "gateway-reset"
+        [[fault]]
+        kind = "control-ignored"
         [[fault]]
         kind = "power-off"
         [[fault]]
@@ -120,7 +133,12 @@ fn script_with_every_kind_parses() {
         FaultKind::Silent,
         FaultKind::Emergency { code: 0x2310 },
         FaultKind::LinkBreak { port: 1 },
-        FaultKind::NodeSilent { node: 5 },
+        FaultKind::Gateway(GatewayFault::NodeSilent(5)),
+        FaultKind::Gateway(GatewayFault::HeartbeatLost(6)),
+        FaultKind::Gateway(GatewayFault::NodeError(7)),
+        FaultKind::Gateway(GatewayFault::CanOpen),
+        FaultKind::Gateway(GatewayFault::Reset),
+        FaultKind::Gateway(GatewayFault::ControlIgnored),
         FaultKind::PowerOff,
         FaultKind::FrameDuplicate {
             hits: FrameSelection::Each(0.25),

@@ -36,7 +36,8 @@ pub fn is_gateway(device: &Device) -> bool {
 }
 
 /// Returns the numbers of input and output bytes that the ESI maps by default.
-pub(super) fn default_sizes(device: &Device) -> (u16, u16) {
+#[must_use]
+pub fn default_sizes(device: &Device) -> (u16, u16) {
     let bytes = |pdos: &[EsiPdo]| {
         let assigned = pdos.iter().filter(|pdo| pdo.sm.is_some());
         let bits: u32 = assigned.map(EsiPdo::bit_len).sum();
@@ -56,6 +57,13 @@ pub(super) fn shape(device: &Device, (inputs, outputs): (u16, u16)) -> Device {
     shaped.rx_pdos = pdos(&device.rx_pdos, Direction::Rx, outputs);
     shaped.tx_pdos = pdos(&device.tx_pdos, Direction::Tx, inputs);
     shaped
+}
+
+/// Returns the device with other input and output sizes, as its CoE objects describe them.
+#[must_use]
+pub fn with_sizes(device: &Device, inputs: u16, outputs: u16) -> Device {
+    let size = |bytes: u16| bytes.clamp(MIN_SIZE, MAX_SIZE);
+    shape(device, (size(inputs), size(outputs)))
 }
 
 fn pdos(templates: &[EsiPdo], direction: Direction, size: u16) -> Vec<EsiPdo> {

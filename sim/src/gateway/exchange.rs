@@ -20,7 +20,7 @@ impl Gateway {
         self.obey(in_op, now);
         self.poll_events(now);
         self.inputs[0] = self.status;
-        self.inputs[1] = self.master.error_node();
+        self.inputs[1] = self.error_node();
         for (byte, slot) in self.inputs.iter().zip(&self.slots[0]) {
             if let Some(to) = store.bytes_mut(*slot).first_mut() {
                 *to = *byte;
@@ -33,10 +33,14 @@ impl Gateway {
         if !in_op {
             // An old command in the buffer must not act when the fieldbus comes back.
             self.status = NO_OPERATION << 4 | u8::from(self.toggle) << 7;
+            // "If the PLC is not running, the NMT state is set to PRE-OPERATIONAL" (slave).
+            if !self.is_master() {
+                self.permit(false, now);
+            }
             return;
         }
         let [byte, node, ..] = self.outputs;
-        if control::toggle(byte) == self.toggle {
+        if control::toggle(byte) == self.toggle || self.disturbance.control_ignored {
             return;
         }
         let Some(word) = ControlWord::decode([byte, node]) else {
@@ -71,7 +75,7 @@ impl Gateway {
         if self.transmit_errors >= ERROR_PASSIVE {
             bits |= general::ERROR_PASSIVE;
         }
-        if self.master.error_node() != 0 {
+        if self.error_node() != 0 {
             bits |= general::ERROR_CONTROL;
         }
         if self.misses_sync() {

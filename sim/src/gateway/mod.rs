@@ -14,7 +14,7 @@
 //!
 //! The secondary network runs in true time between the points at which the gateway forwards data.
 //! The bus has no bit errors, so no controller goes bus-off. The bus has no LSS slave. A gateway
-//! that is not the NMT master finds no other master.
+//! that is not the NMT master obeys the one whose frames [`Gateway::inject`] sends.
 //!
 //! ```
 //! use ecaxis_sim::DeviceOptions;
@@ -35,6 +35,7 @@ mod concise;
 mod control;
 mod dictionary;
 mod exchange;
+mod fault;
 mod master;
 mod nmt;
 mod node;
@@ -43,6 +44,7 @@ mod options;
 mod pdo;
 mod process;
 mod sdo;
+mod trace;
 
 use std::collections::VecDeque;
 
@@ -53,7 +55,9 @@ pub use nmt::NmtState;
 pub use node::{Epos, Node};
 pub use options::{BIT_RATES, GatewayError, GatewayOptions, NodeOptions, PdoLink, Supervision};
 
-pub use anybus::is_gateway;
+pub use anybus::{default_sizes, is_gateway, with_sizes};
+pub(crate) use fault::GatewayFault;
+pub use trace::CanTrace;
 
 use ecaxis_esi::model::Device;
 
@@ -79,6 +83,8 @@ const ERROR_PASSIVE: u16 = 128;
 const TRANSMIT_ERROR: u16 = 8;
 /// CAN in error passive mode.
 const PASSIVE_MODE: u16 = 0x8120;
+/// The sender of injected frames, beyond all node numbers.
+const OTHER: u8 = 0xff;
 
 /// The application of a gateway: CANopen master, its nodes and the CAN bus between them.
 #[derive(Debug, Clone)]
@@ -110,6 +116,9 @@ pub struct Gateway {
     heartbeat: u64,
     transmit_errors: u16,
     log: VecDeque<(Nanos, CanFrame)>,
+    disturbance: fault::Disturbance,
+    /// Slave mode: the control word permits OPERATIONAL.
+    permitted: bool,
 }
 
 impl Gateway {
@@ -154,6 +163,8 @@ impl Gateway {
             heartbeat: u64::MAX,
             transmit_errors: 0,
             log: VecDeque::with_capacity(LOG),
+            disturbance: fault::Disturbance::default(),
+            permitted: false,
             options,
         };
         gateway.d = gateway.factory();
@@ -212,6 +223,7 @@ impl Gateway {
             self.d.restore(&self.stored, 0x1000..=0x1fff);
         }
         self.bus.forget(self.options.node_id);
+        self.permitted = false;
         self.nmt = NmtState::Initialising;
         self.ready = now + INITIALISATION_NS;
         (self.sync, self.heartbeat) = (u64::MAX, u64::MAX);
@@ -279,13 +291,15 @@ impl Gateway {
 
     fn step_bus(&mut self, now: u64) {
         let (own, rate) = (self.options.node_id, self.options.bit_rate);
-        let listens = self.nmt != NmtState::Initialising;
+        let connected = !self.disturbance.open;
+        let listens = connected && self.nmt != NmtState::Initialising;
         let nodes = &self.nodes;
         let sent = self.bus.step(|from| {
             (listens && from != own)
-                || nodes
-                    .iter()
-                    .any(|node| node.id() != from && node.is_on_bus(rate))
+                || ((from != own || connected)
+                    && nodes
+                        .iter()
+                        .any(|node| node.id() != from && node.is_on_bus(rate)))
         });
         let Some(sent) = sent else { return };
         if sent.from == own {
@@ -298,6 +312,9 @@ impl Gateway {
             self.log.pop_front();
         }
         self.log.push_back((now, sent.frame));
+        if let Some(trace) = &self.options.trace {
+            trace.push(now, sent.frame);
+        }
         for node in &mut self.nodes {
             if node.id() != sent.from && node.is_on_bus(rate) {
                 node.receive(&sent.frame, now, &mut self.bus);
@@ -328,6 +345,7 @@ impl Gateway {
     fn hear(&mut self, frame: &CanFrame, now: u64) {
         let node = (frame.id & 0x7f) as u8;
         match (frame.id, frame.data()) {
+            (0, &[specifier, node]) => self.nmt_service(specifier, node, now),
             (0x581..0x600, _) => self.sdo_response(node, frame, now),
             (0x701..0x780, [byte]) => self.heard(node, *byte, now),
             _ => self.take_pdo(frame, now),
@@ -431,6 +449,11 @@ impl Gateway {
     /// end.
     pub fn frames(&self) -> impl Iterator<Item = (Nanos, CanFrame)> + '_ {
         self.log.iter().copied()
+    }
+
+    /// Puts a frame of another participant on the secondary network, such as another NMT master.
+    pub fn inject(&mut self, frame: CanFrame) {
+        self.bus.send(OTHER, frame, self.now);
     }
 
     /// Switches a node's power off or on. A node that gets power boots.

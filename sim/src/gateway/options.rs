@@ -6,6 +6,7 @@ use ecaxis_esi::model::Device;
 use super::anybus::{BYTES_AN_OBJECT, MAX_SIZE, MIN_SIZE};
 use super::node::{Epos, RECEIVABLE, RECEIVE_COBS, TRANSMIT_COBS, TRANSMITTABLE};
 use super::pdo::{INVALID, mapping};
+use super::trace::CanTrace;
 use crate::drive::PlantParams;
 
 /// A value for one subindex.
@@ -41,6 +42,8 @@ pub struct GatewayOptions {
     pub nodes: Vec<NodeOptions>,
     /// Further objects of the gateway's CANopen dictionary, written last.
     pub objects: Vec<(u16, u8, Vec<u8>)>,
+    /// Collects every frame of the network.
+    pub trace: Option<CanTrace>,
 }
 
 impl Default for GatewayOptions {
@@ -55,6 +58,7 @@ impl Default for GatewayOptions {
             start_up: 1,
             nodes: Vec::new(),
             objects: Vec::new(),
+            trace: None,
         }
     }
 }
@@ -94,6 +98,11 @@ pub struct NodeOptions {
     pub mandatory: bool,
     /// The node is configured and started again when it comes back.
     pub restart: bool,
+    /// The node is reset to factory values before its configuration (0x1F81 bit 7).
+    pub factory: bool,
+    /// The expected date and time of the configuration (0x1F26, 0x1F27). A node with these values
+    /// in 0x1020 is not configured again. 0: not compared.
+    pub configured: [u32; 2],
     /// Its transmit PDOs, mapped to the input data.
     pub inputs: Vec<PdoLink>,
     /// Its receive PDOs, mapped to the output data.
@@ -113,6 +122,8 @@ impl NodeOptions {
             supervision: Supervision::Heartbeat { period_ms: 100 },
             mandatory: false,
             restart: true,
+            factory: false,
+            configured: [0; 2],
             inputs: Vec::new(),
             outputs: Vec::new(),
             objects: Vec::new(),
@@ -317,7 +328,12 @@ impl GatewayOptions {
         let (mut inputs, mut outputs) = (0, 0);
         for (n, node) in (1..).zip(&self.nodes) {
             let mut dcf = Vec::new();
-            let mut assignment = 1 | u32::from(node.restart) << 2 | u32::from(node.mandatory) << 3;
+            let mut assignment = 1
+                | u32::from(node.restart) << 2
+                | u32::from(node.mandatory) << 3
+                | u32::from(node.factory) << 7;
+            let expected = [0x1f26, 0x1f27].into_iter().zip(node.configured);
+            gateway.extend(expected.map(|(index, value)| u32_(index, node.id, value)));
             match node.supervision {
                 Supervision::None => {}
                 Supervision::Heartbeat { period_ms } => {

@@ -151,7 +151,8 @@ fn slave_module_commands_only_itself() {
     assert_eq!(line.command(0x01, 2), None);
     assert_eq!(line.command(0x10, 2), None);
     assert_eq!(line.command(0x01, 0), Some(0x01));
-    assert_eq!(line.command(0x10, 0), Some(0x11));
+    // It is permitted to become OPERATIONAL, and no NMT master has started it.
+    assert_eq!(line.command(0x10, 0), Some(0x10));
     assert_eq!(line.node(2).nmt_state(), NmtState::PreOperational);
 }
 

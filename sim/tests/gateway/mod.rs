@@ -3,6 +3,7 @@
 mod commands;
 mod ethercat;
 mod nodes;
+mod slave;
 mod supervision;
 
 use crate::common::*;

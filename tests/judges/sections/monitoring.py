@@ -61,7 +61,11 @@ def scrape(bench, folder):
     """Returns the metrics before and after a drive's fault."""
     faults = folder / "faults.toml"
     faults.write_text(FAULT)
-    command = [str(bench.program), "serve", str(rig.ROOT / "configs/demo.toml"), "--sim", "--http", "127.0.0.1:0"]
+    # A ring has metrics of its own.
+    machine = folder / "ring.toml"
+    text = (rig.ROOT / "configs/demo.toml").read_text().replace("[bus]", '[bus]\nredundant = "second"', 1)
+    machine.write_text(text.replace('"esi/', f'"{rig.ROOT}/configs/esi/'))
+    command = [str(bench.program), "serve", str(machine), "--sim", "--http", "127.0.0.1:0"]
     command += ["--socket", str(folder / "s.sock"), "--faults", str(faults)]
     with rig.process(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as child:
         url = child.stdout.readline().split("#")[0] + "metrics"

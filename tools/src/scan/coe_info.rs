@@ -11,6 +11,9 @@ const DETECTED: u16 = 0xf050;
 
 const MAXON: u32 = 0xfb;
 
+/// The PDOs of a gateway in each direction, 128 bytes each.
+const GATEWAY_PDOS: u16 = 4;
+
 /// `None`: the object is missing or not readable.
 #[derive(Debug, Clone, Default)]
 pub struct CoeInfo {
@@ -26,6 +29,20 @@ pub struct CoeInfo {
     pub detected: Option<Vec<u32>>,
     /// The answers of a CiA 402 drive.
     pub drive: Option<DriveInfo>,
+    /// The process data of a CANopen gateway.
+    pub gateway: Option<GatewayInfo>,
+}
+
+/// Sizes and state of a CANopen gateway. It shows no object of its CANopen side, such as 0x3000.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct GatewayInfo {
+    /// Bytes of its inputs and outputs, control and status word included.
+    pub inputs: u16,
+    pub outputs: u16,
+    /// The first byte of the status word: toggle bit, command, extension.
+    pub status: u8,
+    /// The lowest node in error, 0 without one.
+    pub error_node: u8,
 }
 
 /// Units and limits of a drive.
@@ -69,13 +86,47 @@ pub(super) async fn ask(
         configured: coe.upload_list(wire, CONFIGURED).await?,
         detected: coe.upload_list(wire, DETECTED).await?,
         drive: None,
+        gateway: None,
     };
     let profile = answers.device_type.map(|t| t & 0xffff);
     if profile == Some(402) || device.says_drive() {
         let maxon = device.identity().is_some_and(|i| i.vendor == MAXON);
         answers.drive = Some(drive(wire, coe, maxon).await?);
     }
+    // A gateway has no profile.
+    if answers.device_type == Some(0) {
+        answers.gateway = gateway(wire, coe).await?;
+    }
     Ok(answers)
+}
+
+/// Returns `None` if the process data are not the bytes of a gateway.
+async fn gateway(
+    wire: &impl MailboxTransport,
+    coe: &mut CoeClient,
+) -> Result<Option<GatewayInfo>, SdoError> {
+    let mut sizes = [0; 2];
+    for (size, (pdo, byte)) in sizes
+        .iter_mut()
+        .zip([(0x1a00, 0x2000_0108), (0x1600, 0x2100_0108)])
+    {
+        if coe.upload_integer(wire, pdo, 1).await? != Some(byte) {
+            return Ok(None);
+        }
+        for n in 0..GATEWAY_PDOS {
+            let bytes = coe.upload_integer(wire, pdo + n, 0).await?;
+            *size += bytes.and_then(|n| u16::try_from(n).ok()).unwrap_or(0);
+        }
+    }
+    let status = coe.upload_integer(wire, 0x2000, 1).await?;
+    let error_node = coe.upload_integer(wire, 0x2000, 2).await?;
+    let [inputs, outputs] = sizes;
+    Ok(Some(GatewayInfo {
+        inputs,
+        outputs,
+        status: status.unwrap_or(0) as u8,
+        error_node: error_node.unwrap_or(0) as u8,
+    }))
 }
 
 async fn drive(

@@ -35,7 +35,7 @@ pub mod registers;
 pub(crate) mod tests;
 pub mod write;
 
-pub use coe_info::{CoeInfo, DriveInfo};
+pub use coe_info::{CoeInfo, DriveInfo, GatewayInfo};
 pub use esi_match::EsiMatch;
 pub use other_main_device::MainDeviceEvidence;
 use registers::{CONTROLLER_BYTES, Controller};

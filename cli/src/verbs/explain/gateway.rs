@@ -42,6 +42,20 @@ pub(super) fn network(
         paths(node, start, &mut table);
     }
     out.table(table);
+    let mut held = Table::new("node|object|value");
+    for node in &gateway.nodes {
+        for (index, sub, data) in &node.objects {
+            let value = data
+                .iter()
+                .rev()
+                .fold(0_u64, |value, byte| value << 8 | u64::from(*byte));
+            held.row(cells![node.id, ecaxis_esi::address(*index, *sub), value]);
+        }
+    }
+    if !held.is_empty() {
+        out.line("the configuration tool of the gateway must write to the drives:");
+        out.table(held);
+    }
 }
 
 /// Adds the path of each object of a node.

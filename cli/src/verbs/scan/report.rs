@@ -96,6 +96,12 @@ fn answers(answers: &CoeInfo) -> Value {
         "software": answers.software,
         "modules": { "configured": answers.configured, "detected": answers.detected },
         "drive": answers.drive.as_ref().map(drive),
+        "gateway": answers.gateway.map(|gateway| json!({
+            "inputs": gateway.inputs,
+            "outputs": gateway.outputs,
+            "status": gateway.status,
+            "error_node": gateway.error_node,
+        })),
     })
 }
 

@@ -36,6 +36,7 @@ pub(super) fn document(seen: &ScanResult) -> Document {
     let mut places = Table::new("pos|address|alias|id|at|open ports|delay|clock|mailbox");
     let mut descriptions = Table::new("pos|ESI file|revision|out|in|axis");
     let mut answers = Table::new("pos|name|hardware|software|modules");
+    let mut gateways = Table::new("pos|gateway inputs|gateway outputs|status word|node in error");
     let mut drives =
         Table::new("pos|modes|counts/turn|velocity in|position range|speed|torque|window");
     for (device, described) in seen.devices() {
@@ -51,6 +52,16 @@ pub(super) fn document(seen: &ScanResult) -> Document {
                 or_dash(modules(info, described)),
             ]);
             drives_row(device, info, &mut drives);
+            if let Some(gateway) = &info.gateway {
+                let node = Some(gateway.error_node).filter(|node| *node != 0);
+                gateways.row(cells![
+                    device.position(),
+                    format!("{} B", gateway.inputs),
+                    format!("{} B", gateway.outputs),
+                    format!("0x{:02x}", gateway.status),
+                    node.map_or_else(|| "-".to_owned(), |node| node.to_string()),
+                ]);
+            }
         }
     }
     out.gap();
@@ -60,7 +71,7 @@ pub(super) fn document(seen: &ScanResult) -> Document {
         Some((id, vendor(esi, id)?))
     }));
     out.gap();
-    for table in [places, descriptions, answers] {
+    for table in [places, descriptions, answers, gateways] {
         out.table(table);
     }
     if !drives.is_empty() {

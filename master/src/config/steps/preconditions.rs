@@ -205,8 +205,14 @@ impl ProgramState<'_, '_, '_, '_> {
                 relative,
                 targets,
                 together,
+                speed,
+                ramp,
                 ..
             } => {
+                let paced = (*speed, *ramp) != (1.0, 1.0);
+                for (axis, _) in targets.iter().filter(|_| paced) {
+                    self.free_profile(step, *axis);
+                }
                 let what = if *together {
                     TargetKind::SetPoint
                 } else {
@@ -367,6 +373,23 @@ impl ProgramState<'_, '_, '_, '_> {
                 state.stops();
                 state.position = to.filter(|_| !modulo);
             });
+        }
+    }
+
+    /// Rejects a speed or ramp for a drive that moves with its own.
+    fn free_profile(&mut self, step: &Step, axis: AxisIndex) {
+        let (Some(state), Some(setup)) = (self.state(axis), self.axis(axis)) else {
+            return;
+        };
+        if state.mode == Some(Mode::Pp) && setup.config.profile_fixed {
+            let name = self.name(axis);
+            let message = format!(
+                "`{name}` moves with the speed and ramp of its drive in mode \"pp\"{}",
+                self.round()
+            );
+            let hint =
+                "leave `speed` and `ramp` out, or switch it before: `mode = { … = \"csp\" }`";
+            self.refuse(step, axis, message, hint.to_owned());
         }
     }
 

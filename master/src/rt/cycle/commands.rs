@@ -9,6 +9,7 @@ use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::{COMMANDS_PER_CYCLE, Event, RtCommand};
 use crate::rt::exchange::SubDeviceDiagnostics;
 use crate::rt::flight_recorder::Trigger;
+use crate::rt::gateway::Gateway;
 use crate::rt::reaction_group::{ActiveStop, ReactionGroup, check_permitted};
 use crate::rt::setpoint_generator::{self, GeneratorRequest};
 
@@ -64,6 +65,7 @@ impl Engine {
                 self.exchange.expect_op(false);
                 self.axes.iter_mut().for_each(RtAxis::disarm);
             }
+            RtCommand::EndGateways => self.gateways.iter_mut().for_each(Gateway::end),
             RtCommand::Stop => self.stop(None, StopCause::Requested),
             RtCommand::ErrorCode { axis, code } => {
                 if let Some(slot) = self.axes.get_mut(axis) {

@@ -2,6 +2,7 @@
 //! error control.
 
 use super::super::concise;
+use super::super::nmt::NmtCommand;
 use super::super::{Abort, Gateway};
 use super::{Boot, Purpose, Request};
 
@@ -20,6 +21,9 @@ const IDENTITY: [(u16, u8, u16); 5] = [
     (0x1018, 4, 0x1f88),
 ];
 
+/// A subindex of 0x1020 (verify configuration), and the object with its expected value.
+const CONFIGURED: [(u8, u16); 2] = [(1, 0x1f26), (2, 0x1f27)];
+
 impl Gateway {
     pub(super) fn booted(&mut self, node: u8, now: u64) {
         let assignment = self.assignment(node);
@@ -34,6 +38,8 @@ impl Gateway {
         if slave.boot != Boot::Waiting && assignment & 1 << 2 == 0 {
             return;
         }
+        // A node that restarts by itself may have other values again.
+        slave.restored &= slave.boot == Boot::Waiting;
         // A restarted node does not answer earlier requests.
         self.master.forget(Some(node));
         let Some(slave) = self.master.slave(node) else {
@@ -54,6 +60,8 @@ impl Gateway {
 
     /// Sends the next request of a slave's boot, or ends the boot.
     fn boot_on(&mut self, node: u8, now: u64) {
+        let assignment = self.assignment(node);
+        let expected = CONFIGURED.map(|(_, object)| self.d.get(object, node) as u32);
         let Some(slave) = self.master.slaves.get_mut(usize::from(node)) else {
             return;
         };
@@ -67,7 +75,26 @@ impl Gateway {
                 let (index, sub) = (*index, *sub);
                 return self.enqueue(node, index, sub, None, Purpose::Boot, now);
             }
-            slave.boot = Boot::Settings(0);
+            let restores = assignment & 1 << 7 != 0 && !slave.restored;
+            slave.boot = if restores {
+                Boot::Factory
+            } else {
+                Boot::Configured(0)
+            };
+        }
+        if slave.boot == Boot::Factory {
+            let load = b"load".to_vec();
+            return self.enqueue(node, 0x1011, 1, Some(load), Purpose::Boot, now);
+        }
+        if let Boot::Configured(line) = slave.boot {
+            match CONFIGURED.get(line) {
+                Some((sub, _)) if expected.iter().any(|value| *value != 0) => {
+                    return self.enqueue(node, 0x1020, *sub, None, Purpose::Boot, now);
+                }
+                // Both are as expected: the node keeps its configuration.
+                None => slave.boot = Boot::Settings(slave.settings.len()),
+                Some(_) => slave.boot = Boot::Settings(0),
+            }
         }
         if let Boot::Settings(n) = slave.boot {
             if let Some((index, sub, data)) = slave.settings.get(n).cloned() {
@@ -89,11 +116,36 @@ impl Gateway {
     ) {
         let node = request.node;
         let expected = IDENTITY.map(|(.., object)| self.d.get(object, node) as u32);
+        let configured = CONFIGURED.map(|(_, object)| self.d.get(object, node) as u32);
         let Some(slave) = self.master.slave(node) else {
             return;
         };
         match (&mut slave.boot, result) {
-            (boot @ (Boot::Identity(_) | Boot::Settings(_)), Err(abort)) => {
+            // Factory values take effect after a reset.
+            (Boot::Factory, Ok(_)) => {
+                slave.restored = true;
+                self.nmt(NmtCommand::ResetNode, node, now);
+            }
+            // A node without 0x1020 is configured each time.
+            (Boot::Configured(_), Err(abort)) if abort != Abort::TIMEOUT => {
+                slave.boot = Boot::Settings(0);
+                self.boot_on(node, now);
+            }
+            (Boot::Configured(line), Ok(data)) => {
+                let found = data.iter().rev().fold(0u32, |v, b| v << 8 | u32::from(*b));
+                let same = configured.get(*line) == Some(&found);
+                slave.boot = if same {
+                    Boot::Configured(*line + 1)
+                } else {
+                    Boot::Settings(0)
+                };
+                self.boot_on(node, now);
+            }
+            (
+                boot
+                @ (Boot::Identity(_) | Boot::Factory | Boot::Configured(_) | Boot::Settings(_)),
+                Err(abort),
+            ) => {
                 *boot = Boot::Refused;
                 let error = if abort == Abort::TIMEOUT {
                     SDO_TIMEOUT

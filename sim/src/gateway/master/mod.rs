@@ -18,10 +18,17 @@ use super::options::Setting;
 use super::sdo::Client;
 use super::{Abort, Gateway};
 
+/// The control word does not permit OPERATIONAL (slave mode).
+const NOT_PERMITTED: u16 = 0xff10;
+
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 enum Boot {
     #[default]
     Waiting,
+    /// Resets the node to its factory values.
+    Factory,
+    /// Compares this line of the configuration's date and time.
+    Configured(usize),
     /// Reads this line of the identity.
     Identity(usize),
     /// Writes this setting.
@@ -53,6 +60,8 @@ struct Slave {
     /// The last reported state.
     state: Option<u8>,
     error: bool,
+    /// The node has its factory values.
+    restored: bool,
 }
 
 impl Default for Slave {
@@ -65,6 +74,7 @@ impl Default for Slave {
             guard: None,
             state: None,
             error: false,
+            restored: false,
         }
     }
 }
@@ -228,6 +238,11 @@ impl Gateway {
             return false;
         }
         match target {
+            Target::Module if !self.is_master() => match command {
+                NmtCommand::Start => self.permit(true, now),
+                NmtCommand::EnterPreOperational | NmtCommand::Stop => self.permit(false, now),
+                reset => self.change_own(reset, now),
+            },
             Target::Module => self.change_own(command, now),
             // A module that is not the master can command only itself.
             _ if !self.is_master() => return false,
@@ -256,6 +271,33 @@ impl Gateway {
                     self.start_pdos();
                     self.start_slaves(now);
                 }
+            }
+        }
+    }
+
+    /// Slave mode: the control word permits or forbids OPERATIONAL.
+    pub(super) fn permit(&mut self, permitted: bool, now: u64) {
+        self.permitted = permitted;
+        if !permitted && self.nmt == NmtState::Operational {
+            self.nmt = NmtState::PreOperational;
+            self.emergency(NOT_PERMITTED, 0, now);
+        }
+    }
+
+    /// Slave mode: handles a command of the NMT master.
+    pub(super) fn nmt_service(&mut self, specifier: u8, node: u8, now: u64) {
+        let own = node == 0 || node == self.options.node_id;
+        let Some(command) = NmtCommand::from_specifier(specifier) else {
+            return;
+        };
+        match command {
+            _ if self.is_master() || !own => {}
+            NmtCommand::Start if !self.permitted => self.emergency(NOT_PERMITTED, 0, now),
+            command => {
+                let permitted = self.permitted;
+                self.change_own(command, now);
+                // The control word outlasts a reset over the secondary network.
+                self.permitted = permitted;
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use super::super::can::CanFrame;
 use super::super::control::Target;
-use super::super::nmt::NmtCommand;
+use super::super::nmt::{NmtCommand, NmtState};
 use super::super::{Abort, Gateway, MS};
 use super::Guard;
 
@@ -131,6 +131,10 @@ impl Gateway {
         }
         self.emergency(ERROR_CONTROL, u16::from(node), now);
         if !self.is_master() {
+            // A slave leaves OPERATIONAL and waits (§6.4.1).
+            if self.nmt == NmtState::Operational {
+                self.nmt = NmtState::PreOperational;
+            }
             return;
         }
         let mandatory = assignment & 1 << 3 != 0;

@@ -170,6 +170,9 @@ pub(super) fn dictionary(model: Epos, id: u8, serial: u32, bit_rate: u32) -> Dic
     for (sub, value) in (1..).zip(identity) {
         d.add(0x1018, sub, U32, Ro, value);
     }
+    d.add(0x1020, 0, U8, Ro, 2);
+    d.add(0x1020, 1, U32, Rw, 0);
+    d.add(0x1020, 2, U32, Rw, 0);
     d.add(0x1200, 0, U8, Ro, 2);
     d.add(0x1200, 1, U32, Ro, 0x600 + node);
     d.add(0x1200, 2, U32, Ro, 0x580 + node);

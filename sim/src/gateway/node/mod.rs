@@ -74,6 +74,8 @@ pub struct Node {
     master: u64,
     guard_toggle: bool,
     bit_rate: u32,
+    /// The node sends no heartbeat.
+    muted: bool,
 }
 
 impl Node {
@@ -107,6 +109,7 @@ impl Node {
             master: u64::MAX,
             guard_toggle: false,
             bit_rate: settings.bit_rate,
+            muted: false,
             settings,
         };
         node.power_on(0);
@@ -232,9 +235,21 @@ impl Node {
         }
     }
 
+    /// Ends or restarts the heartbeat.
+    pub(super) fn mute(&mut self, muted: bool, now: u64) {
+        self.muted = muted;
+        if self.nmt != NmtState::Initialising {
+            self.start_heartbeat(now);
+        }
+    }
+
     fn start_heartbeat(&mut self, now: u64) {
         let period = self.d.get(0x1017, 0).cast_unsigned() * MS;
-        self.heartbeat = if period > 0 { now + period } else { u64::MAX };
+        self.heartbeat = if period > 0 && !self.muted {
+            now + period
+        } else {
+            u64::MAX
+        };
     }
 
     fn control(&mut self, bus: &mut CanBus, now: u64) {

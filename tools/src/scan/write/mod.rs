@@ -269,11 +269,33 @@ pub fn device_section(
         ));
     }
     let mut text = lines.text();
+    text += &described.map_or_else(String::new, |described| gateway(device, described));
     if let (Some(_), Some(described)) = (named.mode, described) {
         text += "\n";
         text += &axis::section(device, described);
     }
     text
+}
+
+/// Returns the data sizes of a gateway that are not those of its ESI.
+fn gateway(device: &Device, described: &EsiMatch) -> String {
+    let answers = device
+        .answers
+        .as_ref()
+        .and_then(|answers| answers.as_ref().ok());
+    let Some(gateway) = answers.and_then(|answers| answers.gateway) else {
+        return String::new();
+    };
+    let (inputs, outputs) = (gateway.inputs.into(), gateway.outputs.into());
+    let layout = selection(described, None, CYCLES[0]).map(|selection| selection.layout);
+    if layout.is_some_and(|own| (own.tx_bytes(), own.rx_bytes()) == (inputs, outputs)) {
+        return String::new();
+    }
+    let mut lines = TomlWriter::default();
+    lines.header("[device.can]");
+    lines.add("inputs", &inputs.to_string(), "as the gateway maps them");
+    lines.add("outputs", &outputs.to_string(), "");
+    format!("\n{}", lines.text())
 }
 
 /// Adds `esi` and the keys that select the device.
