@@ -32,7 +32,7 @@ impl KeptParameters {
     ) -> Result<Self, (String, String)> {
         let text = file::read_text(path, MAX_BYTES).map_err(|error| {
             let hint =
-                "paths are relative to the machine file; `ecaxis sdo dump` writes such files";
+                "paths are relative to the machine file; save one with `ecaxis sdo dump` before you add the key";
             (unreadable(path, &error), hint.to_owned())
         })?;
         files
