@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use ecaxis_axis::{CommandError, Mode, State, Statusword, Trip};
 
-use crate::config::{LimitConflict, Step, UnitProblem};
+use crate::config::{LimitConflict, UnitProblem};
 use crate::link::{LinkError, OpenError};
 use crate::mailbox::{DatagramError, InfoError, SdoError};
 use crate::rt::gateway::NodeState;
@@ -15,7 +15,8 @@ use crate::rt::setpoint_generator::GeneratorError;
 use crate::text::rounded;
 
 use super::cause_text::{al_note, by, code_note, list, lost, lost_note, mode_note};
-use super::{DeviceRef, DiagnosisMessage, EepromError, EmergencyReport, StateError, StepRef};
+use super::error_place::{FailedStep, Location};
+use super::{DeviceRef, DiagnosisMessage, EepromError, EmergencyReport, StateError};
 use ecaxis_ecat::al_state::AlState;
 use ecaxis_ecat::al_status_code::al_status_text;
 use ecaxis_esi::address;
@@ -31,46 +32,6 @@ pub struct Error {
     pub action: Option<&'static str>,
     #[source]
     pub cause: Box<Cause>,
-}
-
-/// The step of a run in which an error occurred.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum FailedStep {
-    BringUp,
-    /// A step of the machine file's program.
-    Program(StepRef),
-}
-
-impl From<&Step> for FailedStep {
-    fn from(step: &Step) -> Self {
-        Self::Program(step.into())
-    }
-}
-
-impl fmt::Display for FailedStep {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::BringUp => f.write_str("bring-up"),
-            Self::Program(step) => step.fmt(f),
-        }
-    }
-}
-
-/// The place of an error.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Location {
-    Device(DeviceRef),
-    /// A device or signal of the machine file, before the bus is known.
-    Name(String),
-}
-
-impl fmt::Display for Location {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Device(device) => device.fmt(f),
-            Self::Name(name) => write!(f, "`{name}`"),
-        }
-    }
 }
 
 struct Prefix<'a, T>(&'a Option<T>);

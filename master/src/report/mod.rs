@@ -13,6 +13,7 @@ mod device_log;
 mod diagnosis_message;
 mod emergencies;
 mod error;
+mod error_place;
 pub mod events;
 mod progress;
 pub(crate) mod summary;
@@ -22,7 +23,8 @@ pub use device_error::{DeviceRef, EepromError, StateError};
 pub use device_log::DeviceLog;
 pub use diagnosis_message::{DiagnosisKind, DiagnosisMessage};
 pub use emergencies::{EmergencyLine, EmergencyLog, EmergencyReport};
-pub use error::{Cause, DriveReport, Error, FailedStep, Location};
+pub use error::{Cause, DriveReport, Error};
+pub use error_place::{FailedStep, Location};
 pub use events::EventLine;
 pub use progress::{
     AxisLine, DevicePlace, Home, Observer, ProbeCapture, Progress, Status, StepRef, UnknownDevice,
