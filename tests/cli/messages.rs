@@ -461,16 +461,13 @@ fn packages_depend_in_one_direction() {
         ("clients/rust", &[]),
         ("tests/support", &below_support),
     ];
-    let root = root();
     let read = |path: &str| -> toml::Table {
-        let text = std::fs::read_to_string(root.join(path)).expect("a manifest");
+        let text = std::fs::read_to_string(root().join(path)).expect("a manifest");
         text.parse().expect("TOML")
     };
     let members = read("Cargo.toml")["workspace"]["members"].clone();
-    assert_eq!(
-        members,
-        toml::Value::from(allowed.map(|(folder, _)| folder).to_vec())
-    );
+    let folders = allowed.map(|(folder, _)| folder).to_vec();
+    assert_eq!(members, toml::Value::from(folders));
     for (folder, allowed) in allowed {
         let manifest = read(&format!("{folder}/Cargo.toml"));
         let targets = manifest.get("target").and_then(|t| t.as_table());
