@@ -24,6 +24,7 @@ use crate::link::replay::Replay;
 use crate::link::sim::{SimLink, SimRing};
 use crate::link::{self, Link, NicWarning, OpenError};
 use crate::recording;
+use crate::rt::image::NumericFormat;
 use crate::sys::rt_thread;
 
 /// Opens the link of the machine. Blocks.
@@ -187,7 +188,11 @@ pub fn simulated_bus(
         let name = &machine.devices[input.device].name;
         if let Some(device) = order.iter().position(|other| other.name == *name) {
             let object = (device, input.field.index, input.field.sub);
-            faults.add_input(object, *value as i64, (*at_ns, *for_ns));
+            let value = match input.kind() {
+                NumericFormat::Real => (*value as f32).to_bits().into(),
+                NumericFormat::Signed | NumericFormat::Unsigned => *value as i64,
+            };
+            faults.add_input(object, value, (*at_ns, *for_ns));
         }
     }
     segment.set_faults(faults);
