@@ -130,7 +130,7 @@ enum Stage {
     #[default]
     Starting,
     Running,
-    /// The command to all nodes waits for its acknowledgement.
+    /// The last command or the command to all nodes waits for its acknowledgement.
     Ending,
     Ended,
 }
@@ -222,10 +222,7 @@ impl Gateway {
     pub fn end(&mut self) {
         self.stage = match self.stage {
             Stage::Starting => Stage::Ended,
-            Stage::Running => {
-                self.command = None;
-                Stage::Ending
-            }
+            Stage::Running => Stage::Ending,
             ending => ending,
         };
     }
@@ -282,13 +279,15 @@ impl Gateway {
     fn take_status(&mut self, status: u8, error: u8) {
         match (self.command, self.stage) {
             (_, Stage::Ended) => return,
-            (None, Stage::Ending) => self.issue(END, status),
             (None, _) => self.issue(START, status),
             (Some([byte, node]), _) if (byte ^ status) & (TOGGLE | COMMAND) == 0 => {
                 self.take_answer([byte & COMMAND, node], status);
             }
             (Some(_), Stage::Running) if self.waiting > self.config.timeout_cycles => {
                 self.lose_all();
+            }
+            (Some(_), Stage::Ending) if self.waiting > self.config.timeout_cycles => {
+                self.issue(END, status);
             }
             (Some(_), _) => {}
         }
@@ -311,6 +310,8 @@ impl Gateway {
         let waits = matches!(state, NodeState::PreOperational | NodeState::Stopped);
         let mut start = None;
         match (self.stage, command) {
+            // A command that replaces an unacknowledged one would have its toggle bit.
+            (Stage::Ending, _) if of != END[1] => return self.issue(END, status),
             (Stage::Ending, _) => {
                 self.stage = Stage::Ended;
                 for state in &mut self.states {

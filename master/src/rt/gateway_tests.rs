@@ -28,6 +28,9 @@ struct Peer {
     /// The executed commands, without toggle bit.
     commands: Vec<[u8; 2]>,
     silent: bool,
+    /// Cycles until a new control word is seen, and those that have passed.
+    delay: u32,
+    waited: u32,
 }
 
 impl Peer {
@@ -40,6 +43,8 @@ impl Peer {
             general: 0,
             commands: Vec::new(),
             silent: false,
+            delay: 0,
+            waited: 0,
         }
     }
 
@@ -47,7 +52,11 @@ impl Peer {
         let mut image = [0; 12];
         gateway.write(&mut image);
         let [byte, node] = [image[4], image[5]];
-        if !self.silent && (byte ^ self.status) & 0x80 != 0 {
+        let new = !self.silent && (byte ^ self.status) & 0x80 != 0;
+        if new && self.waited < self.delay {
+            self.waited += 1;
+        } else if new {
+            self.waited = 0;
             let extension = match byte & 0x70 {
                 0x10 if node == 0 => self.own,
                 0x10 => self.states[NODES.iter().position(|n| *n == node).unwrap()],
@@ -199,6 +208,41 @@ fn the_end_leads_all_nodes_to_pre_operational_and_loses_none() {
     // The summary still has the states when the bus has left Op.
     gateway.observe(&[0; 12], true, false, false);
     assert_eq!(gateway.state(1), NodeState::PreOperational);
+}
+
+/// The end may come while the acknowledgement of any command is under way, or never comes.
+#[test]
+fn the_end_is_acknowledged_by_a_slow_gateway_at_any_moment() {
+    for (delay, before) in (0..8).flat_map(|d| (60..80).map(move |b| (d, b))) {
+        let (mut gateway, mut peer) = (gateway(), Peer::new());
+        peer.delay = delay;
+        for _ in 0..before {
+            peer.cycle(&mut gateway);
+        }
+        gateway.end();
+        for _ in 0..2 * delay + 4 {
+            peer.cycle(&mut gateway);
+        }
+        assert!(gateway.has_ended(), "delay {delay}, end in cycle {before}");
+        assert_eq!(peer.commands.last(), Some(&[0x00, 128]));
+    }
+}
+
+#[test]
+fn a_gateway_without_acknowledgement_receives_the_end() {
+    let (mut gateway, mut peer) = (gateway(), Peer::new());
+    for _ in 0..20 {
+        peer.cycle(&mut gateway);
+    }
+    peer.silent = true;
+    peer.cycle(&mut gateway);
+    gateway.end();
+    let mut image = [0; 12];
+    for _ in 0..TIMEOUT + 2 {
+        peer.cycle(&mut gateway);
+        gateway.write(&mut image);
+    }
+    assert_eq!((image[4] & 0x7f, image[5]), (0x00, 128));
 }
 
 #[test]
