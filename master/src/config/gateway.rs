@@ -13,15 +13,17 @@ use toml::Spanned;
 use super::device::CheckedAxis;
 use super::duration::show;
 use super::fields::{Domain, Field, Key, KeyExt, Ns, Read, Table, TableKey, Value, Written};
-use super::problem::{Problems, Span, list, suggestion};
-use super::raw::{AxisTables, RawAxis, RawDevice, RawEntry, RawSdo};
+use super::problem::{Problems, Span, list};
+use super::raw::{AxisTables, RawAxis, RawDevice, RawSdo};
 use super::schema::{self, Schema};
 use super::{AxisSetup, axis, sdo};
 
 mod load;
 mod mode;
+mod values;
 
 use load::{MAX_LOAD, load};
+pub(crate) use values::{Heartbeat, MappableObject};
 
 const MS: Ns = 1_000_000;
 
@@ -40,7 +42,7 @@ table! { "[device.can]",
         outputs: Key<u16> [2..=512],
         /// Node-ID of the gateway (1 to 127; default 99)
         node_id: Key<u8> [1..=127],
-        /// Period of the gateway's own heartbeat (time, 10 ms to 65 s; default none)
+        /// Period of the gateway's own heartbeat (time, 10 ms to 65 s, `"0ms"` for none; default `"0ms"`)
         heartbeat: Option<Heartbeat>,
         /// Start-up behaviour as in 0x1F80: bit 0 is the NMT master, bit 3 leaves the start of the
         /// nodes to ecaxis (0 to 127; default 1)
@@ -59,7 +61,7 @@ table! { "[[device.node]]",
         drive: Spanned<Epos> = "\"EPOS 24/5\"",
         /// Mode of operation of its axis (`"csp"`, `"pp"`; default `"csp"`)
         mode: Option<Spanned<String>>,
-        /// Period of the heartbeat (time, 10 ms to 65 s; default `"50ms"`)
+        /// Period of the heartbeat (time, 10 ms to 65 s, `"0ms"` for none; default `"50ms"`)
         heartbeat: Option<Heartbeat>,
         /// Period of node guarding, instead of a heartbeat (time, 10 ms to 65 s; default none)
         guarding: Option<Heartbeat>,
@@ -73,6 +75,9 @@ table! { "[[device.node]]",
         /// If true, the gateway resets the node to factory values first, as in 0x1F81 bit 7 (true,
         /// false; default false)
         factory: Option<bool>,
+        /// If true, the drive has no number at its switches; the gateway assigns `id` by layer setting
+        /// services (true, false; default false)
+        lss: Option<bool>,
         /// Expected date and time of the node's configuration, as in 0x1F26 and 0x1F27 (two numbers;
         /// default none: always configured)
         configured: Option<[u32; 2]>,
@@ -125,46 +130,6 @@ pub(super) struct CheckedNetwork {
     pub axes: Vec<CheckedAxis>,
 }
 
-impl Read for Epos {
-    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
-        let name = String::read(value, key, p)?;
-        let found = Self::from_name(&name);
-        if found.is_none() {
-            let names = Self::ALL.iter().map(|drive| drive.name());
-            let hint = suggestion(&name, names, "drives");
-            p.add_hint(value.span(), format!("unknown drive `{name}`"), hint);
-        }
-        found
-    }
-}
-
-impl Schema for Epos {
-    fn schema() -> serde_json::Value {
-        schema::words(Self::ALL.map(Self::name))
-    }
-}
-
-/// A period in ms.
-#[derive(Debug)]
-pub(crate) struct Heartbeat(u16);
-
-impl Read for Heartbeat {
-    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
-        let ms = u16::try_from(Ns::read(value, key, p)? / MS).ok();
-        let ms = ms.filter(|ms| *ms >= 10);
-        if ms.is_none() {
-            p.add(value.span(), "a heartbeat takes 10 ms to 65 s");
-        }
-        ms.map(Self)
-    }
-}
-
-impl Schema for Heartbeat {
-    fn schema() -> serde_json::Value {
-        Ns::schema()
-    }
-}
-
 table! { "a PDO of a node",
     row RawLink {
         /// Number of the PDO (1 to 3)
@@ -175,30 +140,6 @@ table! { "a PDO of a node",
         objects: Vec<MappableObject>,
         /// If true, the PDO waits for the SYNC (default: inputs true, outputs false)
         synchronous: Option<bool>,
-    }
-}
-
-/// Index, subindex and bits of an object.
-#[derive(Debug)]
-pub(crate) struct MappableObject(u16, u8, u8);
-
-impl Read for MappableObject {
-    const LIST: &'static str = RawEntry::LIST;
-
-    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
-        let RawEntry { index, sub, .. } = RawEntry::read(value, key, p)?;
-        let bits = Epos::mappable_bits(index, sub);
-        if bits.is_none() {
-            let message = format!("{} cannot be mapped", esi::address(index, sub));
-            p.add(value.span(), message);
-        }
-        bits.map(|bits| Self(index, sub, bits))
-    }
-}
-
-impl Schema for MappableObject {
-    fn schema() -> serde_json::Value {
-        RawEntry::schema()
     }
 }
 
@@ -380,10 +321,12 @@ pub(super) fn check(
         let mut node = NodeOptions::new(raw.id, *raw.drive.get_ref());
         let period_ms = raw.heartbeat.as_ref().map_or(50, |heartbeat| heartbeat.0);
         node.supervision = match &raw.guarding {
+            Some(Heartbeat(0)) => Supervision::None,
             Some(Heartbeat(period_ms)) => Supervision::Guarding {
                 period_ms: *period_ms,
                 retries: raw.retries.unwrap_or(3).max(1),
             },
+            None if period_ms == 0 => Supervision::None,
             None => Supervision::Heartbeat { period_ms },
         };
         if let (Some(_), Some(_)) = (&raw.guarding, &raw.heartbeat) {
@@ -397,6 +340,7 @@ pub(super) fn check(
         node.mandatory = raw.mandatory.unwrap_or(false);
         node.restart = raw.restart.unwrap_or(true);
         node.factory = raw.factory.unwrap_or(false);
+        node.lss = raw.lss.unwrap_or(false);
         node.configured = raw.configured.unwrap_or_default();
         node.objects = objects(&raw.objects, p);
         node.inputs = raw.inputs.iter().map(|raw| link(raw, true)).collect();
@@ -522,6 +466,13 @@ impl CheckedNetwork {
             let at = device.can.start_up.place().unwrap_or(raw.span.clone());
             let message = "an axis behind a gateway needs the gateway as the NMT master";
             p.add_hint(at, message, "set bit 0: `start_up = 1`");
+            return;
+        }
+        let simulated = self.simulated.nodes.get(n);
+        if simulated.is_some_and(|node| node.supervision == Supervision::None) {
+            let message = "an axis behind a gateway needs error control of its node";
+            let hint = "without it, nothing reports a lost node: write `heartbeat = \"50ms\"`";
+            p.add_hint(raw.span.clone(), message, hint);
             return;
         }
         let Some(mode) = mode::start(raw, node, p) else {

@@ -62,6 +62,7 @@ fn axes_behind_a_gateway_reject_what_cannot_work() {
         ("id      = 1\n", "id = 1\nmode = \"csb\"\n", "unknown mode \"csb\"", "did you mean `csp`?"),
         ("id      = 1\n", "id = 1\nmode = \"pp\"\n", "needs 0x607a:00 (target position", "Controlword and 0x607A"),
         ("id      = 1\n", "id = 1\nheartbeat = \"50ms\"\nguarding = \"50ms\"\n", "either a heartbeat or node guarding", ""),
+        ("id      = 1\n", "id = 1\nheartbeat = \"0ms\"\n", "needs error control of its node", "50ms"),
         ("sync     = \"4ms\"", "sync = \"4ms\"\nstart_up = 0", "as the NMT master", "`start_up = 1`"),
         ("sync     = \"4ms\"", "sync = \"4ms\"\ninputs = 16", "do not lie between", ""),
         ("sync     = \"4ms\"", "sync = \"4ms\"\noutputs = 1", "a whole number from 2 to 512", ""),

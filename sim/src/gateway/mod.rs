@@ -10,10 +10,10 @@
 //! * `master`: NMT master: boots, monitors and commands nodes
 //! * `process`, `objects`: the gateway's own PDOs and its SDO server
 //! * `node`: a drive as a CANopen node
-//! * `can`, `sdo`, `pdo`, `nmt`, `dictionary`: the bus and the parts that both ends share
+//! * `can`, `sdo`, `pdo`, `nmt`, `lss`, `dictionary`: the bus and the parts that both ends share
 //!
 //! The secondary network runs in true time between the points at which the gateway forwards data.
-//! The bus has no bit errors, so no controller goes bus-off. The bus has no LSS slave. A gateway
+//! The bus has no bit errors, so no controller goes bus-off. A gateway
 //! that is not the NMT master obeys the one whose frames [`Gateway::inject`] sends.
 //!
 //! ```
@@ -36,6 +36,7 @@ mod control;
 mod dictionary;
 mod exchange;
 mod fault;
+mod lss;
 mod master;
 mod nmt;
 mod node;
@@ -137,6 +138,7 @@ impl Gateway {
                 plant: node.plant,
                 serial: n,
                 bit_rate: options.bit_rate,
+                lss: node.lss,
             })
         });
         let mut gateway = Self {
@@ -347,6 +349,7 @@ impl Gateway {
         match (frame.id, frame.data()) {
             (0, &[specifier, node]) => self.nmt_service(specifier, node, now),
             (0x581..0x600, _) => self.sdo_response(node, frame, now),
+            (lss::SLAVE, _) => self.lss_answer(frame, now),
             (0x701..0x780, [byte]) => self.heard(node, *byte, now),
             _ => self.take_pdo(frame, now),
         }

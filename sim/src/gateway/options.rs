@@ -15,6 +15,9 @@ pub(super) type Setting = (u16, u8, Vec<u8>);
 /// The time in ms by which a heartbeat may be late.
 const HEARTBEAT_MARGIN_MS: u32 = 20;
 
+/// The time after which the gateway looks for nodes without a number.
+const BOOT_TIME_MS: u32 = 500;
+
 /// The bit rates of the gateway's rotary switch, in bit/s.
 pub const BIT_RATES: [u32; 7] = [
     20_000, 50_000, 125_000, 250_000, 500_000, 800_000, 1_000_000,
@@ -100,6 +103,9 @@ pub struct NodeOptions {
     pub restart: bool,
     /// The node is reset to factory values before its configuration (0x1F81 bit 7).
     pub factory: bool,
+    /// The DIP switches of the drive are at 0: the gateway assigns the number by layer setting
+    /// services (manual §6.3).
+    pub lss: bool,
     /// The expected date and time of the configuration (0x1F26, 0x1F27). A node with these values
     /// in 0x1020 is not configured again. 0: not compared.
     pub configured: [u32; 2],
@@ -123,6 +129,7 @@ impl NodeOptions {
             mandatory: false,
             restart: true,
             factory: false,
+            lss: false,
             configured: [0; 2],
             inputs: Vec::new(),
             outputs: Vec::new(),
@@ -347,6 +354,12 @@ impl GatewayOptions {
                 }
             }
             gateway.push(u32_(0x1f81, node.id, assignment));
+            if node.lss {
+                let identity = node.drive.identity(u32::from(n));
+                let expected = (0x1f85..).zip(identity);
+                gateway.extend(expected.map(|(index, part)| u32_(index, node.id, part)));
+                gateway.push(u32_(0x1f89, 0, BOOT_TIME_MS));
+            }
             for (links, way, used, size) in [
                 (&node.inputs, &INPUTS, &mut inputs, input_size),
                 (&node.outputs, &OUTPUTS, &mut outputs, output_size),

@@ -2,6 +2,7 @@
 
 mod commands;
 mod ethercat;
+mod lss;
 mod nodes;
 mod slave;
 mod supervision;

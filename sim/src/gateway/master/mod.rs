@@ -3,9 +3,11 @@
 //!
 //! * here: the data of each node, NMT services, states
 //! * `boot`, `watch`: a slave's boot; error control
+//! * `lss`: numbers for nodes without DIP switches
 //! * `requests`: SDO transfers
 
 mod boot;
+mod lss;
 mod requests;
 mod watch;
 
@@ -115,6 +117,7 @@ pub(super) struct Master {
     queue: VecDeque<Request>,
     active: Option<(Request, Client, u64)>,
     pub(super) results: VecDeque<SdoResult>,
+    lss: lss::Lss,
 }
 
 impl Default for Master {
@@ -124,6 +127,7 @@ impl Default for Master {
             queue: VecDeque::new(),
             active: None,
             results: VecDeque::new(),
+            lss: lss::Lss::default(),
         }
     }
 }
@@ -150,7 +154,7 @@ impl Master {
             let guard = slave.guard.as_ref().map_or(u64::MAX, |guard| guard.next);
             slave.deadline.min(guard)
         });
-        slaves.fold(sdo, u64::min)
+        slaves.fold(sdo.min(self.lss.due), u64::min)
     }
 
     fn slave(&mut self, node: u8) -> Option<&mut Slave> {
@@ -205,6 +209,7 @@ impl Gateway {
         self.load_consumers();
         if self.is_master() {
             self.nmt(NmtCommand::ResetCommunication, 0, now);
+            self.start_boot_time(now);
         }
     }
 

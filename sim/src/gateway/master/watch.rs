@@ -84,6 +84,7 @@ impl Gateway {
 
     /// Handles due events: missing heartbeats, guarding requests, SDO time-outs.
     pub(in super::super) fn step_master(&mut self, now: u64) {
+        self.step_lss(now);
         if self
             .master
             .active

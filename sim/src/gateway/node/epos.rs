@@ -42,6 +42,17 @@ impl Epos {
         }
     }
 
+    /// Returns vendor, product code, revision and serial number (0x1018).
+    pub(in super::super) fn identity(self, serial: u32) -> [u32; 4] {
+        let hardware = self.hardware() << 16;
+        [
+            MAXON as u32,
+            hardware as u32,
+            (FIRMWARE << 16) as u32,
+            serial,
+        ]
+    }
+
     /// Returns the model with this product name ([`Self::name`]).
     #[must_use]
     pub fn from_name(name: &str) -> Option<Self> {
@@ -135,6 +146,20 @@ pub(super) const VOLATILE: [u16; 6] = [0x2030, 0x2062, 0x206b, 0x6040, 0x607a, 0
 pub(in super::super) const RECEIVE_COBS: [i64; 3] = [0x200, 0x300, 0x400];
 pub(in super::super) const TRANSMIT_COBS: [i64; 3] = [0x180, 0x280, 0x380];
 
+/// The objects that carry the node number in their low seven bits.
+pub(super) const NUMBERED: [(u16, u8); 10] = [
+    (0x1014, 0),
+    (0x1200, 1),
+    (0x1200, 2),
+    (0x1400, 1),
+    (0x1401, 1),
+    (0x1402, 1),
+    (0x1800, 1),
+    (0x1801, 1),
+    (0x1802, 1),
+    (0x2000, 0),
+];
+
 /// The bit rates of the values of 0x2001, in bit/s (step 4).
 pub(super) const BIT_RATES: [u32; 7] = [
     1_000_000, 800_000, 500_000, 250_000, 125_000, 50_000, 20_000,
@@ -166,9 +191,8 @@ pub(super) fn dictionary(model: Epos, id: u8, serial: u32, bit_rate: u32) -> Dic
     d.add(0x1016, 1, U32, Rw, 0);
     d.add(0x1017, 0, U16, Rw, 0);
     d.add(0x1018, 0, U8, Ro, 4);
-    let identity = [MAXON, hardware << 16, FIRMWARE << 16, i64::from(serial)];
-    for (sub, value) in (1..).zip(identity) {
-        d.add(0x1018, sub, U32, Ro, value);
+    for (sub, value) in (1..).zip(model.identity(serial)) {
+        d.add(0x1018, sub, U32, Ro, i64::from(value));
     }
     d.add(0x1020, 0, U8, Ro, 2);
     d.add(0x1020, 1, U32, Rw, 0);

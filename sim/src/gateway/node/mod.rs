@@ -3,9 +3,11 @@
 //!
 //! * here: states and communication on the bus
 //! * `epos`: its objects, and their connection to the drive
+//! * `lss`: its number and bit rate by layer setting services
 //! * `objects`: access by SDO clients
 
 mod epos;
+mod lss;
 mod objects;
 #[cfg(test)]
 mod tests;
@@ -16,6 +18,7 @@ pub(super) use objects::{LOAD, SAVE};
 
 use super::can::{CanBus, CanFrame};
 use super::dictionary::{Dictionary, Handle};
+use super::lss::UNNUMBERED;
 use super::nmt::{NmtCommand, NmtState};
 use super::pdo::{self, Pdo};
 use super::sdo::Server;
@@ -42,12 +45,18 @@ pub(super) struct Settings {
     pub(super) serial: u32,
     /// The bit rate in bit/s.
     pub(super) bit_rate: u32,
+    /// The DIP switches are at 0: the node gets its number by layer setting services.
+    pub(super) lss: bool,
 }
 
 /// An EPOS drive as a CANopen node.
 #[derive(Debug, Clone)]
 pub struct Node {
     settings: Settings,
+    /// Its number on the network, and that at power-on.
+    number: u8,
+    stored_number: u8,
+    lss: lss::Lss,
     nmt: NmtState,
     /// The node has power and is connected.
     alive: bool,
@@ -89,7 +98,15 @@ impl Node {
         let mut store = epos::store();
         let drive = Drive::new(&mut store, settings.plant);
         let ties = ObjectBindings::new(&factory, &store, &settings.plant);
+        let number = if settings.lss {
+            UNNUMBERED
+        } else {
+            settings.id
+        };
         let mut node = Self {
+            number: settings.id,
+            stored_number: number,
+            lss: lss::Lss::default(),
             nmt: NmtState::Initialising,
             alive: true,
             online: false,
@@ -116,7 +133,7 @@ impl Node {
         node
     }
 
-    /// Returns the node number.
+    /// Returns the node number in the settings.
     #[must_use]
     pub fn id(&self) -> u8 {
         self.settings.id
@@ -160,6 +177,8 @@ impl Node {
     pub(super) fn power_on(&mut self, now: u64) {
         (self.alive, self.online) = (true, false);
         self.d = self.stored.clone();
+        self.lss = lss::Lss::default();
+        self.set_number(self.stored_number);
         self.store = epos::store();
         self.drive = Drive::new(&mut self.store, self.settings.plant);
         self.tick = now + CONTROL_PERIOD_NS;
@@ -181,6 +200,7 @@ impl Node {
         self.waiting = [None; 3];
         (self.heartbeat, self.life, self.master) = (u64::MAX, u64::MAX, u64::MAX);
         self.guard_toggle = false;
+        self.take_number();
         self.load_pdos();
     }
 
@@ -207,6 +227,7 @@ impl Node {
             .min(self.heartbeat)
             .min(self.life)
             .min(self.master)
+            .min(self.lss.due())
     }
 
     /// Handles all events that are due at `now`.
@@ -215,8 +236,12 @@ impl Node {
             self.tick += CONTROL_PERIOD_NS;
             self.control(bus, now);
         }
+        self.step_lss(now);
         if self.nmt == NmtState::Initialising {
-            if self.ready <= now {
+            if self.ready <= now && self.number == UNNUMBERED {
+                // Nothing but layer setting services.
+                (self.online, self.ready) = (true, u64::MAX);
+            } else if self.ready <= now {
                 self.nmt = NmtState::PreOperational;
                 self.online = true;
                 self.send(bus, 0x700, &[0], now);
@@ -284,16 +309,17 @@ impl Node {
 
     /// Sends a frame with the node's own number in the identifier.
     fn send(&mut self, bus: &mut CanBus, base: u16, data: &[u8], now: u64) {
-        let id = base + u16::from(self.settings.id);
+        let id = base + u16::from(self.number);
         bus.send(self.settings.id, CanFrame::new(id, data), now);
     }
 
     /// Handles a frame from another node.
     pub(super) fn receive(&mut self, frame: &CanFrame, now: u64, bus: &mut CanBus) {
+        self.lss_request(frame, now, bus);
         if self.nmt == NmtState::Initialising {
             return;
         }
-        let own = u16::from(self.settings.id);
+        let own = u16::from(self.number);
         let operational = self.nmt == NmtState::Operational;
         match (frame.id, frame.remote) {
             (0, false) => self.network_management(frame, now, bus),
@@ -313,7 +339,7 @@ impl Node {
         let &[specifier, node] = frame.data() else {
             return;
         };
-        if node != 0 && node != self.settings.id {
+        if node != 0 && node != self.number {
             return;
         }
         let command = NmtCommand::from_specifier(specifier);

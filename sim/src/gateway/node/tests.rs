@@ -14,6 +14,7 @@ fn node() -> (Node, CanBus) {
         plant: drive.plant(),
         serial: 1,
         bit_rate: 500_000,
+        lss: false,
     });
     let mut bus = CanBus::new(500_000);
     while node.due() <= BOOT_NS {
