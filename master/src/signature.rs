@@ -26,7 +26,7 @@ const MAX_SIGNATURE_BYTES: u64 = 16 << 10;
 pub enum SignedKind {
     /// The machine file.
     Machine,
-    /// ESI files, and EEPROM images that a machine file names.
+    /// ESI files, and EEPROM images and EDS files that a machine file names.
     Esi,
     /// Set-point tables that a machine file names.
     Tables,

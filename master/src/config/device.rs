@@ -75,7 +75,14 @@ pub(crate) fn check(
         };
         sim::check(sim, names, axis, p)
     });
-    let network = gateway::check(&raw, device, chosen.as_mut(), files.cycle.as_ref(), p);
+    let network = gateway::check(
+        &raw,
+        device,
+        chosen.as_mut(),
+        files.cycle.as_ref(),
+        files.folder(),
+        p,
+    );
     let startup = Startup::of(&raw);
     let parameters = files.parameters(&raw, device, p);
     let device = device.map(|d| Arc::new(d.clone()));

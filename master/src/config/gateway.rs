@@ -5,6 +5,8 @@
 //! The file repeats that: a node gets a process data layout of its own, with offsets in the
 //! gateway's process data. Its axis is then an axis like any other.
 
+use std::path::Path;
+
 use ecaxis_esi as esi;
 use ecaxis_esi::layout::{Field as ObjectField, Layout};
 use ecaxis_sim::gateway::{BIT_RATES, Epos, GatewayOptions, NodeOptions, PdoLink, Supervision};
@@ -18,10 +20,12 @@ use super::raw::{AxisTables, RawAxis, RawDevice, RawSdo};
 use super::schema::{self, Schema};
 use super::{AxisSetup, axis, sdo};
 
+mod eds;
 mod load;
 mod mode;
 mod values;
 
+use eds::Eds;
 use load::{MAX_LOAD, load};
 pub(crate) use values::{Heartbeat, MappableObject};
 
@@ -59,6 +63,9 @@ table! { "[[device.node]]",
         id: u8 [1..=127] = "1",
         /// Model of the drive (`"EPOS 24/1"`, `"EPOS 24/5"`, `"EPOS 70/10"`)
         drive: Spanned<Epos> = "\"EPOS 24/5\"",
+        /// EDS file of the drive: contents of PDOs that the file does not list, and objects that a PDO
+        /// can carry (path; default as in the vendor's application note)
+        eds: Option<Spanned<String>>,
         /// Mode of operation of its axis (`"csp"`, `"pp"`; default `"csp"`)
         mode: Option<Spanned<String>>,
         /// Period of the heartbeat (time, 10 ms to 65 s, `"0ms"` for none; default `"50ms"`)
@@ -275,6 +282,7 @@ pub(super) fn check(
     device: Option<&esi::Device>,
     selection: Option<&mut esi::Selection>,
     cycle: Option<&(u64, Span)>,
+    folder: &Path,
     p: &mut Problems<'_>,
 ) -> Option<CheckedNetwork> {
     if !raw.written.has("can") && raw.node.is_empty() {
@@ -345,6 +353,7 @@ pub(super) fn check(
         node.objects = objects(&raw.objects, p);
         node.inputs = raw.inputs.iter().map(|raw| link(raw, true)).collect();
         node.outputs = raw.outputs.iter().map(|raw| link(raw, false)).collect();
+        complete(&mut node, raw, folder, p)?;
         let setup = NodeSetup::new(&node, selection);
         network.simulated.nodes.push(node);
         // Validated after each node, so that the error marks the right one.
@@ -362,6 +371,34 @@ pub(super) fn check(
         network.check_axis(n, node, raw, cycle, p);
     }
     Some(network)
+}
+
+/// Completes the PDOs of a node by its EDS.
+fn complete(
+    node: &mut NodeOptions,
+    raw: &RawNode,
+    folder: &Path,
+    p: &mut Problems<'_>,
+) -> Option<()> {
+    let Some(name) = &raw.eds else {
+        return Some(());
+    };
+    let path = folder.join(name.get_ref());
+    let eds = Eds::read(&path, &mut p.files);
+    let eds = eds.map_err(|(message, hint)| p.add_hint(name.span(), message, hint));
+    let eds = eds.ok()?;
+    let outputs = node.outputs.iter_mut().zip(&raw.outputs);
+    let inputs = node.inputs.iter_mut().zip(&raw.inputs);
+    let links = outputs.map(|pair| (pair, 0x1600));
+    for ((link, raw), first) in links.chain(inputs.map(|pair| (pair, 0x1a00))) {
+        if let Err(error) = eds.complete(link, first) {
+            let message = format!("{}: {error}", path.display());
+            let hint = "compare with the PDO mapping in the drive's documents";
+            p.add_hint(raw.span.clone(), message, hint);
+            return None;
+        }
+    }
+    Some(())
 }
 
 impl CheckedNetwork {

@@ -153,3 +153,28 @@ fn a_node_has_the_objects_of_an_axis_at_offsets_of_the_gateway() {
         lift.config.dead_time_s
     );
 }
+
+/// The EDS fills in what the file leaves out, and its objects are checked.
+#[test]
+fn a_node_with_an_eds_has_its_contents() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let path = root.join("configs/mixed.toml");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let eds = root.join("tests/judges/esi/epos.eds");
+    let text = text.replacen(
+        "id      = 1\n",
+        &format!("id = 1\neds = \"{}\"\n", eds.display()),
+        1,
+    );
+    let machine = parse(&path, &text).unwrap();
+    let gateway = machine.devices[ecaxis_ecat::index::DeviceIndex(2)]
+        .gateway
+        .as_ref();
+    let outputs = &gateway.unwrap().nodes[0].outputs;
+    assert_eq!(outputs[0].contents, [(0x6040, 0, 16), (0x2062, 0, 32)]);
+    let wrong = text.replacen("epos.eds", "epod.eds", 1);
+    let Err(ConfigError::Problems(problems)) = parse(&path, &wrong) else {
+        panic!("the file is missing")
+    };
+    assert!(problems[0].message.contains("epod.eds"), "{problems:?}");
+}

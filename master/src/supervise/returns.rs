@@ -178,6 +178,10 @@ impl RunningSegment {
         let lost = self.lost(searches);
         for (device, search) in searches.enumerate_mut() {
             if !lost.contains(&device) && !search.attempted {
+                // It was cut off for a moment and has stayed in Op.
+                if search.since.is_some() && search.place.is_some() {
+                    self.report_return(device, search);
+                }
                 *search = Search {
                     restarted: search.restarted,
                     replaced: search.replaced,

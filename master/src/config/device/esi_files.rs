@@ -39,6 +39,11 @@ impl<'f> EsiFiles<'f> {
         }
     }
 
+    /// Returns the folder of the machine file.
+    pub fn folder(&self) -> &'f Path {
+        self.folder
+    }
+
     /// Returns the EEPROM image that `sii` names.
     pub fn image(&mut self, raw: &RawDevice, p: &mut Problems<'_>) -> Option<Arc<SiiImage>> {
         let name = raw.sii.as_ref()?;

@@ -24,6 +24,11 @@ impl RunningSegment {
             self.leave_in_init(index).await;
             return (index, done);
         }
+        self.report_return(index, &search);
+        (index, Ok(()))
+    }
+
+    pub(super) fn report_return(&self, index: DeviceIndex, search: &Search) {
         let since = search.since.unwrap_or_else(clock::now);
         let at = self.devices[index].at.clone();
         self.report(Progress::DeviceReturned {
@@ -33,10 +38,9 @@ impl RunningSegment {
             },
             after_ns: clock::now().saturating_sub(since),
             restarted: search.restarted,
-            home: self.home(index, &search),
+            home: self.home(index, search),
             first: search.absent,
         });
-        (index, Ok(()))
     }
 
     /// Returns what a restart has made of the home of the axes.
