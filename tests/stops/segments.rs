@@ -139,7 +139,7 @@ fn a_segment_with_another_device_is_not_driven() {
 #[test]
 fn a_segment_comes_and_goes_without_any_effect_on_the_others() {
     const CYCLES: usize = 16_000;
-    let trials = std::env::var("ECAXIS_TRIALS").map_or(12, |n| n.parse().expect("a number"));
+    let trials = std::env::var("ECAXIS_TRIALS").map_or(16, |n| n.parse().expect("a number"));
     let machine = parse(&text(2));
     let swing = |script: &str, seed| {
         let options = Options {

@@ -262,8 +262,8 @@ impl Exchange {
         };
         frame_set.answer(0)?;
         let found = self.diagnoses.get(device)?;
-        let read = block == DiagnosticRegister::ClockDifference && found.answers;
-        read.then_some((device, found.clock_difference))
+        let read = block == DiagnosticRegister::ClockDifference && found.has_read(block);
+        (read && found.answers).then_some((device, found.clock_difference))
     }
 
     /// Returns the reference clock; `None` without distributed clocks.
@@ -532,8 +532,9 @@ impl Exchange {
             match poll.target {
                 PollTarget::Registers { device, block } => {
                     if let Some(to) = self.diagnoses.get_mut(device) {
-                        to.answers = slot.wkc(first) == 1;
-                        if to.answers {
+                        let answered = slot.wkc(first) == 1;
+                        to.note_answer(block, answered);
+                        if answered {
                             let first = !to.has_read(block);
                             to.take(block, data);
                             if let Some(window) = self.windows.get_mut(device) {

@@ -190,7 +190,7 @@ impl RunningSegment {
                     absent: search.absent,
                     ..Search::default()
                 };
-            } else if search.since.is_none() {
+            } else if search.since.is_none() && clock::now() >= search.not_before {
                 search.since = Some(clock::now());
                 if let Some(place) = search.place {
                     self.report(Progress::DeviceLost {

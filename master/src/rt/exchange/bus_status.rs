@@ -170,8 +170,11 @@ impl Exchange {
         let seen = &self.bus_status.answering;
         seen.store(answering, Ordering::Relaxed);
         for ((member, found), group) in self.diagnoses.enumerate().zip(&self.groups) {
-            self.bus_status
-                .set_presence(member, found.is_in_op(), stopped(*group));
+            // Until then, the presence is that of the bring-up.
+            if found.judged {
+                self.bus_status
+                    .set_presence(member, found.is_in_op(), stopped(*group));
+            }
         }
         self.bus_status.set_reference(self.reference());
     }

@@ -122,6 +122,8 @@ pub struct SubDeviceDiagnostics {
     /// Own clock minus reference, nanoseconds.
     pub clock_difference: i32,
     pub errors: ErrorCounters,
+    /// True once it was seen in Op, missing, or with an error: it may reach Op after the others.
+    pub(super) judged: bool,
     /// The counters at the first read.
     start: ErrorCounters,
     /// For each of [`DiagnosticRegister::ALL`], true once it was read.
@@ -235,11 +237,21 @@ impl SubDeviceDiagnostics {
         latest
     }
 
+    /// Takes whether a read was answered. A device need not have every register block: only a block
+    /// that it has shows that it is missing. RT.
+    pub(super) fn note_answer(&mut self, block: DiagnosticRegister, answered: bool) {
+        self.judged |= block == DiagnosticRegister::AlStatus && !answered;
+        if answered || block == DiagnosticRegister::AlStatus || self.has_read(block) {
+            self.answers = answered;
+        }
+    }
+
     /// Processes an answer. RT.
     pub(super) fn take(&mut self, block: DiagnosticRegister, data: &[u8]) {
         match (block, data) {
             (DiagnosticRegister::AlStatus, &[status, _, _, _, low, high]) => {
                 self.al_status = status;
+                self.judged |= status == AlState::Op.code() || status & AL_ERROR != 0;
                 self.al_code = u16::from_le_bytes([low, high]);
             }
             (DiagnosticRegister::DlStatus, &[low, high]) => {
@@ -268,6 +280,9 @@ impl SubDeviceDiagnostics {
     }
 }
 
+/// The error indication in the AL status.
+const AL_ERROR: u8 = 0x10;
+
 /// Converts 0x092C, received minus own time. Bit 31 is the sign (own clock ahead), the rest the
 /// amount.
 pub(crate) fn sign_magnitude(raw: u32) -> i32 {
@@ -287,6 +302,17 @@ mod tests {
     fn the_difference_register_is_sign_and_magnitude() {
         assert_eq!(sign_magnitude(5), 5);
         assert_eq!(sign_magnitude(0x8000_0005), -5);
+    }
+
+    #[test]
+    fn a_register_block_that_a_device_lacks_does_not_make_it_missing() {
+        let mut diagnosis = SubDeviceDiagnostics::default();
+        diagnosis.note_answer(DiagnosticRegister::AlStatus, true);
+        diagnosis.take(DiagnosticRegister::AlStatus, &[8, 0, 0, 0, 0, 0]);
+        diagnosis.note_answer(DiagnosticRegister::ClockDifference, false);
+        assert!(diagnosis.is_in_op());
+        diagnosis.note_answer(DiagnosticRegister::AlStatus, false);
+        assert!(!diagnosis.is_in_op());
     }
 
     #[test]
