@@ -16,3 +16,4 @@ mod output;
 mod rights;
 mod signatures;
 mod terminal;
+mod tune;

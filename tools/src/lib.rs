@@ -7,7 +7,8 @@
 //! - [`host`]: the state of a computer from its files;
 //! - [`mod@bench`]: the measurements of the benchmark;
 //! - [`analyze`]: analysis of recordings;
-//! - [`document`]: reports as data, as text and as HTML.
+//! - [`document`]: reports as data, as text and as HTML;
+//! - [`tune`]: frequency response and gains of an axis.
 
 #![forbid(unsafe_code)]
 
@@ -19,3 +20,4 @@ pub mod document;
 pub mod firmware;
 pub mod host;
 pub mod scan;
+pub mod tune;

@@ -94,15 +94,8 @@ impl DeviceArgs {
         } else if let Some(nic) = &self.nic {
             machine.bus.nic = Nic::Interface(nic.clone());
         }
-        let config = named(&machine, name)?.clone();
-        let target = Target {
-            bus: Bus::of(&machine),
-            at: config.at,
-            machine: Some(Box::new(machine)),
-            config: Some(Box::new(config)),
-            esi: None,
-        };
-        Ok((target, rest))
+        let device = selected(&machine, name)?;
+        Ok((Target::of_device(machine, device), rest))
     }
 }
 
@@ -157,6 +150,18 @@ pub(crate) struct OpenDevice {
 }
 
 impl Target {
+    /// Returns a device of a machine.
+    pub fn of_device(machine: Machine, device: DeviceIndex) -> Self {
+        let config = machine.devices[device].clone();
+        Self {
+            bus: Bus::of(&machine),
+            at: config.at,
+            machine: Some(Box::new(machine)),
+            config: Some(Box::new(config)),
+            esi: None,
+        }
+    }
+
     /// Runs `work` on the device in its current state.
     pub fn visit<T: Send + 'static>(
         self,

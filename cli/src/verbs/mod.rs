@@ -26,6 +26,7 @@ mod schema;
 mod sdo;
 mod serve;
 mod sim;
+mod tune;
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Verb {
@@ -45,6 +46,7 @@ pub(crate) enum Verb {
     Analyze(analyze::Args),
     Firmware(firmware::Args),
     Jog(jog::Args),
+    Tune(tune::Args),
     Schema(schema::Args),
     Completions(completions::Args),
     Man(man::Args),
@@ -63,6 +65,7 @@ impl Verb {
             Self::Sim(args) => Some(&args.verbosity),
             Self::Bench(args) => Some(&args.verbosity),
             Self::Firmware(args) => Some(&args.verbosity),
+            Self::Tune(args) => Some(&args.verbosity),
             _ => None,
         }
     }
@@ -84,6 +87,7 @@ impl Verb {
             Self::Sdo(args) => args.changes(),
             Self::Eeprom(args) => args.changes(),
             Self::Firmware(args) => args.changes(),
+            Self::Tune(args) => args.changes(),
             _ => false,
         }
     }
@@ -124,6 +128,7 @@ impl Verb {
             Self::Bench(args) => bench::run(&args),
             Self::Firmware(args) => firmware::run(&args),
             Self::Jog(args) => jog::run(&args),
+            Self::Tune(args) => tune::run(&args),
             Self::Schema(args) => schema::run(&args),
             Self::Completions(args) => completions::run(&args),
             Self::Man(args) => man::run(&args),
