@@ -92,10 +92,19 @@ pub fn fit(lines: &[Line], source: TorqueSource, longest_s: f64) -> Result<Plant
     })?;
     // Lines near a resonance are not those of a rigid body.
     if let Some(found) = resonance(&good, source, &plant) {
+        let factor = |omega: f64, hz: f64| 1.0 - (omega / (hz * std::f64::consts::TAU)).powi(2);
         let below: Vec<Line> = good
             .iter()
-            .filter(|line| line.omega < 0.4 * found.antiresonance_hz * std::f64::consts::TAU)
-            .copied()
+            .filter(|line| line.omega < 0.5 * found.antiresonance_hz * std::f64::consts::TAU)
+            .map(|line| {
+                // As the position would be without the elastic coupling.
+                let lifted = factor(line.omega, found.antiresonance_hz)
+                    / factor(line.omega, found.resonance_hz);
+                Line {
+                    position: line.position / lifted,
+                    ..*line
+                }
+            })
             .collect();
         if below.len() >= 4 {
             plant = rigid(&below, source, longest_s)?;
