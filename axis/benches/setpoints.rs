@@ -64,6 +64,7 @@ fn cycles(c: &mut Criterion) {
         from: Motion::at(0.0),
         target: 10.0 + index as f64,
         limits: LIMITS,
+        fastest: LIMITS.velocity,
         range: None,
     };
     let parts: [LineAxis; AXES] = std::array::from_fn(part);

@@ -63,6 +63,9 @@ const SHORTEST_CYCLE_S: f64 = 1e-6;
 /// Longest accepted cycle. A longer one would let the set-point jump.
 const LONGEST_CYCLE_S: f64 = 0.1;
 
+/// The highest override of velocities.
+pub const MAX_RATE: f64 = 1.2;
+
 /// One axis: commands in, limited set-points out, supervision in between. Call it once per cycle.
 #[derive(Debug, Clone)]
 pub struct Axis {
@@ -83,6 +86,8 @@ pub struct Axis {
     /// True while set-points come from `plan`. Otherwise they follow `actual`.
     active: bool,
     plan: Plan,
+    /// Override of all velocities, from 0 to [`MAX_RATE`].
+    rate: f64,
     motion: Motion,
     loop_state: LoopState,
     derived: control_law::DerivedConstants,
@@ -141,6 +146,7 @@ impl Axis {
             switch: None,
             switch_failed: None,
             plan: Plan::braking(&config, config.mode),
+            rate: 1.0,
             motion: Motion::default(),
             loop_state: LoopState::default(),
             derived: control_law::DerivedConstants::new(&config),
@@ -192,6 +198,16 @@ impl Axis {
     /// blocks or allocates.
     pub fn command(&mut self, command: Command) -> Result<(), CommandError> {
         self.take(command)
+    }
+
+    /// Multiplies the velocity of moves and velocities by `rate`, from 0 to [`MAX_RATE`], within the
+    /// limits of the axis. At 0 a motion decelerates with its own limits and waits on its way; a
+    /// later rate continues it. Stops, homing, torques and set-points from outside do not change.
+    /// An invalid rate counts as 0. RT: O(1), plans at most once per cycle.
+    pub const fn set_rate(&mut self, rate: f64) {
+        // Written so that NaN is rejected, too.
+        let valid = rate >= 0.0 && rate <= MAX_RATE;
+        self.rate = if valid { rate } else { 0.0 };
     }
 
     /// Sets the position of the next cycle from outside: for groups, streams and user controllers.

@@ -43,6 +43,10 @@ pub struct Profile {
     goal: Option<Goal>,
     next: Option<Goal>,
     halt: bool,
+    /// The override of the profile velocity. At 0 the drive is halted on its way.
+    rate: f64,
+    /// The override that the drive has received.
+    sent_rate: f64,
 }
 
 impl Default for Profile {
@@ -60,6 +64,8 @@ impl Profile {
             goal: None,
             next: None,
             halt: false,
+            rate: 1.0,
+            sent_rate: 1.0,
         }
     }
 
@@ -88,6 +94,19 @@ impl Profile {
         };
     }
 
+    /// Sets the override. The drive takes another velocity with the same target again.
+    pub fn set_rate(&mut self, rate: f64) {
+        self.rate = rate;
+        if rate == 0.0 {
+            // While it halts, a drive reports standstill as "target reached" (bit 10), so the
+            // target is set again after a hold.
+            self.sent_rate = 0.0;
+        } else if rate != self.sent_rate && self.phase == Phase::Running {
+            self.next = self.goal;
+            self.enter(Phase::Waiting);
+        }
+    }
+
     const fn enter(&mut self, phase: Phase) {
         self.phase = phase;
         self.in_phase_s = 0.0;
@@ -95,12 +114,17 @@ impl Profile {
 
     /// Runs one fresh cycle of PP. `acknowledged`: Statusword bit 12. `reached`: bit 10.
     pub fn step(&mut self, acknowledged: bool, reached: bool, dt_s: f64) {
+        if self.phase == Phase::Waiting && self.rate == 0.0 {
+            // A new target would end the halt.
+            return;
+        }
         self.in_phase_s += dt_s;
         let late = self.in_phase_s > ACKNOWLEDGE_S;
         match self.phase {
             Phase::Waiting if !acknowledged => {
                 self.goal = self.next.take();
                 self.halt = false;
+                self.sent_rate = self.rate;
                 self.enter(Phase::Raised);
             }
             Phase::Raised if acknowledged => self.enter(Phase::Lowered),
@@ -114,7 +138,7 @@ impl Profile {
             Phase::Waiting | Phase::Raised | Phase::Lowered if late => {
                 self.enter(Phase::NotTaken);
             }
-            Phase::Running if reached => self.enter(Phase::Reached),
+            Phase::Running if reached && self.rate > 0.0 => self.enter(Phase::Reached),
             _ => {}
         }
     }
@@ -127,7 +151,7 @@ impl Profile {
             new_set_point: raised,
             change_at_once: raised,
             relative: false,
-            halt: self.halt,
+            halt: self.halt || self.rate == 0.0,
         }
     }
 

@@ -13,6 +13,7 @@ mod modes;
 mod motion;
 mod no_alloc;
 mod no_alloc_motion;
+mod overrides;
 mod profiles;
 mod properties;
 mod reactions;

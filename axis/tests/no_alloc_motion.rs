@@ -72,6 +72,7 @@ fn lines_do_not_allocate() {
             from: Motion::at(0.0),
             target: 40.0,
             limits: LIMITS,
+            fastest: LIMITS.velocity,
             range: None,
         };
         let axes = [axis; 100];
@@ -81,8 +82,8 @@ fn lines_do_not_allocate() {
             |cycle, motion| {
                 let all = along.iter_mut().map(|source| {
                     match cycle {
-                        50 => source.stop(DT),
-                        150 => source.go_on(0.5, DT),
+                        50 => source.set_rate(0.0, DT),
+                        150 => source.set_rate(0.5, DT),
                         _ => {}
                     }
                     source.advance(motion, DT)
@@ -163,7 +164,7 @@ fn tables_do_not_allocate() {
     let made = counted(|| {
         let mut playback = Playback::new(&table, Motion::at(0.0), LIMITS, 0.0).unwrap();
         run(
-            |_, motion| playback.advance(&table, motion, DT),
+            |_, motion| playback.advance(&table, motion, DT, 1.0),
             Motion::at(0.0),
         )
     });

@@ -56,6 +56,11 @@ pub fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Opti
     }
 }
 
+/// Returns a fraction in percent, without digits that come from rounding.
+pub(crate) fn percent(fraction: f64) -> f64 {
+    rounded(fraction * 100.0)
+}
+
 /// Rounds to six decimals, without digits that come from computing.
 #[must_use]
 pub fn rounded(x: f64) -> f64 {

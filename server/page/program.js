@@ -23,7 +23,7 @@ export class Program {
     const part = this.#part;
     const action = (name, text, kind) => (this.#buttons[name] = h("button", { type: "button", class: kind, "data-op": `program-${name}`, text, onclick: () => control.command("program", { action: name }, false) }));
     part.slider = h("input", {
-      type: "range", min: 1, max: 100, step: 1, value: 100, id: "override", "aria-label": "Override in percent",
+      type: "range", min: 0, max: 120, step: 1, value: 100, id: "override", "aria-label": "Override in percent",
       oninput: () => {
         this.#dragging = true;
         set(part.override, `${part.slider.value} %`);
@@ -43,6 +43,7 @@ export class Program {
       h("div", { class: "panel" },
         h("dl", { class: "stats" }, stat("Program", (part.state = h("dd", { "data-value": "program" }))), stat("Run", (part.run = h("dd", {}))), stat("Step", (part.step = h("dd", {}))), stat("Override", h("dd", {}, part.override))),
         connection.control ? h("div", { class: "row commands" }, action("start", "Start", "primary"), action("pause", "Pause"), action("resume", "Resume"), action("step", "Step"), action("stop", "Stop the program"),
+          (part.hold = h("button", { type: "button", "data-op": "hold", text: "Hold", onclick: () => control.command(connection.state?.held ? "resume" : "hold", {}, false) })),
           h("label", { class: "override" }, h("span", { text: "Override" }), part.slider)) : null),
       steps.length
         ? h("table", { class: "steps" }, h("thead", {}, h("tr", {}, ...["", "Step", "What", "Line"].map((text, k) => h("th", { text, scope: "col", class: k % 2 ? "number" : null })))), h("tbody", {}, ...this.#steps.map(({ row }) => row)))
@@ -66,6 +67,10 @@ export class Program {
       if (document.activeElement !== part.slider) part.slider.value = percent;
     }
     part.slider.disabled = !control.mine;
+    if (part.hold) {
+      set(part.hold, state.held ? "Continue" : "Hold");
+      part.hold.disabled = !control.mine;
+    }
     const { running, paused } = program;
     const may = { start: !running && !paused, pause: running && !paused, resume: paused, step: paused || !running, stop: running || paused };
     for (const [name, button] of Object.entries(this.#buttons)) button.disabled = !control.mine || !may[name] || this.#steps.length === 0;

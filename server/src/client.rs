@@ -5,10 +5,10 @@ use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use ecaxis_axis::Mode;
 use ecaxis_axis::setpoint::{Interpolation, Knot, MotionLimits, StreamConfig};
+use ecaxis_axis::{MAX_RATE, Mode};
 use ecaxis_ecat::data_type::{DataType, Kind};
-use ecaxis_ecat::index::AxisIndex;
+use ecaxis_ecat::index::{AxisIndex, GroupIndex};
 use ecaxis_esi::address;
 use ecaxis_master::clock;
 use ecaxis_master::mailbox::worker::MailboxError;

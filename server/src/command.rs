@@ -126,11 +126,16 @@ pub enum Op {
         output: String,
         value: f64,
     },
-    /// Scales the speeds of moves, velocities and programs.
+    /// Scales the speed of all motions, of the machine or of a group.
     Override {
-        /// Above 0 and at most 1.
+        /// From 0 to 1.2.
         factor: f64,
+        group: Option<String>,
     },
+    /// Holds all motions on their way, of the machine or of a group. Needs no lease.
+    Hold { group: Option<String> },
+    /// Lets held motions continue.
+    Resume { group: Option<String> },
     /// Starts or ends the program of the machine file.
     Program { action: ProgramAction },
     /// Writes an object of a device over CoE.
@@ -286,6 +291,7 @@ impl Op {
             | Self::Await { .. } => Access::Read,
             Self::Stop {}
             | Self::EmergencyStop {}
+            | Self::Hold { .. }
             | Self::Take { .. }
             | Self::Renew {}
             | Self::Release {}

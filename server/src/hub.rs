@@ -138,7 +138,6 @@ struct Inner {
     ring: Option<&'static RingStatus>,
     mailboxes: Option<Mailboxes>,
     step: RunningStep,
-    speed_override: f64,
     outputs: Vec<Option<f64>>,
     events: VecDeque<Arc<Event>>,
     fault_reports: VecDeque<Value>,
@@ -231,7 +230,6 @@ impl Hub {
                 ring: None,
                 mailboxes: None,
                 step: RunningStep::default(),
-                speed_override: 1.0,
                 outputs: vec![None; outputs.len()],
                 events: VecDeque::new(),
                 fault_reports: VecDeque::new(),
@@ -470,7 +468,6 @@ impl Hub {
         inner.advance_to = 0;
         inner.now = 0;
         // A new run begins with these.
-        inner.speed_override = 1.0;
         inner.outputs.fill(None);
     }
 

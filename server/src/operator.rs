@@ -306,6 +306,7 @@ impl ServerOperator {
             | Request::SetMode { .. }
             | Request::SetOutput { .. }
             | Request::Override { .. }
+            | Request::Hold { .. }
             | Request::Program(ProgramRequest::Pause | ProgramRequest::Resume) => return None,
             Request::Program(ProgramRequest::Start | ProgramRequest::Step) => {
                 (None, Some(Request::StopAll))
@@ -345,11 +346,10 @@ impl ServerOperator {
                 }
                 outcome = false;
             }
-            Request::Override { factor } => {
-                self.hub.set_override(factor);
-                outcome = false;
-            }
-            Request::StopAll | Request::EmergencyStop => outcome = false,
+            Request::StopAll
+            | Request::EmergencyStop
+            | Request::Override { .. }
+            | Request::Hold { .. } => outcome = false,
             Request::Jog { axis, .. } => {
                 if let Some(last) = self.jogs.get_mut(axis) {
                     let last = std::mem::replace(last, self.requests);

@@ -13,6 +13,7 @@ use ecaxis_master::config::{AxisSetup, Machine, Signal, si_factor};
 use ecaxis_master::link::redundant::{RingState, RingStatus};
 use ecaxis_master::report::events::describe_stop;
 use ecaxis_master::rt::exchange::{DiagnosticRegister, SubDeviceDiagnostics};
+use ecaxis_master::rt::overrides::Override;
 use ecaxis_master::rt::samples::CYCLE_COLUMNS;
 use ecaxis_master::supervise::operator::MAX_MANUAL_SPEED;
 use serde_json::{Map, Value, json};
@@ -162,6 +163,17 @@ pub fn state(hub: &Hub) -> Value {
         let (device, name) = split(machine, output);
         json!({"device": device, "name": name, "value": value})
     });
+    let groups = latest
+        .iter()
+        .flat_map(|latest| latest.snapshot.groups.enumerate());
+    let mut overrides: Vec<_> = groups
+        .map(|(group, status)| {
+            let Override { factor, held } = status.rate;
+            json!({"group": machine.group_name(group), "factor": factor, "held": held})
+        })
+        .collect();
+    let rate = (!overrides.is_empty()).then(|| overrides.remove(0));
+    let rate = rate.unwrap_or_else(|| json!({"factor": 1.0, "held": false}));
     let program = latest.map(|latest| &latest.program);
     let names = CYCLE_COLUMNS.map(|(name, _)| name);
     let timing: Map<String, Value> = names
@@ -176,7 +188,9 @@ pub fn state(hub: &Hub) -> Value {
         "events": hub.last_event(),
         "bus": bus_state(hub, latest),
         "lease": {"owner": owner, "remaining_ms": rest},
-        "override": hub.speed_override(),
+        "override": rate["factor"],
+        "held": rate["held"],
+        "overrides": overrides,
         "program": {
             "running": program.is_some_and(|program| program.running),
             "paused": program.is_some_and(|program| program.paused),

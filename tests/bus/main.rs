@@ -24,6 +24,7 @@ mod lrw;
 mod mailbox_sizes;
 mod mailboxes;
 mod oddities;
+mod overrides;
 mod phase;
 mod probe;
 mod program;

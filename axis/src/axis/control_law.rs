@@ -214,13 +214,19 @@ impl Axis {
                 if let Some(goal) = goal {
                     let target = scale.position_to_counts(UserUnits(goal.target));
                     out.target_position = target.wrapped();
-                    out.profile_velocity = speed(scale, goal.velocity);
+                    // A held profile keeps its velocity: the drive accepts no other.
+                    let velocity = match self.rate {
+                        0.0 => goal.velocity,
+                        _ => self.profile_velocity(goal.velocity),
+                    };
+                    out.profile_velocity = speed(scale, velocity);
                 }
                 self.profile.position_bits()
             }
             Mode::Pv => {
                 if let Some(goal) = goal {
-                    out.target_velocity = scale.velocity_to_raw(UserVelocity(goal.target)).0;
+                    let velocity = self.profile_velocity(goal.target);
+                    out.target_velocity = scale.velocity_to_raw(UserVelocity(velocity)).0;
                 }
                 self.profile.velocity_bits()
             }

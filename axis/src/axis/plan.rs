@@ -192,9 +192,19 @@ impl Axis {
                 self.motion = self.following();
             }
             Plan::Hold(hold) => self.motion = hold.advance(before, dt_s),
-            Plan::Jerk(ref mut source) => self.motion = source.advance(before, dt_s),
-            Plan::Move(trapezoid) => self.motion = trapezoid.advance(before, dt_s),
-            Plan::Velocity(ramp) => self.motion = self.run(ramp, before, dt_s),
+            Plan::Jerk(ref mut source) => {
+                source.set_rate(self.rate, before, dt_s);
+                self.motion = source.advance(before, dt_s);
+            }
+            Plan::Move(trapezoid) => {
+                let velocity = bounded(trapezoid.velocity * self.rate, self.config.limits.velocity);
+                let trapezoid = Trapezoid {
+                    velocity,
+                    ..trapezoid
+                };
+                self.motion = trapezoid.advance(before, dt_s);
+            }
+            Plan::Velocity(ramp) => self.motion = self.run(self.at_rate(ramp), before, dt_s),
             Plan::Torque(ramp) => {
                 self.loop_state.torque = ramp.advance(self.loop_state.torque, dt_s);
                 self.motion = self.uncommanded();
@@ -207,6 +217,7 @@ impl Axis {
                         ..
                     } = self.statusword.in_mode(self.mode)
                 {
+                    self.profile.set_rate(self.rate);
                     self.profile.step(acknowledged, target_reached, dt_s);
                 }
                 if fresh {
@@ -262,6 +273,19 @@ impl Axis {
         self.held_by_range = outwards;
     }
 
+    /// Returns the ramp with the override.
+    pub(super) fn at_rate(&self, ramp: Ramp) -> Ramp {
+        Ramp {
+            target: bounded(ramp.target * self.rate, self.config.limits.velocity),
+            ..ramp
+        }
+    }
+
+    /// True while the override holds a velocity.
+    const fn holds(&self, velocity: f64) -> bool {
+        self.rate == 0.0 && velocity != 0.0
+    }
+
     fn run(&mut self, ramp: Ramp, before: Motion, dt_s: f64) -> Motion {
         let [lowest, highest] = self.allowed_by_range();
         let asked = ramp.advance(before.velocity, dt_s);
@@ -276,12 +300,20 @@ impl Axis {
         before.then(before.position + velocity * dt_s, velocity, dt_s)
     }
 
+    /// Returns the velocity of a profile of the drive with the override.
+    pub(super) fn profile_velocity(&self, velocity: f64) -> f64 {
+        bounded(velocity * self.rate, self.config.limits.velocity)
+    }
+
     /// Returns true if the drive's profile has ended, as far as it reports it.
     fn profile_arrived(&self) -> bool {
         match (self.mode, self.profile.goal()) {
             (Mode::Pp, Some(_)) => !self.profile.pending(),
             (Mode::Pp, None) if self.profile.pending() => false,
-            (Mode::Pv, Some(goal)) => self.velocity_reached(goal.target),
+            (Mode::Pv, Some(goal)) => {
+                !self.holds(goal.target)
+                    && self.velocity_reached(self.profile_velocity(goal.target))
+            }
             _ => !self.home.running() && self.at_standstill(),
         }
     }
@@ -300,7 +332,9 @@ impl Axis {
             Plan::Hold(hold) => hold.finished(self.motion),
             Plan::Move(trapezoid) => trapezoid.finished(self.motion),
             Plan::Jerk(ref source) => source.finished(self.motion),
-            Plan::Velocity(ramp) => self.motion.velocity == ramp.target,
+            Plan::Velocity(ramp) => {
+                !self.holds(ramp.target) && self.motion.velocity == self.at_rate(ramp).target
+            }
             Plan::Torque(ramp) => self.loop_state.torque == ramp.target,
             Plan::DriveProfile => self.profile_arrived(),
             Plan::External => self.motion.velocity == 0.0,

@@ -18,7 +18,7 @@ impl Axis {
         let goal = self.profile.goal().map(|goal| goal.target);
         let (goal_position, goal_velocity) = match self.mode {
             Mode::Pp => (goal, None),
-            Mode::Pv => (None, goal),
+            Mode::Pv => (None, goal.map(|goal| self.profile_velocity(goal))),
             _ => (None, None),
         };
         let sent = goal_position.map_or(self.sent, |goal| {
@@ -129,7 +129,7 @@ impl Axis {
     /// True if the axis has arrived at the target of the set-point.
     fn reached(&self) -> bool {
         match self.plan {
-            Plan::Velocity(ramp) => self.velocity_reached(ramp.target),
+            Plan::Velocity(ramp) => self.velocity_reached(self.at_rate(ramp).target),
             Plan::Torque(_) => true,
             Plan::DriveProfile => match (self.mode, self.profile.goal()) {
                 (Mode::Pp, Some(goal)) => {

@@ -17,6 +17,8 @@ pub struct LineAxis {
     pub target: f64,
     /// Limits of this axis on the line.
     pub limits: MotionLimits,
+    /// The highest velocity at a rate above 1, at least that of `limits`.
+    pub fastest: f64,
     /// Lowest and highest position, user units; `None`: unlimited.
     pub range: Option<[f64; 2]>,
 }
@@ -48,6 +50,7 @@ impl Line {
             jerk: f64::INFINITY,
         };
         let mut limits = unbounded;
+        let mut fastest = f64::INFINITY;
         let mut slowest = 0;
         for (index, axis) in axes.iter().enumerate() {
             let way = axis
@@ -60,18 +63,25 @@ impl Line {
             if own.velocity < limits.velocity {
                 slowest = index;
             }
+            fastest = fastest.min(axis.fastest / way);
             limits = MotionLimits {
                 velocity: limits.velocity.min(own.velocity),
                 acceleration: limits.acceleration.min(own.acceleration),
                 jerk: limits.jerk.min(own.jerk),
             };
         }
-        let (start, limits) = if limits == unbounded {
-            (1.0, UNIT)
+        let (start, limits, fastest) = if limits == unbounded {
+            (1.0, UNIT, UNIT.velocity)
         } else {
-            (0.0, limits)
+            (0.0, limits, fastest)
         };
-        let order = MoveRequest::within(Goal::Position(1.0), limits);
+        let order = MoveRequest {
+            ceiling: MotionLimits {
+                velocity: limits.velocity.max(fastest),
+                ..limits
+            },
+            ..MoveRequest::within(Goal::Position(1.0), limits)
+        };
         let path = JerkLimited::new(order, Motion::at(start), 0.0).map_err(|error| LineError {
             axis: slowest,
             error,
@@ -152,50 +162,16 @@ impl LinePath {
         self.target
     }
 
-    /// Returns the target; `None` if the line stops before it.
-    #[must_use]
-    pub const fn destination(&self) -> Option<f64> {
-        match self.path.order().goal {
-            Goal::Position(_) => Some(self.target),
-            Goal::Velocity(_) => None,
-        }
-    }
-
     /// Returns this axis's part of the line's deceleration.
     #[must_use]
     pub const fn braking(&self) -> f64 {
         self.path.used().acceleration * (self.target - self.start).abs()
     }
 
-    /// Decelerates on the line, with the limits of the plan.
-    pub fn stop(&mut self, dt_s: f64) {
-        self.redirect(Goal::Velocity(0.0), 1.0, dt_s);
-    }
-
-    /// Continues to the target after a stop, or changes the speed: a fraction of the planned
-    /// velocity, above 0 and at most 1. Other values change nothing.
-    pub fn go_on(&mut self, speed: f64, dt_s: f64) {
-        if speed > 0.0 && speed <= 1.0 {
-            self.redirect(Goal::Position(1.0), speed, dt_s);
-        }
-    }
-
-    fn redirect(&mut self, goal: Goal, speed: f64, dt_s: f64) {
-        let planned = self.path.order().ceiling;
-        let order = MoveRequest {
-            limits: MotionLimits {
-                velocity: planned.velocity * speed,
-                ..planned
-            },
-            ..MoveRequest {
-                ceiling: planned,
-                ..MoveRequest::within(goal, planned)
-            }
-        };
-        // Fails only on non-finite numbers; the line then continues unchanged.
-        if let Ok(path) = self.path.redirect(order, self.at, dt_s) {
-            self.path = path;
-        }
+    /// Multiplies the velocity on the line by `rate`, within the limits of the axes; 0 stops on the
+    /// line. Call it for all axes in the same cycle. RT: O(1).
+    pub fn set_rate(&mut self, rate: f64, dt_s: f64) {
+        self.path.set_rate(rate, self.at, dt_s);
     }
 
     /// Restarts from `motion` after an interruption. The other axes of the line were interrupted as
@@ -233,7 +209,7 @@ impl Setpoint for LinePath {
         self.last
     }
 
-    /// True at the target, or after a stop on the way.
+    /// True at the target.
     fn finished(&self, _: Motion) -> bool {
         self.path.finished(self.at)
     }

@@ -29,7 +29,7 @@ impl Source {
                 Goal::Position(target) => Some(target),
                 Goal::Velocity(_) => None,
             },
-            Self::Line(along) => along.destination(),
+            Self::Line(along) => Some(along.target()),
             Self::Hold(_) | Self::Wave(_) => None,
         }
     }

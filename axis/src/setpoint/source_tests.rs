@@ -80,6 +80,7 @@ fn take(next: Next, now: Source, motion: Motion) -> Option<Source> {
                 from: motion,
                 target,
                 limits: LIMITS,
+                fastest: LIMITS.velocity,
                 range: None,
             };
             Line::plan(&[axis])

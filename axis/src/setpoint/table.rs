@@ -359,7 +359,7 @@ impl Playback {
     /// Advances one cycle. `table` must be the table passed to [`Playback::new`]. RT: O(rows passed
     /// in one cycle).
     #[must_use]
-    pub fn advance(&mut self, table: &Table, motion: Motion, dt_s: f64) -> Motion {
+    pub fn advance(&mut self, table: &Table, motion: Motion, dt_s: f64, rate: f64) -> Motion {
         if dt_s.is_nan() || dt_s <= 0.0 {
             return motion;
         }
@@ -370,7 +370,7 @@ impl Playback {
             let acceleration = self.acceleration;
             Hold { acceleration }.advance(motion, dt_s)
         } else {
-            let position = self.pass(table, dt_s) + self.offset;
+            let position = self.pass(table, dt_s * rate) + self.offset;
             motion.then(position, (position - motion.position) / dt_s, dt_s)
         };
         self.last
@@ -380,6 +380,22 @@ impl Playback {
     #[must_use]
     pub fn finished(&self, motion: Motion) -> bool {
         self.state != State::Playing && motion.velocity == 0.0
+    }
+
+    /// Returns true if one cycle at `rate` keeps the velocity and acceleration limits. A constant
+    /// rate up to 1 always does. RT: O(rows in a cycle).
+    #[must_use]
+    pub fn permits(
+        mut self,
+        table: &Table,
+        motion: Motion,
+        limits: &MotionLimits,
+        dt_s: f64,
+        rate: f64,
+    ) -> bool {
+        let next = self.advance(table, motion, dt_s, rate);
+        let change = (next.velocity - motion.velocity).abs();
+        next.velocity.abs() <= limits.velocity && change <= limits.acceleration * dt_s
     }
 
     fn pass(&mut self, table: &Table, dt_s: f64) -> f64 {

@@ -1,5 +1,6 @@
 use proptest::prelude::*;
 
+use super::super::table_rate;
 use super::super::test_support::Sequence;
 use super::*;
 
@@ -27,7 +28,7 @@ fn run(table: &Table) -> (u32, Motion) {
     let mut sequence = Sequence::from(start, LIMITS, DT);
     let mut cycles = 0;
     while !playback.finished(sequence.motion) {
-        let next = playback.advance(table, sequence.motion, DT);
+        let next = playback.advance(table, sequence.motion, DT, 1.0);
         sequence.then(next).unwrap();
         cycles += 1;
     }
@@ -172,7 +173,7 @@ proptest! {
             if held_up == Some(cycle) {
                 sequence.hold_up();
             }
-            let next = playback.advance(&table, sequence.motion, DT);
+            let next = playback.advance(&table, sequence.motion, DT, 1.0);
             sequence.then(next)?;
             prop_assert!(next.position.abs() <= 2.0 + 1e-9);
             if playback.finished(next) {
@@ -191,6 +192,53 @@ proptest! {
             {
                 prop_assert!(table.duration_s() > 0.0);
             }
+        }
+    }
+}
+
+proptest! {
+    /// Two tables in step, with a rate that changes at any time: velocity and acceleration stay
+    /// within the limits, both keep their common time, and both end exactly.
+    #[test]
+    fn rates_keep_the_limits_of_tables_and_their_common_time(
+        ends in prop::collection::vec(-1.0..1.0f64, 2..8), scale in 0.3..2.0f64,
+        rates in prop::collection::vec((prop_oneof![Just(0.0), 0.05..1.0f64], 1u32..300), 1..8),
+    ) {
+        // Rows in time with the distance, so that the tables use much of their limits.
+        let rows = |factor: f64| {
+            let mut text = String::from("0, 0, 0\n");
+            for (index, end) in ends.iter().enumerate() {
+                text += &format!("{}, {}, 0\n", 0.2 * (index + 1) as f64, end * factor * scale);
+            }
+            Table::parse(&text, Interpolation::Cubic).unwrap()
+        };
+        let tables = [rows(1.0), rows(-0.7)];
+        let limits = MotionLimits { acceleration: 600.0, ..LIMITS };
+        prop_assume!(tables.iter().all(|table| table.check(limits, None, 0.0, DT).is_ok()));
+        let start = Motion::at(0.0);
+        let mut players = [0, 1].map(|index| (Playback::new(&tables[index], start, limits, 0.0).unwrap(), start));
+        let mut rate = 1.0;
+        for (wanted, cycles) in rates.into_iter().chain([(0.0, 3000), (1.0, 20_000)]) {
+            for _ in 0..cycles {
+                rate = table_rate(rate, wanted, DT, |rate| {
+                    players.iter().zip(&tables).all(|((play, motion), table)| {
+                        play.permits(table, *motion, &limits, DT, rate)
+                    })
+                });
+                for ((play, motion), table) in players.iter_mut().zip(&tables) {
+                    let next = play.advance(table, *motion, DT, rate);
+                    let change = (next.velocity - motion.velocity).abs();
+                    prop_assert!(change <= limits.acceleration * DT * (1.0 + 1e-9));
+                    prop_assert!(next.velocity.abs() <= limits.velocity + 1e-9);
+                    *motion = next;
+                }
+                let [(_, a), (_, b)] = players;
+                prop_assert!((a.position * -0.7 - b.position).abs() <= 1e-9);
+            }
+            prop_assert!(wanted > 0.0 || cycles < 3000 || players.iter().all(|(_, motion)| motion.velocity == 0.0));
+        }
+        for ((play, motion), table) in players.iter().zip(&tables) {
+            prop_assert!(play.finished(*motion) && motion.stands_at(table.ends()[1]));
         }
     }
 }

@@ -7,6 +7,7 @@
 use core::f64::consts::TAU;
 
 use super::error::{position, usable};
+use super::rate::Rate;
 use super::spline::within;
 use super::{Goal, Hold, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint, SetpointError};
 
@@ -33,6 +34,9 @@ pub struct Wave {
 /// Factors by which a sine's derivatives grow while it fades in or out. The steady derivatives are
 /// 2π, 4π² and 8π³ per period.
 const FADING: [f64; 3] = [1.0, 1.1122, 1.3286];
+
+/// Share of the limits that a sine leaves for changes of its rate; twice as much of the jerk.
+const RESERVE: f64 = 0.03;
 
 /// Minimum number of cycles per period of a sine.
 const CYCLES_PER_PERIOD: f64 = 10.0;
@@ -140,6 +144,9 @@ pub struct PositionWave {
     centre: f64,
     limits: MotionLimits,
     state: State,
+    /// The wanted rate of the wave's time, and the present one of a sine.
+    wanted: f64,
+    rate: Rate,
     last: Motion,
 }
 
@@ -174,16 +181,16 @@ impl PositionWave {
                         limit: limits.velocity,
                     });
                 }
-                if acceleration > limits.acceleration {
+                if acceleration > limits.acceleration * (1.0 - RESERVE) {
                     return Err(SetpointError::TooSteep {
                         acceleration,
-                        limit: limits.acceleration,
+                        limit: limits.acceleration * (1.0 - RESERVE),
                     });
                 }
-                if jerk > limits.jerk {
+                if jerk > limits.jerk * (1.0 - 2.0 * RESERVE) {
                     return Err(SetpointError::TooMuchJerk {
                         jerk,
-                        limit: limits.jerk,
+                        limit: limits.jerk * (1.0 - 2.0 * RESERVE),
                     });
                 }
                 State::Sine
@@ -208,6 +215,8 @@ impl PositionWave {
             centre,
             limits,
             state,
+            wanted: 1.0,
+            rate: Rate::WHOLE,
             last: motion,
         })
     }
@@ -216,6 +225,12 @@ impl PositionWave {
     #[must_use]
     pub const fn limits(&self) -> &MotionLimits {
         &self.limits
+    }
+
+    /// Sets how fast the time of the wave passes, from 0 to 1. A sine changes its rate within the
+    /// limits of the axis. RT: O(1).
+    pub const fn set_rate(&mut self, rate: f64) {
+        self.wanted = rate.min(1.0);
     }
 
     /// Returns true if the axis was interrupted; it stands since then.
@@ -236,18 +251,28 @@ impl Setpoint for PositionWave {
         }
         let next = match &mut self.state {
             State::Sine => {
-                let value = self.wave.advance(dt_s);
+                let (slopes, limits) = (self.wave.slopes(), &self.limits);
+                let rate = self.rate.advance(self.wanted, slopes, limits, dt_s);
+                let value = self.wave.advance(rate * dt_s);
                 let position = self.centre + value;
                 motion.then(position, (position - motion.position) / dt_s, dt_s)
             }
             State::Square(source) => {
-                let target = self.centre + self.wave.advance(dt_s);
+                let mut ahead = self.wave;
+                let target = self.centre + ahead.advance(self.wanted * dt_s);
                 let order = MoveRequest::within(Goal::Position(target), self.limits);
-                if source.order().goal != order.goal
+                let same = source.order().goal == order.goal;
+                // A hold delays a move, and the wave waits for its end.
+                if same || source.finished(motion) {
+                    self.wave = ahead;
+                }
+                if !same
+                    && source.finished(motion)
                     && let Ok(next) = source.redirect(order, motion, dt_s)
                 {
                     *source = next;
                 }
+                source.set_rate(self.wanted, motion, dt_s);
                 source.advance(motion, dt_s)
             }
             State::Interrupted => Hold {

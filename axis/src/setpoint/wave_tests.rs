@@ -149,3 +149,44 @@ proptest! {
         }
     }
 }
+
+proptest! {
+    /// Rates that change at any time, on waves that use all their limits: the limits hold in every
+    /// cycle, a hold stands still within seconds, and the wave ends at its start.
+    #[test]
+    fn rates_keep_the_limits_of_a_wave(
+        square in any::<bool>(), frequency in 0.3..8.0f64, used in 0.2..0.999f64,
+        rates in prop::collection::vec((prop_oneof![Just(0.0), 0.05..1.2f64], 1u32..800), 1..8),
+    ) {
+        let slopes = Wave::new(Shape::Sine, 1.0, frequency, 3, DT).unwrap().slopes();
+        let most = [LIMITS.velocity, LIMITS.acceleration * 0.97, LIMITS.jerk * 0.94];
+        let amplitude = slopes.iter().zip(most).map(|(slope, most)| most / slope).fold(f64::MAX, f64::min);
+        let (shape, amplitude) = match square {
+            true => (Shape::Square, amplitude * used * 0.3),
+            false => (Shape::Sine, amplitude * used),
+        };
+        let wave = Wave::new(shape, amplitude, frequency, 3, DT).unwrap();
+        let mut source = PositionWave::new(wave, Motion::at(1.0), LIMITS, None, DT).unwrap();
+        let mut motion = Motion::at(1.0);
+        let mut ended = false;
+        let rates = rates.into_iter().chain([(0.0, 20_000), (1.0, 60_000)]);
+        for (rate, cycles) in rates {
+            source.set_rate(rate);
+            for _ in 0..cycles {
+                let next = source.advance(motion, DT);
+                let jerk = (next.acceleration - motion.acceleration) / DT;
+                prop_assert!(next.velocity.abs() <= LIMITS.velocity + 1e-9);
+                prop_assert!(next.acceleration.abs() <= LIMITS.acceleration + 1e-6);
+                prop_assert!(jerk.abs() <= LIMITS.jerk + 1e-2, "{} {:?}", jerk, source);
+                prop_assert!((next.position - 1.0).abs() <= amplitude * 1.0 + 1e-9 || square);
+                motion = next;
+                ended = source.finished(motion);
+                if ended {
+                    break;
+                }
+            }
+            prop_assert!(rate > 0.0 || cycles < 20_000 || motion.velocity == 0.0, "{:?}", source);
+        }
+        prop_assert!(ended && motion.stands_at(1.0), "{:?}", source);
+    }
+}

@@ -93,7 +93,14 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         cycle_s,
     };
     let names = (raw.signals, raw.variables, raw.sim);
-    let program = steps::check(raw.steps, raw.stop, names, resolved, repeat, p);
+    let program = steps::check(
+        raw.steps,
+        (raw.stop, raw.overrides),
+        names,
+        resolved,
+        repeat,
+        p,
+    );
     let brakes = brake_outputs(&brakes, known, &program.outputs, p);
     let steps = program.outputs.iter().zip(&program.output_places);
     let steps = steps.map(|(output, place)| {
@@ -145,6 +152,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         switched: program.switched,
         copies,
         stop: program.stop,
+        overrides: program.overrides,
         tables: program.tables,
         repeat,
         enable: raw.enable.value().unwrap_or(true),

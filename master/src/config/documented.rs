@@ -64,7 +64,7 @@ fn document_lists_every_key() {
 
 /// The tables of the schema that a section of the document describes.
 #[rustfmt::skip] // one row per section
-const SECTIONS: [(&str, &str); 14] = [
+const SECTIONS: [(&str, &str); 15] = [
     ("[bus]", "/properties/bus"),
     ("[[device]]", "/properties/device/items"),
     ("[device.axis]", "/definitions/axis"),
@@ -78,6 +78,7 @@ const SECTIONS: [(&str, &str); 14] = [
     ("[device.sim]", "/properties/device/items/properties/sim"),
     ("[[copy]]", "/properties/copy/items"),
     ("[stop]", "/properties/stop"),
+    ("[override]", "/properties/override"),
     ("[server]", "/properties/server"),
 ];
 

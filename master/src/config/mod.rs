@@ -95,6 +95,7 @@ pub use crate::rt::config::{Bounds, Condition, ExchangeMode, GroupStopScope};
 use crate::rt::config::{GroupConfig, RtConfig};
 pub use crate::rt::controller::{AxisRef, InputRef, OutputRef};
 use crate::rt::image::{OpOnly, ProcessData};
+pub use crate::rt::overrides::{OverrideConfig, OverrideInput};
 pub use crate::rt::spin::Spin;
 use crate::signature::{SignaturePolicy, SignedKind};
 
@@ -126,6 +127,7 @@ pub struct Machine {
     pub switched: Vec<SwitchedInput>,
     pub copies: Vec<CopySetup>,
     pub stop: StopSetup,
+    pub overrides: OverrideConfig,
     /// The set-point tables that the steps play.
     pub tables: Vec<TableFile>,
     /// The number of program runs, at least 1.
@@ -496,6 +498,7 @@ impl Machine {
             groups: std::iter::once(rest).chain(named).collect(),
             bus_lost: stop.bus_lost,
             emergency: stop.emergency.clone(),
+            overrides: self.overrides.clone(),
             copies: self.copies.iter().map(CopySetup::rt).collect(),
             repeats: device::repeats(&self.devices),
         }

@@ -3,12 +3,12 @@
 use std::path::PathBuf;
 
 use ecaxis_axis::{AxisStatus, Edge, StopMethod};
-use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex};
 
 use super::{
     AxisSetup, Bounds, Condition, GroupStopScope, InputRef, Machine, OutputRef, Signal, duration,
 };
-use crate::text::rounded;
+use crate::text::{percent, rounded};
 
 /// One step of the program.
 #[derive(Debug, Clone, PartialEq)]
@@ -130,6 +130,8 @@ pub enum Action {
     Set {
         values: Vec<(OutputRef, f64)>,
     },
+    /// Set the override of the machine (the first group) or of groups.
+    Override(Vec<(GroupIndex, f64)>),
     /// Set variables, or add to them.
     Assign {
         add: bool,
@@ -483,6 +485,7 @@ impl Machine {
                 });
                 each.collect::<Vec<_>>().join(", ")
             }
+            Action::Override(values) => self.describe_overrides(values),
             Action::Message { text } => text.clone(),
             Action::Alarm { text } => format!("alarm: {text}"),
             Action::Set { values } => {
@@ -592,9 +595,4 @@ const TORQUE: &str = "torque";
 /// Rounds to six significant digits.
 fn short(x: f64) -> f64 {
     format!("{x:.5e}").parse().unwrap_or(x)
-}
-
-/// Returns a fraction in percent, without digits that come from rounding.
-fn percent(fraction: f64) -> f64 {
-    rounded(fraction * 100.0)
 }

@@ -10,6 +10,7 @@ use toml::Spanned;
 mod condition;
 mod follow;
 mod modes;
+mod overrides;
 mod preconditions;
 mod probe;
 mod stop;
@@ -18,11 +19,12 @@ mod target;
 use super::fields::{Key, KeyExt};
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{
-    Levels, NamedValues, RawAction, RawAxes, RawSimulation, RawStep, RawStop, TimeLimit,
+    Levels, NamedValues, RawAction, RawAxes, RawOverride, RawSimulation, RawStep, RawStop,
+    TimeLimit,
 };
 use super::{
-    Action, AxisSetup, DeviceConfig, NamedSignal, Signal, Step, StopSetup, SwitchedInput,
-    TableFile, Variable,
+    Action, AxisSetup, DeviceConfig, NamedSignal, OverrideConfig, Signal, Step, StopSetup,
+    SwitchedInput, TableFile, Variable,
 };
 use ecaxis_axis::Mode;
 pub(crate) use preconditions::enables;
@@ -65,6 +67,7 @@ pub(crate) struct Resolved<'c> {
 #[derive(Debug, Default)]
 pub(crate) struct Program {
     pub stop: StopSetup,
+    pub overrides: OverrideConfig,
     pub steps: Vec<Step>,
     pub inputs: Vec<Signal>,
     pub outputs: Vec<Signal>,
@@ -79,7 +82,7 @@ pub(crate) struct Program {
 /// Checks the steps.
 pub(crate) fn check(
     steps: Vec<RawStep>,
-    stop: RawStop,
+    (stop, overrides): (RawStop, RawOverride),
     (signals, variables, sim): (NamedValues<String>, NamedValues<f64>, RawSimulation),
     known: Resolved<'_>,
     repeat: u32,
@@ -101,6 +104,9 @@ pub(crate) fn check(
         places: RefCell::default(),
         signals: Vec::new(),
         variables: Vec::new(),
+        groups: (stop.groups.iter())
+            .map(|group| (group.name.as_ref()).map_or_else(String::new, |n| n.get_ref().clone()))
+            .collect(),
     };
     checker.name_signals(signals, p);
     checker.name_variables(variables, p);
@@ -110,9 +116,11 @@ pub(crate) fn check(
         checker.flow(&steps, repeat, p);
     }
     let stop = checker.stop(&stop, p);
+    let overrides = checker.overrides(&overrides, p);
     let switched = checker.switched_inputs(sim, p);
     Program {
         stop,
+        overrides,
         steps,
         inputs: checker.inputs,
         outputs: checker.outputs,
@@ -143,6 +151,8 @@ struct ProgramChecker<'c> {
     /// The names of `[signals]`, and `[variables]`.
     signals: Vec<NamedSignal>,
     variables: Vec<Variable>,
+    /// The names of `[[stop.group]]`.
+    groups: Vec<String>,
 }
 
 impl ProgramChecker<'_> {
@@ -301,6 +311,7 @@ impl ProgramChecker<'_> {
                     .collect();
                 (count > 0 && values.len() == count).then_some(Action::Assign { add, values })?
             }
+            RawAction::Override(values) => self.override_step(values, p)?,
             RawAction::Message(text) => Action::Message { text },
             RawAction::Alarm(text) => Action::Alarm { text },
             RawAction::Repeat {

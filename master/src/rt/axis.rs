@@ -5,6 +5,7 @@ use ecaxis_ecat::index::{DeviceIndex, GroupIndex};
 
 use super::gateway::NodePlace;
 use super::image::{AxisBits, SignalBits};
+use super::overrides::Rates;
 use super::setpoint_generator::SetpointGenerator;
 use crate::clock::Nanos;
 
@@ -35,6 +36,8 @@ pub struct RtAxis {
     pub(super) ordered: bool,
     /// The axis was processed in this cycle.
     pub(super) acted: bool,
+    /// The override of this cycle.
+    pub(super) rates: Rates,
 }
 
 impl RtAxis {
@@ -56,6 +59,7 @@ impl RtAxis {
             armed: false,
             ordered: false,
             acted: false,
+            rates: Rates::WHOLE,
         }
     }
 

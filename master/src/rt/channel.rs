@@ -40,6 +40,17 @@ pub enum RtCommand {
         output: OutputRef,
         value: f64,
     },
+    /// Sets the override of the machine (the first group) or of a group.
+    Override {
+        group: GroupIndex,
+        /// From 0 to [`ecaxis_axis::MAX_RATE`].
+        factor: f64,
+    },
+    /// Holds the machine or a group on its way, or lets it continue.
+    Hold {
+        group: GroupIndex,
+        held: bool,
+    },
     /// Starts the bus monitor: from now on too many bad cycles stop the machine.
     StartBusMonitor,
     /// Stops a group that waits for an optional device.

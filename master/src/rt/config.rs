@@ -5,6 +5,7 @@ use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 
 use super::controller::InputRef;
 use super::image::ProcessData;
+use super::overrides::OverrideConfig;
 use super::spin::Spin;
 use crate::clock::Nanos;
 
@@ -27,6 +28,7 @@ pub struct RtConfig {
     pub bus_lost: StopMethod,
     /// The conditions for an emergency stop; one is enough.
     pub emergency: Vec<Condition>,
+    pub overrides: OverrideConfig,
     /// Inputs that are copied to outputs in every cycle.
     pub copies: Vec<ProcessDataCopy>,
     /// Outputs that repeat other outputs of their device.

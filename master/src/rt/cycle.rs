@@ -16,6 +16,7 @@ use super::flight_recorder::{self, FlightRecorder};
 use super::gateway::{Gateway, NodeState};
 use super::heartbeat;
 use super::image::SignalBits;
+use super::overrides::Overrides;
 use super::phase::Phase;
 use super::reaction_group::{GroupStatus, ReactionGroup};
 use super::samples::{CycleSample, SampleWriter, flags};
@@ -27,6 +28,7 @@ mod axes;
 mod commands;
 mod io;
 mod panic;
+mod rates;
 
 use panic::Plain;
 
@@ -53,6 +55,7 @@ pub struct Engine {
     gateways: Box<[Gateway]>,
     /// The first group is the machine's: all axes without a group.
     groups: IndexVec<GroupIndex, ReactionGroup>,
+    overrides: Overrides,
     signals: Signals,
     /// Each value is from the last cycle in which its group was fresh.
     inputs: Vec<f64>,
@@ -183,6 +186,7 @@ impl Engine {
             clocks_off,
             guard: BusMonitor::new(config.lost_frames, &groups),
             guarding: false,
+            overrides: Overrides::new(config.overrides.clone(), config.groups.len()),
             late_wake_ups: 0,
             supervisor: heartbeat::Watch::default(),
             stats: Stats::default(),
@@ -445,7 +449,11 @@ impl Engine {
                 stops: group.stops,
                 fresh: result.fresh,
                 powered: false,
+                rate: Default::default(),
             };
+        }
+        for (group, to) in snapshot.groups.enumerate_mut() {
+            to.rate = self.overrides.of(group);
         }
         for (slot, status) in self.axes.iter().zip(&snapshot.axes) {
             if let Some(group) = snapshot.groups.get_mut(slot.group) {

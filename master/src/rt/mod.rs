@@ -43,6 +43,7 @@ pub mod flight_recorder;
 pub mod gateway;
 pub mod heartbeat;
 pub mod image;
+pub mod overrides;
 pub mod phase;
 pub mod reaction_group;
 pub mod samples;

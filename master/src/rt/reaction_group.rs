@@ -8,6 +8,7 @@ use ecaxis_ecat::index::{GroupIndex, IndexVec};
 
 use super::bus_monitor::StopCause;
 use super::config::{GroupConfig, GroupStopScope};
+use super::overrides::Override;
 use crate::clock::Nanos;
 
 /// A stop in progress or completed.
@@ -44,6 +45,8 @@ pub struct GroupStatus {
     pub fresh: bool,
     /// True if one of its axes has power according to its process data.
     pub powered: bool,
+    /// The override of the group alone; of the first group, that of the machine.
+    pub rate: Override,
 }
 
 impl ReactionGroup {

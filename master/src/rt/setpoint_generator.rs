@@ -12,6 +12,8 @@ use ecaxis_axis::setpoint::{
 use ecaxis_axis::{Axis, AxisStatus, CommandError, HomingStatus};
 use ecaxis_ecat::index::AxisIndex;
 
+use super::overrides::Rates;
+
 /// A request to start following a set-point source.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum GeneratorRequest {
@@ -148,13 +150,14 @@ impl SetpointGenerator {
     }
 
     /// Starts a source. `master` is the motion of the gear's master. `ring` is true if the master
-    /// follows this axis. RT: O(1).
+    /// follows this axis. `rate` is the override of the axis. RT: O(1).
     pub fn begin(
         &mut self,
         start: GeneratorRequest,
         axis: &AxisStatus,
         master: Option<Motion>,
         ring: bool,
+        rate: f64,
     ) {
         self.slipping_s = 0.0;
         if ring || (matches!(start, GeneratorRequest::Gear { .. }) && master.is_none()) {
@@ -166,7 +169,8 @@ impl SetpointGenerator {
         }
         let source = match start {
             GeneratorRequest::Line(along) => Ok(Source::Line(along)),
-            GeneratorRequest::Move(planned) => Ok(Source::Move(planned)),
+            // From rest, slower moves of the same duration still arrive together.
+            GeneratorRequest::Move(planned) => Ok(Source::Move(planned.slowed(rate))),
             GeneratorRequest::Wave(wave) => Ok(Source::Wave(wave)),
             GeneratorRequest::Table { table, playback } => Ok(Source::Table { table, playback }),
             GeneratorRequest::Gear {
@@ -195,6 +199,24 @@ impl SetpointGenerator {
     #[must_use]
     pub fn on_line(&self) -> bool {
         matches!(self.source, Some(Source::Line(_)))
+    }
+
+    /// True while the axis plays a table.
+    #[must_use]
+    pub fn plays(&self) -> bool {
+        matches!(self.source, Some(Source::Table { .. }))
+    }
+
+    /// Returns true if the table keeps the limits of the axis in a cycle at `rate`. RT: O(rows in a
+    /// cycle).
+    pub fn permits_rate(&self, axis: &Axis, tables: &[Table], rate: f64, dt_s: f64) -> bool {
+        let Some(Source::Table { table, playback }) = self.source else {
+            return true;
+        };
+        let motion = self.resume_motion(axis, dt_s);
+        let limits = axis.config().limits.motion();
+        let table = tables.get(table);
+        table.is_none_or(|table| playback.permits(table, motion, &limits, dt_s, rate))
     }
 
     /// Ends the line because another axis on it has stopped.
@@ -250,6 +272,7 @@ impl SetpointGenerator {
         axis: &mut Axis,
         tables: &[Table],
         master: Option<Motion>,
+        rates: Rates,
         dt_s: f64,
     ) -> bool {
         let Some(mut source) = self.source else {
@@ -263,21 +286,24 @@ impl SetpointGenerator {
         let mut interrupted = false;
         let (next, finished, state) = match &mut source {
             Source::Line(along) => {
+                along.set_rate(rates.line, dt_s);
                 let next = along.advance(before, dt_s);
                 (next, along.finished(next), GeneratorState::Running)
             }
             Source::Move(planned) => {
+                planned.set_rate(rates.own.min(1.0), before, dt_s);
                 let next = planned.advance(before, dt_s);
                 (next, planned.finished(next), GeneratorState::Running)
             }
             Source::Wave(wave) => {
+                wave.set_rate(rates.own);
                 let next = wave.advance(before, dt_s);
                 interrupted = wave.interrupted();
                 (next, wave.finished(next), GeneratorState::Running)
             }
             Source::Table { table, playback } => match tables.get(*table) {
                 Some(table) => {
-                    let next = playback.advance(table, before, dt_s);
+                    let next = playback.advance(table, before, dt_s, rates.table);
                     interrupted = playback.interrupted();
                     (next, playback.finished(next), GeneratorState::Running)
                 }

@@ -4,6 +4,7 @@ use ecaxis_axis::{AxisConfig, Command, Inputs, Limits, Mode, Outputs, Scale};
 use ecaxis_ecat::index::AxisIndex;
 
 use super::*;
+use crate::rt::overrides::Rates;
 
 const DT: f64 = 0.001;
 
@@ -60,14 +61,16 @@ impl Rig {
         };
         self.axis.observe(&inputs, DT);
         self.before = self.axis.status().target_position;
-        let _ = self.generator.advance(&mut self.axis, &[], master, DT);
+        let _ = self
+            .generator
+            .advance(&mut self.axis, &[], master, Rates::WHOLE, DT);
         self.out = self.axis.act();
         self.axis.status().target_position
     }
 
     fn begin(&mut self, start: GeneratorRequest, master: Option<Motion>) {
         let status = self.axis.status();
-        self.generator.begin(start, &status, master, false);
+        self.generator.begin(start, &status, master, false, 1.0);
     }
 
     fn part(&self, target: f64, speed: f64) -> LineAxis {
@@ -79,6 +82,7 @@ impl Rig {
                 velocity: limits.velocity * speed,
                 ..limits.motion()
             },
+            fastest: limits.velocity,
             range: limits.position,
         }
     }

@@ -52,6 +52,7 @@ impl Supervisor {
                     self.resolve_target(axis, from.position, target)
                 },
                 limits: self.part_of(axis, part),
+                fastest: self.limits(axis).velocity * WHOLE,
                 range: self.limits(axis).position,
             });
         }

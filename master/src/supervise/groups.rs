@@ -150,6 +150,7 @@ pub(super) fn needed(action: &Action) -> Vec<AxisIndex> {
         | Action::Dwell { .. }
         | Action::Wait { .. }
         | Action::Set { .. }
+        | Action::Override(_)
         | Action::Assign { .. }
         | Action::Message { .. }
         | Action::Alarm { .. }

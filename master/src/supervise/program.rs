@@ -341,6 +341,13 @@ impl Supervisor {
                 }
                 Ok(())
             }
+            Action::Override(values) => {
+                let commands = values
+                    .iter()
+                    .map(|&(group, factor)| RtCommand::Override { group, factor });
+                self.send_all(&commands.collect::<Vec<_>>()).await;
+                self.taken(start).await
+            }
             // The report of the step has the text.
             Action::Message { .. } => Ok(()),
             Action::Alarm { text } => {

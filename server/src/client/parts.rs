@@ -74,13 +74,17 @@ impl Client {
                 output,
                 value,
             } => self.output(&device, &output, value),
-            Op::Override { factor } if factor > 0.0 && factor <= 1.0 => {
-                Ok(vec![Work::Request(MachineRequest::Override { factor })])
+            Op::Override { factor, group } if (0.0..=MAX_RATE).contains(&factor) => {
+                let group = self.group(group.as_deref())?;
+                let request = MachineRequest::Override { group, factor };
+                Ok(vec![Work::Request(request)])
             }
-            Op::Override { factor } => {
-                let message = format!("`factor` is {factor}: it must be above 0 and at most 1");
+            Op::Override { factor, .. } => {
+                let message = format!("`factor` is {factor}: it must be from 0 to {MAX_RATE}");
                 Err(OpError::new(ErrorCode::BadRequest, message))
             }
+            Op::Hold { group } => self.hold(group.as_deref(), true),
+            Op::Resume { group } => self.hold(group.as_deref(), false),
             Op::Program { action } => {
                 let request = match action {
                     ProgramAction::Start => ProgramRequest::Start,
@@ -132,6 +136,25 @@ impl Client {
             }]),
             _ => Err(OpError::new(ErrorCode::BadRequest, "not a command")),
         }
+    }
+
+    fn hold(&self, group: Option<&str>, held: bool) -> Result<Vec<Work>, OpError> {
+        let group = self.group(group)?;
+        Ok(vec![Work::Request(MachineRequest::Hold { group, held })])
+    }
+
+    /// Returns a group by its name; without one, the machine.
+    fn group(&self, name: Option<&str>) -> Result<GroupIndex, OpError> {
+        let Some(name) = name else {
+            return Ok(GroupIndex::MACHINE);
+        };
+        let groups = &self.hub.machine.stop.groups;
+        let found = groups.iter().position(|group| group.name == name);
+        found.map(|index| GroupIndex(index + 1)).ok_or_else(|| {
+            let message = format!("no group is named `{name}`");
+            OpError::new(ErrorCode::UnknownName, message)
+                .help("`machine` lists the groups of the axes")
+        })
     }
 
     fn check_torque_offset(&self, axis: AxisIndex) -> Result<(), OpError> {

@@ -57,15 +57,6 @@ impl Hub {
         self.lock().step.clone()
     }
 
-    pub fn set_override(&self, factor: f64) {
-        self.lock().speed_override = factor;
-    }
-
-    #[must_use]
-    pub fn speed_override(&self) -> f64 {
-        self.lock().speed_override
-    }
-
     /// Remembers the value of an output.
     pub fn set_output(&self, index: usize, value: f64) {
         if let Some(output) = self.lock().outputs.get_mut(index) {

@@ -93,7 +93,8 @@ fn refusals_say_why() {
             "refused",
             "homing",
         ),
-        ("override", json!({"factor": 0}), "bad_request", "factor"),
+        ("override", json!({"factor": 1.3}), "bad_request", "factor"),
+        ("hold", json!({"group": "none"}), "unknown_name", "none"),
         (
             "output",
             json!({"device": "x", "output": "Controlword", "value": 1}),

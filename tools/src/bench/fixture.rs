@@ -190,6 +190,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
             groups: vec![GroupConfig::machine(StopMethod::Ramp)].into(),
             bus_lost: StopMethod::QuickStop,
             emergency: Vec::new(),
+            overrides: config::OverrideConfig::default(),
             copies: Vec::new(),
             repeats: Vec::new(),
         },

@@ -408,3 +408,42 @@ proptest! {
         prop_assert_eq!(motion.position, target);
     }
 }
+
+proptest! {
+    /// Rates that change at any time: the limits hold in every cycle, a hold stands still, and the
+    /// move ends exactly at its target.
+    #[test]
+    fn rates_keep_the_limits_and_end_at_the_target(
+        target in -50.0..50.0f64, part in 0.2..=1.0f64, velocity in prop::option::of(-1.0..1.0f64),
+        rates in prop::collection::vec((prop_oneof![Just(0.0), 0.05..1.2f64], 1u32..200), 1..12),
+    ) {
+        let limits = MotionLimits { velocity: LIMITS.velocity * part, ..LIMITS };
+        let goal = match velocity {
+            Some(velocity) => Goal::Velocity(velocity * limits.velocity),
+            None => Goal::Position(target),
+        };
+        let order = MoveRequest { ceiling: LIMITS, ..MoveRequest::within(goal, limits) };
+        let mut source = JerkLimited::new(order, Motion::at(0.0), DT).unwrap();
+        let mut watch = Watch::at(Motion::at(0.0), LIMITS, DT);
+        for (rate, cycles) in rates {
+            for _ in 0..cycles {
+                source.set_rate(rate, watch.motion, DT);
+                watch.cycle(&mut source)?;
+            }
+            let most = order.at_rate(rate).limits.velocity;
+            for _ in 0..1000 {
+                if rate == 0.0 {
+                    watch.cycle(&mut source)?;
+                }
+            }
+            prop_assert!(rate > 0.0 || watch.motion.velocity == 0.0);
+            prop_assert!(most <= LIMITS.velocity);
+        }
+        source.set_rate(1.0, watch.motion, DT);
+        watch.finish(&mut source)?;
+        match goal {
+            Goal::Position(target) => prop_assert!(watch.motion.stands_at(target)),
+            Goal::Velocity(velocity) => prop_assert_eq!(watch.motion.velocity, velocity),
+        }
+    }
+}

@@ -43,6 +43,35 @@ pub struct MoveRequest {
 }
 
 impl MoveRequest {
+    /// Returns the request with its velocity multiplied by `rate`, at most the velocity of the
+    /// ceiling. At rate 0 the goal is a stop on the way.
+    #[must_use]
+    pub fn at_rate(self, rate: f64) -> Self {
+        if rate <= 0.0 {
+            return Self {
+                goal: Goal::Velocity(0.0),
+                // The range could only reject a stop.
+                range: None,
+                ..self
+            };
+        }
+        let most = self.ceiling.velocity.max(self.limits.velocity);
+        let velocity = (self.limits.velocity * rate).min(most);
+        let goal = match self.goal {
+            // Not `clamp`: it panics if a bound is NaN.
+            Goal::Velocity(goal) => Goal::Velocity((goal * rate).max(-velocity).min(velocity)),
+            Goal::Position(target) => Goal::Position(target),
+        };
+        Self {
+            goal,
+            limits: MotionLimits {
+                velocity,
+                ..self.limits
+            },
+            ..self
+        }
+    }
+
     /// Returns a move in the shortest time that the limits allow.
     #[must_use]
     pub const fn within(goal: Goal, limits: MotionLimits) -> Self {
@@ -58,6 +87,10 @@ impl MoveRequest {
 /// Follows a [`MoveRequest`]. Cheap to copy (some 400 bytes); allocates nothing.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct JerkLimited {
+    /// The request, and the rate at which it is executed.
+    nominal: MoveRequest,
+    rate: f64,
+    /// The request at this rate.
     order: MoveRequest,
     /// The limits of the profile, without the factor [`PLANNED`].
     used: MotionLimits,
@@ -105,7 +138,31 @@ impl JerkLimited {
     /// Returns the request of this move.
     #[must_use]
     pub const fn order(&self) -> &MoveRequest {
-        &self.order
+        &self.nominal
+    }
+
+    /// Multiplies the velocity of the request by `rate` ([`MoveRequest::at_rate`]). 0 stops on the
+    /// way, and a later rate continues from there. `motion` is the result of the last cycle. RT:
+    /// O(1), plans only if the rate changes.
+    ///
+    /// If no plan is possible, the present one continues and the next call tries again.
+    pub fn set_rate(&mut self, rate: f64, motion: Motion, dt_s: f64) {
+        let stops = self.nominal.goal == Goal::Velocity(0.0);
+        if rate == self.rate || stops || !rate.is_finite() {
+            return;
+        }
+        let nominal = self.nominal;
+        if let Goal::Position(target) = nominal.goal
+            && motion.stands_at(target)
+        {
+            self.rate = rate;
+        } else if let Ok(plan) = self.redirect(nominal.at_rate(rate), motion, dt_s) {
+            *self = Self {
+                nominal,
+                rate,
+                ..plan
+            };
+        }
     }
 
     /// Returns the limits of the motion: those of the request, or higher ones if these did not
@@ -179,6 +236,17 @@ impl JerkLimited {
         })
     }
 
+    /// Returns a move from rest at `rate`, stretched as a whole. Only before the first cycle. Moves
+    /// that arrive together still do.
+    #[must_use]
+    pub fn slowed(&self, rate: f64) -> Self {
+        let stretched = match rate > 0.0 && rate < 1.0 {
+            true => self.lasting(self.duration / rate),
+            false => None,
+        };
+        stretched.map_or(*self, |stretched| Self { rate, ..stretched })
+    }
+
     fn plan(
         order: MoveRequest,
         start: State,
@@ -227,6 +295,8 @@ impl JerkLimited {
         let (used, profile, span, outside) = chosen.ok_or(SetpointError::NoTime)?;
         outside.map_or(Ok(()), Err)?;
         Ok(Self {
+            nominal: order,
+            rate: 1.0,
             order,
             used,
             origin,
@@ -261,6 +331,8 @@ impl JerkLimited {
         };
         if let Ok(resumed) = Self::new(order, motion, dt_s) {
             *self = Self {
+                nominal: self.nominal,
+                rate: self.rate,
                 order: self.order,
                 ..resumed
             };
@@ -372,11 +444,15 @@ impl Setpoint for JerkLimited {
         self.last
     }
 
-    /// A velocity goal is finished when it is reached.
+    /// A velocity goal is finished when it is reached. A goal that is held by rate 0 is not
+    /// finished.
     fn finished(&self, motion: Motion) -> bool {
-        match self.order.goal {
-            Goal::Position(target) => motion.stands_at(target),
-            Goal::Velocity(velocity) => motion.velocity == velocity,
+        match (self.nominal.goal, self.order.goal) {
+            (Goal::Position(target), _) => motion.stands_at(target),
+            (Goal::Velocity(nominal), Goal::Velocity(velocity)) => {
+                (self.rate > 0.0 || nominal == 0.0) && motion.velocity == velocity
+            }
+            (Goal::Velocity(_), Goal::Position(_)) => false,
         }
     }
 }

@@ -339,6 +339,18 @@ class Machine:
         """Each axis stops as the machine file says and loses power. Needs no lease."""
         self.connection.request("emergency_stop")
 
+    def override(self, factor: float, group: str | None = None) -> None:
+        """Scales the speed of all motions, from 0 to 1.2; of the machine or of a group."""
+        self._await("override", factor=factor, group=group)
+
+    def hold(self, group: str | None = None) -> None:
+        """Holds all motions on their way. Needs no lease."""
+        self.connection.request("hold", group=group)
+
+    def resume(self, group: str | None = None) -> None:
+        """Lets held motions continue."""
+        self._await("resume", group=group)
+
     def input(self, device: str, name: str) -> float:
         return input_of(self.state, device, name)
 

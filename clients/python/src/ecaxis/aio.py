@@ -257,6 +257,18 @@ class Machine:
         """All axes decelerate and hold. Needs no lease."""
         await self.connection.request("stop")
 
+    async def override(self, factor: float, group: str | None = None) -> None:
+        """Scales the speed of all motions, from 0 to 1.2; of the machine or of a group."""
+        await self.command("override", "override", factor=factor, group=group)
+
+    async def hold(self, group: str | None = None) -> None:
+        """Holds all motions on their way. Needs no lease."""
+        await self.connection.request("hold", group=group)
+
+    async def resume(self, group: str | None = None) -> None:
+        """Lets held motions continue."""
+        await self.command("resume", "resume", group=group)
+
     async def input(self, device: str, name: str) -> float:
         return input_of(await self.state(), device, name)
 

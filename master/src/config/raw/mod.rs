@@ -36,6 +36,8 @@ table! { "the machine file",
         copies: Vec<RawCopy> as "copy",
         /// How the machine stops
         stop: RawStop,
+        /// Speed of all motions, and their hold
+        overrides: RawOverride as "override",
         /// Clients of `ecaxis serve`
         server: RawServer,
         /// The simulated bus: inputs that are switched by time
@@ -433,6 +435,21 @@ table! { "[stop]",
         emergency: Option<Conditions>,
         /// Axes that stop together (tables, `[[stop.group]]`; default none)
         groups: Vec<RawGroup> as "group",
+    }
+}
+
+table! { "[override]",
+    table RawOverride {
+        /// Override at the start (%, 0 to 120; default 100)
+        initial: Key<f64>,
+        /// Each condition alone holds the machine (conditions as in `wait`; default none)
+        hold: Option<Conditions>,
+        /// Input that multiplies the override (signal; default none)
+        input: Key<String>,
+        /// Value of the input at 0 % (number; default 0)
+        zero: Key<f64>,
+        /// Value of the input at 100 % (number, required with `input`)
+        full: Key<f64>,
     }
 }
 

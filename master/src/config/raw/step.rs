@@ -65,6 +65,8 @@ pub(crate) enum RawAction {
         timeout: Option<TimeLimit>,
     },
     Set(Levels),
+    /// Groups and their override in percent.
+    Override(Named<f64>),
     Assign {
         add: bool,
         values: Named<f64>,
@@ -146,7 +148,7 @@ table! { "a probe",
 /// The verbs, each with an example and the keys that go with it. The key of a step that is a verb
 /// defines the action.
 #[rustfmt::skip] // one row per verb
-const VERBS: [(&str, &str, &[&str]); 27] = [
+const VERBS: [(&str, &str, &[&str]); 28] = [
     ("enable", "enable = [\"x\"]", &[]),
     ("disable", "disable = true", &[]),
     ("reset", "reset = [\"x\"]", &[]),
@@ -167,6 +169,7 @@ const VERBS: [(&str, &str, &[&str]); 27] = [
     ("dwell", "dwell = \"500ms\"", &[]),
     ("wait", "wait = { io.\"Input 1\" = true }", &["timeout"]),
     ("set", "set = { io.\"Output 1\" = true }", &[]),
+    ("override", "override = 50", &[]),
     ("let", "let = { parts = 0 }", &[]),
     ("add", "add = { parts = 1 }", &[]),
     ("message", "message = \"load the magazine\"", &[]),
@@ -325,6 +328,13 @@ impl<'d> Step<'_, 'd> {
                 }
             }
             "set" => RawAction::Set(Levels::read(value, verb, p)?),
+            "override" => RawAction::Override(match value.get_ref() {
+                DeValue::Table(_) => self.named(value, p)?,
+                _ => {
+                    let machine = Spanned::new(value.span(), "machine".to_owned());
+                    vec![(machine, Spanned::read(value, verb, p)?)]
+                }
+            }),
             "let" | "add" => RawAction::Assign {
                 add: verb == "add",
                 values: self.named(value, p)?,
@@ -528,6 +538,7 @@ fn argument(verb: &str) -> Json {
         "dwell" => Ns::schema(),
         "wait" | "while" | "if" => RawWhen::schema(),
         "set" => Levels::schema(),
+        "override" => any_of([f64::schema(), named(f64::schema())]),
         "let" | "add" => named(f64::schema()),
         "message" | "alarm" => String::schema(),
         _ => any_of([schema::integer(1, 1_000_000), json!({ "enum": [FOREVER] })]),

@@ -298,6 +298,7 @@ impl ProgramState<'_, '_, '_, '_> {
             | Action::Dwell { .. }
             | Action::Wait { .. }
             | Action::Set { .. }
+            | Action::Override(_)
             | Action::Assign { .. }
             | Action::Message { .. }
             | Action::Alarm { .. } => {}

@@ -64,6 +64,7 @@ impl Engine {
     /// same cycle.
     pub(super) fn act(&mut self) {
         self.stop_missing_axes();
+        self.set_rates();
         // Gears form no loops, so every pass steps at least one axis.
         for _ in 0..self.axes.len() {
             let mut waiting = false;
@@ -111,7 +112,7 @@ impl Engine {
         let dt_s = slot.dt_s(self.config.cycle_ns);
         let lost = slot
             .generator
-            .advance(&mut slot.axis, &self.tables, master, dt_s);
+            .advance(&mut slot.axis, &self.tables, master, slot.rates, dt_s);
         let outputs = slot.axis.act();
         slot.write(self.exchange.outputs_mut(), &outputs);
         let status = slot.axis.status();

@@ -55,6 +55,8 @@ impl Engine {
                     signal.set(self.exchange.outputs_mut(), value);
                 }
             }
+            RtCommand::Override { group, factor } => self.overrides.set_factor(group, factor),
+            RtCommand::Hold { group, held } => self.overrides.set_hold(group, held),
             RtCommand::StartBusMonitor => {
                 self.guarding = true;
                 self.exchange.expect_op(true);
@@ -267,7 +269,8 @@ impl Engine {
                 return;
             }
             let status = slot.axis.status();
-            slot.generator.begin(start, &status, master, ring);
+            let rate = self.overrides.rate(slot.group);
+            slot.generator.begin(start, &status, master, ring, rate);
         }
     }
 

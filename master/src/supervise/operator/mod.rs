@@ -197,10 +197,16 @@ pub enum Request {
         output: OutputRef,
         value: f64,
     },
-    /// Scales the speed of all moves and velocities; above 0 and at most 1. A move to a position
-    /// follows at once, other motions from the next on.
+    /// Scales the speed of all motions of the machine (the first group) or of a group.
     Override {
+        group: GroupIndex,
+        /// From 0 to [`ecaxis_axis::MAX_RATE`].
         factor: f64,
+    },
+    /// Holds all motions of the machine or of a group on their way, or lets them continue.
+    Hold {
+        group: GroupIndex,
+        held: bool,
     },
     Program(ProgramRequest),
     /// Stops all axes and removes power as fast as possible, as configured for each axis.
@@ -228,6 +234,7 @@ impl Request {
             | Self::EmergencyStop
             | Self::SetOutput { .. }
             | Self::Override { .. }
+            | Self::Hold { .. }
             | Self::Program(_) => None,
         }
     }

@@ -26,8 +26,6 @@ pub struct AxisActivity {
     pub since: Nanos,
     /// The number of the request; 0 once its result is reported.
     pub(super) request: u64,
-    /// The speed of a move without the override.
-    pub(super) speed: f64,
 }
 
 /// The state of all axes in manual mode.
@@ -38,8 +36,6 @@ pub(super) struct RequestController {
     /// The maximum time in ns to wait for a drive.
     timeout: Nanos,
     shares: LimitShares,
-    /// The factor of all speeds.
-    speed_override: f64,
     /// The number of the request that is being taken.
     number: u64,
 }
@@ -89,14 +85,8 @@ impl RequestController {
             news: Pending::new(),
             timeout,
             shares,
-            speed_override: 1.0,
             number: 0,
         }
-    }
-
-    /// Returns the factor of all speeds.
-    pub fn speed_override(&self) -> f64 {
-        self.speed_override
     }
 
     fn refuse(&mut self, axis: AxisIndex, why: String) {
@@ -268,24 +258,11 @@ impl RequestController {
                 Ok((axis, doing, command)) => self.begin(axis, doing, command, scene, out),
                 Err((axis, why)) => self.refuse(axis, why),
             },
-            Request::Override { factor } => self.scale_speeds(factor, scene, out),
             // The loop that serves the operator takes these.
-            Request::SetOutput { .. } | Request::Program(_) => {}
-        }
-    }
-
-    /// Takes a new factor of all speeds. Moves to a position continue with it.
-    fn scale_speeds(&mut self, factor: f64, scene: &RequestContext<'_>, out: &mut Commands) {
-        if !(factor > 0.0 && factor <= 1.0) {
-            return;
-        }
-        self.speed_override = factor;
-        for (axis, hand) in self.hands.enumerate() {
-            if let Activity::Moving { by: false, value } = hand.doing
-                && scene.moving(axis)
-            {
-                out.push((axis, self.move_to(axis, value, hand.speed, scene)));
-            }
+            Request::SetOutput { .. }
+            | Request::Override { .. }
+            | Request::Hold { .. }
+            | Request::Program(_) => {}
         }
     }
 
@@ -372,7 +349,6 @@ impl RequestController {
                     by: true,
                     value: distance,
                 };
-                let speed = speed * self.speed_override;
                 let command = Command::MoveBy {
                     distance,
                     speed,
@@ -390,9 +366,6 @@ impl RequestController {
                     by: false,
                     value: position,
                 };
-                if let Some(hand) = self.hands.get_mut(axis) {
-                    hand.speed = speed;
-                }
                 Ok((axis, doing, self.move_to(axis, position, speed, scene)))
             }
             Request::Velocity { axis, velocity } => {
@@ -404,7 +377,6 @@ impl RequestController {
                     return Err((axis, why));
                 }
                 let doing = Activity::Turning { velocity };
-                let velocity = velocity * self.speed_override;
                 Ok((axis, doing, Command::Velocity { velocity, ramp }))
             }
             Request::Torque {
@@ -446,7 +418,7 @@ impl RequestController {
         });
         Command::MoveTo {
             position,
-            speed: speed * self.speed_override,
+            speed,
             ramp: self.shares.ramp,
         }
     }

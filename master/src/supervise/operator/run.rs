@@ -151,12 +151,6 @@ impl Supervisor {
         Ok(())
     }
 
-    /// Returns the factor of the program's speeds.
-    pub(in crate::supervise) fn speed_override(&self) -> f64 {
-        let attendance = self.attendance.as_ref();
-        attendance.map_or(1.0, |attendance| attendance.controller.speed_override())
-    }
-
     /// Calls the operator and carries out its requests. Fails if the operator ends the program.
     pub(in crate::supervise) async fn attend(&mut self, snapshot: &Snapshot) -> Result<(), Error> {
         let Some(mut attendance) = self.attendance.take() else {
@@ -216,7 +210,8 @@ impl Supervisor {
         }
         for (index, request) in turn.requests.into_iter().enumerate() {
             attendance.requests += 1;
-            if request.stops() || (there && index < MOST_REQUESTS) {
+            let stops = request.stops() || matches!(request, Request::Hold { held: true, .. });
+            if stops || (there && index < MOST_REQUESTS) {
                 attendance.take(request, &scene, &mut commands, out);
             } else {
                 attendance.refuse(request, "too many requests at once");
@@ -282,10 +277,10 @@ impl Attendance {
         match request {
             Request::Program(request) => self.take_program(request, scene),
             Request::SetOutput { output, value } => out.push(RtCommand::Output { output, value }),
-            Request::Override { .. } => {
-                self.controller
-                    .take(self.requests, request, scene, commands);
+            Request::Override { group, factor } => {
+                out.push(RtCommand::Override { group, factor });
             }
+            Request::Hold { group, held } => out.push(RtCommand::Hold { group, held }),
             // A motion by hand would disturb the program; a stop ends it.
             request if self.program.running && !request.stops() => {
                 self.refuse(request, "the program runs: stop it first");

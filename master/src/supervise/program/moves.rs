@@ -22,7 +22,6 @@ impl Supervisor {
         [speed, ramp]: [f64; 2],
     ) -> Result<(), Error> {
         let targets = self.destinations(relative, targets).await?;
-        let speed = speed * self.speed_override();
         self.move_and_wait(step, start, TargetKind::Position, &targets, |position| {
             Command::MoveTo {
                 position,

@@ -1,0 +1,249 @@
+//! Override and hold: the rate of all motions, for the machine and for each group.
+//!
+//! The rate of an axis is the product of the machine's factor and its group's, at most [`MAX_RATE`].
+//! It is 0 while one of both is held. Stops do not use the rate.
+
+use ecaxis_axis::MAX_RATE;
+use ecaxis_ecat::index::{GroupIndex, IndexVec};
+
+use super::config::Condition;
+use super::controller::InputRef;
+
+/// How the machine file sets the override.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OverrideConfig {
+    /// The machine's factor at the start, from 0 to [`MAX_RATE`].
+    pub initial: f64,
+    /// The conditions that hold the machine; one is enough.
+    pub hold: Vec<Condition>,
+    /// An input that multiplies the machine's factor.
+    pub input: Option<OverrideInput>,
+}
+
+impl Default for OverrideConfig {
+    fn default() -> Self {
+        Self {
+            initial: 1.0,
+            hold: Vec::new(),
+            input: None,
+        }
+    }
+}
+
+/// An input for the override: its values at 0 % and at 100 %.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct OverrideInput {
+    pub input: InputRef,
+    pub zero: f64,
+    pub full: f64,
+}
+
+/// Steps of an input, so that its noise does not plan every motion again.
+const STEP: f64 = 0.01;
+
+impl OverrideInput {
+    /// Returns the factor in whole steps; `before` unless the input has left its step. Without a
+    /// valid value it is 0. RT.
+    fn factor(&self, inputs: &[f64], before: f64) -> f64 {
+        let value = inputs.get(self.input.0).copied().unwrap_or(f64::NAN);
+        let factor = (value - self.zero) / (self.full - self.zero);
+        // Not `clamp`: NaN must become 0.
+        let factor = factor.max(0.0).min(MAX_RATE);
+        if (factor - before).abs() < STEP * 0.75 {
+            return before;
+        }
+        (factor / STEP).round() * STEP
+    }
+}
+
+/// The override of the machine or of one group.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Override {
+    /// From 0 to [`MAX_RATE`].
+    pub factor: f64,
+    pub held: bool,
+}
+
+impl Default for Override {
+    fn default() -> Self {
+        Self {
+            factor: 1.0,
+            held: false,
+        }
+    }
+}
+
+/// The overrides of a machine.
+#[derive(Debug)]
+pub(super) struct Overrides {
+    config: OverrideConfig,
+    /// Requested for each group; the first entry is the machine's.
+    requested: IndexVec<GroupIndex, Override>,
+    /// What the inputs demand of the machine.
+    input: Override,
+    /// The present rate of the tables of each group.
+    pub tables: IndexVec<GroupIndex, f64>,
+}
+
+/// The rates of one axis in one cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rates {
+    pub own: f64,
+    /// The lowest rate of all axes on lines.
+    pub line: f64,
+    /// The rate of the tables of the group.
+    pub table: f64,
+}
+
+impl Rates {
+    pub const WHOLE: Self = Self {
+        own: 1.0,
+        line: 1.0,
+        table: 1.0,
+    };
+}
+
+impl Overrides {
+    #[allow(
+        clippy::disallowed_methods,
+        clippy::disallowed_macros,
+        reason = "runs before the loop"
+    )]
+    pub fn new(config: OverrideConfig, groups: usize) -> Self {
+        let mut requested: IndexVec<GroupIndex, _> = vec![Override::default(); groups].into();
+        if let Some(machine) = requested.get_mut(GroupIndex::MACHINE) {
+            machine.factor = config.initial;
+        }
+        Self {
+            config,
+            requested,
+            input: Override::default(),
+            tables: vec![1.0; groups].into(),
+        }
+    }
+
+    /// Sets the factor of the machine or of a group. Invalid factors are ignored. RT.
+    pub fn set_factor(&mut self, group: GroupIndex, factor: f64) {
+        if let Some(own) = self.requested.get_mut(group)
+            && (0.0..=MAX_RATE).contains(&factor)
+        {
+            own.factor = factor;
+        }
+    }
+
+    /// Holds or releases the machine or a group. RT.
+    pub fn set_hold(&mut self, group: GroupIndex, held: bool) {
+        if let Some(own) = self.requested.get_mut(group) {
+            own.held = held;
+        }
+    }
+
+    /// Reads the inputs. A missing or NaN input holds the machine. RT.
+    pub fn read(&mut self, inputs: &[f64]) {
+        let holds = |c: &Condition| {
+            let value = inputs.get(c.input.0);
+            value.is_none_or(|n| n.is_nan() || c.bounds.holds(*n))
+        };
+        let before = self.input.factor;
+        self.input = Override {
+            factor: (self.config.input).map_or(1.0, |input| input.factor(inputs, before)),
+            held: self.config.hold.iter().any(holds),
+        };
+    }
+
+    /// Returns the override of the machine, or that of a group alone. RT.
+    pub fn of(&self, group: GroupIndex) -> Override {
+        let own = self.requested.get(group).copied().unwrap_or_default();
+        if group != GroupIndex::MACHINE {
+            return own;
+        }
+        Override {
+            factor: (own.factor * self.input.factor).min(MAX_RATE),
+            held: own.held || self.input.held,
+        }
+    }
+
+    /// Returns the rate of the axes of a group. RT.
+    pub fn rate(&self, group: GroupIndex) -> f64 {
+        let machine = self.of(GroupIndex::MACHINE);
+        let own = match group {
+            GroupIndex::MACHINE => Override::default(),
+            group => self.of(group),
+        };
+        if machine.held || own.held {
+            return 0.0;
+        }
+        (machine.factor * own.factor).min(MAX_RATE)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rt::config::Bounds;
+
+    const ONE: GroupIndex = GroupIndex(1);
+
+    #[test]
+    fn rate_is_the_product_and_0_in_a_hold() {
+        let mut all = Overrides::new(OverrideConfig::default(), 2);
+        for (machine, group, expected) in [
+            (1.0, 1.0, 1.0),
+            (0.5, 0.5, 0.25),
+            (1.2, 1.2, 1.2),
+            (0.0, 1.0, 0.0),
+        ] {
+            all.set_factor(GroupIndex::MACHINE, machine);
+            all.set_factor(ONE, group);
+            assert_eq!(all.rate(ONE), expected);
+            assert_eq!(all.rate(GroupIndex::MACHINE), machine);
+        }
+        for invalid in [f64::NAN, -0.1, 1.21] {
+            all.set_factor(ONE, invalid);
+        }
+        assert_eq!(all.of(ONE).factor, 1.0);
+        all.set_factor(GroupIndex::MACHINE, 0.8);
+        all.set_hold(ONE, true);
+        assert_eq!([all.rate(ONE), all.rate(GroupIndex::MACHINE)], [0.0, 0.8]);
+        all.set_hold(ONE, false);
+        all.set_hold(GroupIndex::MACHINE, true);
+        assert_eq!([all.rate(ONE), all.rate(GroupIndex::MACHINE)], [0.0, 0.0]);
+    }
+
+    #[test]
+    fn inputs_hold_and_scale_and_a_missing_one_holds() {
+        let bounds = Bounds {
+            equal: Some(0.0),
+            ..Bounds::default()
+        };
+        let input = InputRef(0);
+        let mut all = Overrides::new(
+            OverrideConfig {
+                initial: 1.0,
+                hold: vec![Condition { input, bounds }],
+                input: Some(OverrideInput {
+                    input: InputRef(1),
+                    zero: 100.0,
+                    full: 1100.0,
+                }),
+            },
+            1,
+        );
+        for (inputs, expected) in [
+            (&[1.0, 1100.0][..], 1.0),
+            (&[1.0, 1104.0], 1.0),
+            (&[1.0, 607.0], 0.51),
+            (&[1.0, 604.0], 0.51),
+            (&[1.0, 99_999.0], MAX_RATE),
+            (&[1.0, -5.0], 0.0),
+            (&[1.0, f64::NAN], 0.0),
+            (&[0.0, 1100.0], 0.0),
+            (&[f64::NAN, 1100.0], 0.0),
+            (&[], 0.0),
+        ] {
+            all.read(inputs);
+            let rate = all.rate(GroupIndex::MACHINE);
+            assert!((rate - expected).abs() < 1e-12, "{inputs:?}: {rate}");
+        }
+    }
+}
