@@ -183,6 +183,39 @@ def test_set_points_in_every_cycle_with_a_busy_thread():
         assert machine.wait_until(lambda: machine.x.state["at_rest"], timeout=5)
 
 
+def test_set_points_end_with_the_lease():
+    interval = sys.getswitchinterval()
+    with ecaxis.open(DEMO, sim=True, lease=0.4) as machine, ecaxis.attach(machine._path, take=False) as other:
+        machine.x.enable()
+        with machine.cyclic() as cyclic:
+            assert sys.getswitchinterval() < interval and not cyclic.x.stopped
+            with pytest.raises(ecaxis.NotOwner):
+                for cycle in cyclic.cycles(seconds=5):
+                    cyclic.x.position = cyclic.x.target_position
+                    if cycle > 200 and not other._owns:
+                        other.take(force=True)
+        assert sys.getswitchinterval() == interval
+
+
+def test_an_axis_that_has_stopped_follows_again():
+    with ecaxis.open(DEMO, sim=True) as machine:
+        machine.x.enable()
+        with machine.cyclic() as cyclic:
+            start = cyclic.x.target_position
+            released = followed = False
+            for _ in cyclic.cycles(seconds=2):
+                if cyclic.x.stopped:
+                    cyclic.x.release()
+                    released = True
+                elif not released:
+                    # A jump is refused.
+                    cyclic.x.position = start + 10.0
+                elif cyclic.x.target_velocity == 0.0:
+                    cyclic.x.position = cyclic.x.target_position
+                    followed = True
+            assert released and followed and not cyclic.x.stopped and cyclic.refused == 1
+
+
 def test_a_killed_program_leaves_its_axis_at_rest(tmp_path):
     with ecaxis.open(DEMO, sim=True) as machine:
         machine.enable()

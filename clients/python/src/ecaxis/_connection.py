@@ -18,6 +18,8 @@ Answer = Dict[str, Any]
 
 # Outcomes that came before the answer that names their request.
 _KEPT = 1024
+# No request has the number 0.
+_RENEWAL = b'{"id": 0, "op": "renew"}\n'
 OUTCOMES = frozenset({"done", "failed", "refused", "replaced", "let_go"})
 
 
@@ -53,6 +55,7 @@ class Connection:
         self._descriptors: List[int] = []
         self._listeners: List[Callable[[Event], None]] = []
         self._lost: Optional[ConnectionLost] = None
+        self._lease_ended: Optional[EcaxisError] = None
         self._reader = threading.Thread(target=self._read, name="ecaxis", daemon=True)
         self._reader.start()
 
@@ -95,6 +98,18 @@ class Connection:
         if not answer["ok"]:
             raise of_answer(answer["error"])
         return answer
+
+    def renew(self) -> None:
+        """Renews the lease without a wait for the answer: while another thread holds the interpreter's
+        lock, each wait costs milliseconds. Raises once the server has refused a renewal."""
+        with self._lock:
+            ended, self._lease_ended = self._lost or self._lease_ended, None
+        if ended:
+            raise ended
+        try:
+            self._socket.sendall(_RENEWAL)
+        except OSError as error:
+            raise ConnectionLost(f"the connection is lost: {error.strerror}") from error
 
     def command(self, op: str, **keys: Any) -> Outcome:
         """Sends a command. Returns its outcome, which comes later."""
@@ -160,6 +175,8 @@ class Connection:
         if "ok" in message:
             with self._lock:
                 answers = self._answers.get(message.get("id", 0))
+                if message.get("id") == 0 and not message["ok"]:
+                    self._lease_ended = of_answer(message["error"])
             if answers:
                 answers.put(dict(message))
             return

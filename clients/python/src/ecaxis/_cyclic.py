@@ -7,6 +7,7 @@ import mmap
 import os
 import platform
 import struct
+import sys
 import time
 from types import TracebackType
 from typing import Any, Dict, Iterator, List, Mapping, Optional, Type
@@ -15,10 +16,12 @@ from ._connection import Connection
 from ._errors import ConnectionLost, EcaxisError, TimedOut
 
 _ROWS_AT, _ROW_WORDS, _ROWS, _CYCLE_NS, _WRITTEN, _NEXT_NS, _TEXT_AT, _TEXT_BYTES = range(2, 10)
-_AXES_AT, _AXIS_WORDS, _AXES, _SEQUENCE, _COUNTER, _FROM_ROW, _, _USED, _STALE, _REFUSED = range(2, 12)
+_AXES_AT, _AXIS_WORDS, _AXES, _SEQUENCE, _COUNTER, _FROM_ROW, _, _USED, _LATE, _REFUSED, _BLOCKED = range(2, 13)
 _NOTHING, _POSITION, _VELOCITY, _TORQUE = range(4)
 _POLL_S = 20e-6
 _NO_CYCLE_S = 1.0
+# The shortest interval for which threads of the program keep the interpreter's lock.
+_SWITCH_S = 100e-6
 
 
 class CyclicAxis:
@@ -57,6 +60,17 @@ class CyclicAxis:
     def release(self) -> None:
         """The axis decelerates and holds; it follows no set-points until the next one."""
         self._cyclic.set(self._number, _NOTHING, 0.0)
+
+    @property
+    def stopped(self) -> bool:
+        """True if the server has refused a set-point, or none came in time: the axis has stopped. It
+        follows again after a cycle with `release`, once it stands."""
+        return self._cyclic.stopped(self._number)
+
+    @property
+    def target_velocity(self) -> float:
+        """The velocity of the set-point: 0 once the axis holds."""
+        return self._cyclic.value(f"{self.name}.target_velocity")
 
     @property
     def target_position(self) -> float:
@@ -111,6 +125,9 @@ class Cyclic:
         self._counter = self._commands[_COUNTER]
         self._row = self._samples[_WRITTEN]
         self._renewed = 0.0
+        # A thread that computes keeps the interpreter's lock this long, by default for 5 ms.
+        self._switch_interval = sys.getswitchinterval()
+        sys.setswitchinterval(min(self._switch_interval, max(self.cycle_s / 2, _SWITCH_S)))
         return self
 
     def __exit__(
@@ -119,6 +136,7 @@ class Cyclic:
         error: Optional[BaseException],
         trace: Optional[TracebackType],
     ) -> None:
+        sys.setswitchinterval(self._switch_interval)
         # What still moves decelerates and holds: an end is not a program that is late.
         for axis in self.axes.values():
             axis.release()
@@ -145,12 +163,15 @@ class Cyclic:
     @property
     def late(self) -> int:
         """In how many cycles the server had no new set."""
-        return int(self._commands[_STALE])
+        return int(self._commands[_LATE])
 
     @property
     def refused(self) -> int:
         """How many set-points the server has refused."""
         return int(self._commands[_REFUSED])
+
+    def stopped(self, axis: int) -> bool:
+        return bool(self._commands[_BLOCKED] >> min(axis, 63) & 1)
 
     def value(self, signal: str) -> float:
         """Returns a signal of the last cycle."""
@@ -187,14 +208,13 @@ class Cyclic:
     def wait(self) -> int:
         """Waits for the next cycle. Returns how many have passed: more than 1 if some were missed."""
         begin = time.monotonic()
+        if begin - self._renewed > self._lease_s / 4:
+            self._connection.renew()
+            self._renewed = begin
         while self._samples[_WRITTEN] == self._row:
             time.sleep(_POLL_S)
             if time.monotonic() - begin > _NO_CYCLE_S:
                 raise ConnectionLost("no cycle for a second: the server has ended, or the bus is down")
-        now = time.monotonic()
-        if now - self._renewed > self._lease_s / 4:
-            self._connection.request("renew")
-            self._renewed = now
         written = self._samples[_WRITTEN]
         passed, self._row = written - self._row, written
         return int(passed)
