@@ -8,6 +8,7 @@
 """
 
 import pathlib
+import shlex
 import tempfile
 
 from launch import LaunchDescription
@@ -25,17 +26,16 @@ def spawner(*controllers):
 
 
 def generate_launch_description():
-    server = ["ecaxis serve", str(HERE / "cell.toml"), LaunchConfiguration("bus"), "--socket", SOCKET]
+    # The argument may be two words, so a shell splits the line.
+    machine, socket = shlex.quote(str(HERE / "cell.toml")), shlex.quote(SOCKET)
+    server = ["exec ecaxis serve ", machine, " ", LaunchConfiguration("bus"), " --socket ", socket]
     # The interfaces are those of the URDF: arrays of ros2_control have no values of other joints.
     node = ["ecaxis-ros2", SOCKET, "--states", "/ecaxis/joint_states"]
     node += ["--interfaces", "arm=position", "--interfaces", "slide=position", "--interfaces", "wheel=velocity"]
-    command = []
-    for part in server:
-        command += [part, " "]
     return LaunchDescription(
         [
             DeclareLaunchArgument("bus", default_value="--sim"),
-            ExecuteProcess(cmd=[command], shell=True, output="screen"),
+            ExecuteProcess(cmd=[server], shell=True, output="screen"),
             ExecuteProcess(cmd=node, output="screen", respawn=True, respawn_delay=1.0),
             Node(
                 package="robot_state_publisher",

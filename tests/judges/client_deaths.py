@@ -19,8 +19,9 @@ import tempfile
 import time
 
 import rig
-from realtime_clients import MACHINE, Watcher, move_back, within_limits
+from realtime_clients import LIMITS, MACHINE, Watcher, move_back
 from report import Report
+from server import limit_broken
 
 CLIENTS = rig.ROOT / "clients"
 sys.path.insert(0, str(CLIENTS / "linuxcnc/tests"))
@@ -81,7 +82,7 @@ def trial(report, watcher, client, number):
             send(signal.SIGCONT)
             time.sleep(0.3)
             still = watcher.ask("state")["axes"][0]["target_position"] == axis["target_position"]
-    wrong, targets = within_limits(rows), [target for *_, target in rows]
+    wrong, targets = limit_broken(rows, *LIMITS), [target for _, target, _ in rows]
     ok = free and still and axis["at_rest"] and targets[-1] == targets[-50] and not wrong
     if not ok:
         report.note(f"{signal.Signals(number).name}: {wrong}; lease ended {free}; rests after SIGCONT {still}; {axis}")

@@ -24,29 +24,16 @@ import time
 
 import rig
 from report import Report
+from server import Server, limit_broken
 
 CLIENTS = rig.ROOT / "examples/clients"
 MACHINE = rig.ROOT / "configs/demo.toml"
-VELOCITY, ACCELERATION, RANGE = 250.0, 2500.0, 60.0  # configs/demo.toml
+LIMITS = 250.0, 2500.0, 60.0  # configs/demo.toml: velocity, acceleration, range
 TTL_S = 0.5
 
 
-class Watcher:
+class Watcher(Server):
     """Reads events, and the samples in shared memory."""
-
-    def __init__(self, path):
-        self.socket = socket.socket(socket.AF_UNIX)
-        self.socket.settimeout(30)
-        self.socket.connect(str(path))
-        self.lines = self.socket.makefile("r")
-
-    def ask(self, op, **keys):
-        self.socket.sendall(json.dumps({"op": op, "id": op, **keys}).encode() + b"\n")
-        while (answer := json.loads(self.lines.readline())).get("id") != op:
-            pass
-        if not answer["ok"]:
-            raise RuntimeError(answer["error"]["message"])
-        return answer
 
     def map_samples(self):
         """The area goes to an owner only; this one gives the lease back."""
@@ -62,26 +49,11 @@ class Watcher:
         self.ask("release")
 
     def targets(self, first):
-        """Yields the time in ns, whether the inputs are of this cycle, and the target of each cycle."""
+        """Yields the time in ns, the target, and whether the inputs are of this cycle, of each cycle."""
         words = self.words
         for row in range(first, words[6]):
             at = words[2] + row % words[4] * words[3]
-            yield words[at + 1], words[at + 3] & 1, self.numbers[at + self.target]
-
-
-def within_limits(rows, dt=1e-3):
-    """Returns what exceeds the limits of the machine file, or None.
-
-    A computer that skipped cycles has not sent the target before them: the drive stands at an earlier one. While no answer
-    comes, the set-point waits, as the drive does.
-    """
-    for (begin, *_, a), (_, _, b), (end, fresh, c) in zip(rows, rows[1:], rows[2:]):
-        if end - begin > 2.5e9 * dt or not fresh:
-            continue
-        velocity, change = (c - b) / dt, abs(c - 2 * b + a) / dt**2
-        if abs(velocity) > VELOCITY * 1.000001 or change > ACCELERATION * 1.0001 or abs(c) > RANGE:
-            return f"{a}, {b}, {c}: {velocity:.1f} mm/s, {change:.0f} mm/s²"
-    return None
+            yield words[at + 1], self.numbers[at + self.target], words[at + 3] & 1
 
 
 def move_back(watcher):
@@ -106,7 +78,7 @@ def trial(report, watcher, name, command, kill):
         axis = watcher.ask("state")["axes"][0]
         rows = list(watcher.targets(first))
         ended = [e for e in watcher.ask("events", after=events)["events"] if e["event"] in ("lease", "area")]
-    wrong, targets = within_limits(rows), [target for *_, target in rows]
+    wrong, targets = limit_broken(rows, *LIMITS), [target for _, target, _ in rows]
     moved = max(targets) - min(targets)
     names = any(name in json.dumps(event) and event.get("why") in ("expired", "disconnected") for event in ended)
     ok = axis["at_rest"] and axis["enabled"] and targets[-1] == targets[-50] and names and not wrong

@@ -14,15 +14,17 @@ import os
 import pathlib
 import random
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from unittest import mock
 
 import rig
+from launch_file import processes
 from report import Report, Stop
+from server import Server, limit_broken
 
 # Nothing else on this computer has this domain, and the participants only use it.
 os.environ["ROS_DOMAIN_ID"] = str(random.SystemRandom().randint(20, 100))
@@ -35,30 +37,11 @@ MM, DEG, TURN = 1e-3, math.pi / 180, 2 * math.pi
 SCALE = {"arm": DEG, "slide": MM, "wheel": TURN}
 # examples/ros2/cell.toml, in rad and m.
 LIMITS = {"arm": (180 * DEG, 1800 * DEG, 120 * DEG), "slide": (0.25, 2.5, 0.06)}
+# In units of the axis.
+SLIDE_LIMITS = [limit / MM for limit in LIMITS["slide"]]
 FAULTS = '[[fault]]\nkind = "drive-fault"\ndevice = 1\nat = "9s"\ncode = 0x4210\n'
 TTL_S = 1.0
 STALE_MS = 500
-
-
-class Server:
-    """The socket of the server, for comparison with what the node publishes."""
-
-    def __init__(self, path):
-        self.socket = socket.socket(socket.AF_UNIX)
-        self.socket.settimeout(30)
-        self.socket.connect(str(path))
-        self.lines = self.socket.makefile("r")
-
-    def ask(self, op, **keys):
-        self.socket.sendall(json.dumps({"op": op, "id": op, **keys}).encode() + b"\n")
-        while (answer := json.loads(self.lines.readline())).get("id") != op:
-            pass
-        if not answer["ok"]:
-            raise RuntimeError(answer["error"]["message"])
-        return answer
-
-    def axis(self, name):
-        return next(axis for axis in self.ask("state")["axes"] if axis["name"] == name)
 
 
 class Samples:
@@ -85,18 +68,6 @@ class Samples:
         while not self.rows or self.rows[-1][0] < end:
             time.sleep(0.01)
         return list(self.rows)
-
-
-def limit_broken(rows, limits, scale):
-    """Returns how a set-point exceeds its limits, or None. Cycles that the computer skipped are left out."""
-    velocity, acceleration, reach = (limit / scale for limit in limits)
-    for (t0, a), (t1, b), (t2, c) in zip(rows, rows[1:], rows[2:]):
-        if t2 - t0 > 2.5e6 or None in (a, b, c):
-            continue
-        v, change = abs(c - b) / 1e-3, abs(c - 2 * b + a) / 1e-6
-        if v > velocity * 1.000001 or change > acceleration * 1.0001 or abs(c) > reach * 1.000001:
-            return f"{a}, {b}, {c}: velocity {v:.1f}, acceleration {change:.0f}"
-    return None
 
 
 class Ros:
@@ -359,7 +330,7 @@ def sine(report, ros, path, server, seconds):
     rows = samples.until_now()
     targets = [target for _, target in rows]
     report.check("it moves through the whole sine", max(targets) - min(targets) > 18, f"{max(targets) - min(targets):.2f} mm")
-    broken = limit_broken(rows, LIMITS["slide"], MM)
+    broken = limit_broken(rows, *SLIDE_LIMITS)
     report.check("within the limits", not broken, broken or f"{len(rows)} cycles")
     report.check("without commands, the joint rests", server.axis("slide")["at_rest"] and targets[-1] == targets[-100])
     report.check("and the axis keeps its power", server.axis("slide")["enabled"])
@@ -405,7 +376,7 @@ def trajectories(report, ros, path, server):
     ros.spin(0.3)
     at = [ros.joint(name)[0] for name in ("arm", "slide")]
     report.check("and ends at its last point", abs(at[0] + 0.1) < 1e-3 and abs(at[1] - 0.015) < 1e-5, at)
-    broken = limit_broken(samples.until_now(), LIMITS["slide"], MM)
+    broken = limit_broken(samples.until_now(), *SLIDE_LIMITS)
     report.check("within the limits", not broken, broken or "")
     ros.trajectories.publish(trajectory((1.0, (0.3, -0.02)), (2.0, (-0.1, 0.015))))
     ros.spin(0.7)
@@ -515,7 +486,7 @@ def death(ros, programs, what, kill):
             node.send_signal(signal.SIGCONT)
     if max(targets) - min(targets) < 1.0:
         return "it has not moved"
-    broken = limit_broken(rows, LIMITS["slide"], MM)
+    broken = limit_broken(rows, *SLIDE_LIMITS)
     if broken or not axis["at_rest"] or not axis["enabled"] or len(set(targets[-100:])) > 1:
         return f"{broken} {axis}"
     return None
@@ -560,11 +531,44 @@ def example(report, program, node):
     report.check("the controllers have the joints", all(name in controllers for name in names))
 
 
+def launched(report, ros, programs):
+    """The processes of the launch file, in a folder whose name has a space. ros2_control and its controllers are left out."""
+    from sensor_msgs.msg import JointState
+
+    report.section("launch file")
+    states = []
+    subscription = ros.node.create_subscription(JointState, "/ecaxis/joint_states", states.append, 10)
+    with tempfile.TemporaryDirectory(prefix="ecaxis judge-") as temporary, contextlib.ExitStack() as stack:
+        folder, bin = pathlib.Path(temporary), pathlib.Path(temporary) / "bin"
+        bin.mkdir()
+        for name, program in zip(("ecaxis", "ecaxis-ros2"), programs):
+            (bin / name).symlink_to(program)
+        for file in EXAMPLE.iterdir():
+            text = file.read_text() if file.is_file() else ""
+            (folder / file.name).write_text(text.replace("../../configs", str(rig.ROOT / "configs")))
+        environment = {**os.environ, "PATH": f"{bin}:{os.environ['PATH']}"}
+        stack.enter_context(mock.patch.object(tempfile, "tempdir", temporary))
+        children = []
+        for command, shell in processes(folder / "cell.launch.py"):
+            child = rig.process(command, shell=shell, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            children.append(stack.enter_context(child))
+        report.equal("the server and the node", len(children), 2)
+        report.check("joint states come for ros2_control", ros.wait(lambda: states), len(states))
+        report.equal("their names", states[-1].name if states else None, list(SCALE))
+        # A busy computer stalls for longer than this machine may.
+        report.check("the services enable", ros.wait(lambda: ros.call("reset")[0] and ros.call("enable")[0]), ros.call("enable"))
+        # As launch does at Ctrl-C.
+        for child in children:
+            child.send_signal(signal.SIGINT)
+        report.equal("all end well at Ctrl-C", [child.wait(20) for child in children], [0, 0])
+    ros.node.destroy_subscription(subscription)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=1, help="of each death")
     parser.add_argument("--seconds", type=float, default=10.0, help="of the sine")
-    parser.add_argument("--only", choices=["deaths"], help="run this section alone")
+    parser.add_argument("--only", choices=["deaths", "launch"], help="run this section alone")
     arguments = parser.parse_args()
     try:
         import rclpy  # noqa: F401
@@ -588,7 +592,11 @@ def main():
                 second_node(report, ros, programs, path, server)
             fault(report, ros, programs)
             square(report, ros, programs)
-        deaths(report, ros, programs, arguments.trials)
+            launched(report, ros, programs)
+        if arguments.only == "launch":
+            launched(report, ros, programs)
+        else:
+            deaths(report, ros, programs, arguments.trials)
     except Stop:
         pass
     ros.rclpy.shutdown()

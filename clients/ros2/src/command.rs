@@ -3,19 +3,13 @@
 //! `ros2_control` fills each array with the values of the joints that have this interface. An array
 //! may therefore be shorter than `name`. NaN means no command.
 
+use ecaxis_client::SetPoint;
+
 use crate::joints::{Interface, Joint};
 use crate::messages::JointState;
 
-/// A set-point of a joint, in units of its axis or percent of the rated torque.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Wanted {
-    Position(f64),
-    Velocity(f64),
-    Torque(f64),
-}
-
-/// Returns the set-point of each joint; `None` without a command. `modes` are the modes of
-/// operation of the joints.
+/// Returns the set-point of each joint, in units of its axis; `None` without a command. `modes` are
+/// the modes of operation of the joints.
 ///
 /// # Errors
 /// Says why the whole message is refused.
@@ -23,7 +17,7 @@ pub fn read_command(
     message: &JointState,
     joints: &[Joint],
     modes: &[i8],
-) -> Result<Vec<Option<Wanted>>, String> {
+) -> Result<Vec<Option<SetPoint>>, String> {
     let arrays = [
         (Interface::Position, &message.position),
         (Interface::Velocity, &message.velocity),
@@ -95,7 +89,7 @@ fn places(
     ))
 }
 
-fn wanted(values: [Option<f64>; 3], joint: &Joint, mode: i8) -> Result<Option<Wanted>, String> {
+fn wanted(values: [Option<f64>; 3], joint: &Joint, mode: i8) -> Result<Option<SetPoint>, String> {
     let name = &joint.name;
     let Some(interface) = Interface::of_mode(mode) else {
         return Ok(None);
@@ -130,7 +124,7 @@ fn wanted(values: [Option<f64>; 3], joint: &Joint, mode: i8) -> Result<Option<Wa
                     "`{name}` to {value:.6}: outside the range {low:.6} to {high:.6}"
                 ));
             }
-            Ok(Some(Wanted::Position(value)))
+            Ok(Some(SetPoint::Position(value)))
         }
         Interface::Velocity if value.abs() > joint.limits.velocity => {
             let limit = joint.limits.velocity * joint.scale.abs();
@@ -139,12 +133,12 @@ fn wanted(values: [Option<f64>; 3], joint: &Joint, mode: i8) -> Result<Option<Wa
                 "velocity {value:.6} of `{name}`: the limit is {limit:.6}"
             ))
         }
-        Interface::Velocity => Ok(Some(Wanted::Velocity(value))),
+        Interface::Velocity => Ok(Some(SetPoint::Velocity(value))),
         Interface::Effort => match joint.max_torque {
             Some(most) if value.abs() > most => Err(format!(
                 "{value:.1} % of the rated torque for `{name}`: the limit is {most:.1} %"
             )),
-            _ => Ok(Some(Wanted::Torque(value))),
+            _ => Ok(Some(SetPoint::Torque(value))),
         },
     }
 }
@@ -202,9 +196,9 @@ mod tests {
         assert_eq!(
             read,
             [
-                Some(Wanted::Position(20.0)),
-                Some(Wanted::Velocity(50.0)),
-                Some(Wanted::Torque(25.0)),
+                Some(SetPoint::Position(20.0)),
+                Some(SetPoint::Velocity(50.0)),
+                Some(SetPoint::Torque(25.0)),
             ]
         );
     }
@@ -214,9 +208,9 @@ mod tests {
         let mut joints = [joint("a", 0), joint("b", 1), joint("c", 2)];
         let sent = message(&["a", "b", "c"], &[0.01, 0.03], &[0.05], &[]);
         let expected = [
-            Some(Wanted::Position(10.0)),
-            Some(Wanted::Velocity(50.0)),
-            Some(Wanted::Position(30.0)),
+            Some(SetPoint::Position(10.0)),
+            Some(SetPoint::Velocity(50.0)),
+            Some(SetPoint::Position(30.0)),
         ];
         // From the modes, or from the options.
         assert_eq!(

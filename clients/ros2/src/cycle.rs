@@ -2,24 +2,13 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender};
-use std::thread::sleep;
-use std::time::{Duration, Instant};
 
 use ecaxis_axis::{State, Statusword};
-use rustix::time::{ClockId, clock_gettime};
+use ecaxis_client::{AxisNumber, Cyclic, Samples, SetPoint, Signal};
 
-use crate::command::Wanted;
 use crate::follower::{AxisInput, End, Follower, Publisher, Refusal};
 use crate::joints::Joint;
-use crate::server::{Commands, Samples};
 use crate::trajectory::{Plan, Start};
-
-/// The pause between two looks at the samples.
-const POLL: Duration = Duration::from_micros(20);
-/// The time after which a bus without cycles is given up.
-const NO_CYCLE: Duration = Duration::from_secs(1);
-/// Bits of the flags of a row.
-const IN_OP: u64 = 2;
 
 /// A message to the cycle.
 #[derive(Debug)]
@@ -27,7 +16,7 @@ pub enum Message {
     /// A command for each joint.
     Command {
         publisher: Publisher,
-        wanted: Vec<Option<Wanted>>,
+        wanted: Vec<Option<SetPoint>>,
     },
     /// A checked trajectory, and who learns that it does not begin.
     Trajectory(Vec<Plan>),
@@ -47,99 +36,62 @@ pub enum Report {
     Stopped { held: bool },
 }
 
-/// Where the values of an axis are in a row.
+/// Where an axis is in the area.
 #[derive(Debug, Clone, Copy)]
 pub struct Columns {
-    pub position: usize,
-    pub velocity: usize,
-    pub torque: usize,
-    target_position: usize,
-    target_velocity: usize,
-    statusword: usize,
-    mode: usize,
+    axis: AxisNumber,
+    pub position: Signal,
+    pub velocity: Signal,
+    pub torque: Signal,
+    target_position: Signal,
+    target_velocity: Signal,
+    statusword: Signal,
+    mode: Signal,
 }
 
 impl Columns {
     /// Returns the columns of each joint.
     ///
     /// # Errors
-    /// Names the signal that is missing.
-    pub fn of_joints(samples: &Samples, joints: &[Joint]) -> Result<Vec<Self>, String> {
+    /// Names the axis or the signal that is missing.
+    pub fn of_joints(cyclic: &Cyclic, joints: &[Joint]) -> ecaxis_client::Result<Vec<Self>> {
         let of_joint = |joint: &Joint| {
-            let word = |value: &str| {
-                let name = format!("{}.{value}", joint.axis);
-                samples
-                    .signal(&name)
-                    .ok_or_else(|| format!("the samples have no `{name}`"))
-            };
+            let signal = |value: &str| cyclic.signal(&format!("{}.{value}", joint.axis));
             Ok(Self {
-                position: word("position")?,
-                velocity: word("velocity")?,
-                torque: word("torque")?,
-                target_position: word("target_position")?,
-                target_velocity: word("target_velocity")?,
-                statusword: word("statusword")?,
-                mode: word("mode")?,
+                axis: cyclic.axis(&joint.axis)?,
+                position: signal("position")?,
+                velocity: signal("velocity")?,
+                torque: signal("torque")?,
+                target_position: signal("target_position")?,
+                target_velocity: signal("target_velocity")?,
+                statusword: signal("statusword")?,
+                mode: signal("mode")?,
             })
         };
         joints.iter().map(of_joint).collect()
     }
 
-    /// Returns the state of the axis in a row.
+    /// Returns the state of the axis in the last cycle.
     #[must_use]
-    pub fn start(&self, row: &[u64]) -> Start {
-        let in_op = row.get(3).is_some_and(|flags| flags & IN_OP != 0);
-        let word = value(row, self.statusword);
+    pub fn start(&self, samples: &Samples) -> Start {
+        let word = samples.value(self.statusword);
         let state = State::from_statusword(Statusword::from_bits_retain(word as u16));
         Start {
-            position: value(row, self.target_position),
-            enabled: in_op && !word.is_nan() && state == State::OperationEnabled,
-            stands: value(row, self.target_velocity) == 0.0,
-            mode: value(row, self.mode) as i8,
+            position: samples.value(self.target_position),
+            enabled: samples.in_op() && !word.is_nan() && state == State::OperationEnabled,
+            stands: samples.value(self.target_velocity) == 0.0,
+            mode: samples.value(self.mode) as i8,
         }
-    }
-}
-
-/// Returns a value of a row; NaN without one.
-#[must_use]
-pub fn value(row: &[u64], word: usize) -> f64 {
-    row.get(word).map_or(f64::NAN, |bits| f64::from_bits(*bits))
-}
-
-/// Returns the time of CLOCK_MONOTONIC in ns.
-#[must_use]
-pub fn monotonic_ns() -> u64 {
-    let now = clock_gettime(ClockId::Monotonic);
-    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
-}
-
-/// Waits for the cycle after `row`. Returns the number of rows; `None` if none comes.
-pub fn wait_for_row(samples: &Samples, row: u64, ended: &AtomicBool) -> Option<u64> {
-    let begin = Instant::now();
-    // Most of the time is slept in one piece.
-    let due = samples.next_ns().saturating_sub(monotonic_ns());
-    sleep(Duration::from_nanos(due.min(samples.cycle_ns)));
-    loop {
-        let written = samples.written();
-        if written != row {
-            return Some(written);
-        }
-        if begin.elapsed() > NO_CYCLE || ended.load(Ordering::Relaxed) {
-            return None;
-        }
-        sleep(POLL);
     }
 }
 
 /// The joints in the cycle.
 #[derive(Debug)]
 pub struct Cycle {
-    pub samples: Samples,
-    pub commands: Commands,
-    pub columns: Vec<Columns>,
-    pub joints: Vec<Joint>,
-    pub followers: Vec<Follower>,
-    pub reports: Sender<(usize, Report)>,
+    cyclic: Cyclic,
+    columns: Vec<Columns>,
+    followers: Vec<Follower>,
+    reports: Sender<(usize, Report)>,
     /// The last report of each joint.
     reported: Vec<Option<Report>>,
 }
@@ -147,19 +99,15 @@ pub struct Cycle {
 impl Cycle {
     #[must_use]
     pub fn new(
-        samples: Samples,
-        commands: Commands,
+        cyclic: Cyclic,
         columns: Vec<Columns>,
-        joints: Vec<Joint>,
         followers: Vec<Follower>,
         reports: Sender<(usize, Report)>,
     ) -> Self {
-        let reported = vec![None; joints.len()];
+        let reported = vec![None; columns.len()];
         Self {
-            samples,
-            commands,
+            cyclic,
             columns,
-            joints,
             followers,
             reports,
             reported,
@@ -168,39 +116,21 @@ impl Cycle {
 
     /// Writes set-points until the bus has no cycle for a second, or `ended` is set.
     pub fn run(&mut self, messages: &Receiver<Message>, ended: &AtomicBool) {
-        let axes = self
-            .joints
-            .iter()
-            .map(|joint| joint.index + 1)
-            .max()
-            .unwrap_or(0);
-        let mut set = vec![(0, 0.0); axes];
-        let mut values = Vec::new();
-        let mut row = self.samples.written();
-        while let Some(written) = wait_for_row(&self.samples, row, ended) {
-            let cycles = written.saturating_sub(row);
-            row = written;
-            if !self.samples.read_newest(&mut values) {
-                continue;
-            }
+        while !ended.load(Ordering::Relaxed)
+            && let Ok(cycles) = self.cyclic.wait()
+        {
             while let Ok(message) = messages.try_recv() {
                 self.take(message);
             }
             let mut broken = false;
-            for index in 0..self.joints.len() {
-                let axis = self.joints[index].index;
-                let Start {
-                    position,
-                    enabled,
-                    stands,
-                    ..
-                } = self.columns[index].start(&values);
-                let blocked = self.commands.blocked(axis);
+            for index in 0..self.columns.len() {
+                let columns = self.columns[index];
+                let start = columns.start(&self.cyclic);
                 let input = AxisInput {
-                    target_position: position,
-                    enabled,
-                    stands,
-                    blocked,
+                    target_position: start.position,
+                    enabled: start.enabled,
+                    stands: start.stands,
+                    blocked: self.cyclic.is_stopped(columns.axis),
                 };
                 let plays = self.followers[index].plays();
                 let (wanted, end) = self.followers[index].advance(input, cycles);
@@ -208,26 +138,21 @@ impl Cycle {
                     broken |= plays && end != End::Done;
                     self.report(index, Report::Ended(end));
                 }
-                set[axis] = match wanted {
-                    None => (0, 0.0),
-                    Some(Wanted::Position(position)) => (1, position),
-                    Some(Wanted::Velocity(velocity)) => (2, velocity),
-                    Some(Wanted::Torque(percent)) => (3, percent),
-                };
+                self.cyclic.set(columns.axis, wanted.unwrap_or_default());
             }
             if broken {
-                self.stop_trajectory(&mut set);
+                self.stop_trajectory();
             }
-            self.commands.write(row, &set);
+            self.cyclic.publish();
         }
     }
 
     /// The other joints of a trajectory do not go on alone.
-    fn stop_trajectory(&mut self, set: &mut [(u64, f64)]) {
-        for index in 0..self.joints.len() {
+    fn stop_trajectory(&mut self) {
+        for index in 0..self.columns.len() {
             if self.followers[index].plays() {
                 self.followers[index].stop(false);
-                set[self.joints[index].index] = (0, 0.0);
+                self.cyclic.set(self.columns[index].axis, SetPoint::None);
                 self.report(index, Report::Ended(End::Blocked));
             }
         }

@@ -5,8 +5,8 @@
 //! the limits of the axis.
 
 use ecaxis_axis::setpoint::{Gear, GearConfig, GearInMode, Motion, MotionLimits, Playback, Table};
+use ecaxis_client::SetPoint;
 
-use crate::command::Wanted;
 use crate::joints::Joint;
 
 /// The cycles that one call makes up for.
@@ -92,7 +92,7 @@ enum Source {
         motion: Motion,
     },
     /// A velocity or a torque.
-    Constant(Wanted),
+    Constant(SetPoint),
     Trajectory {
         table: Table,
         playback: Playback,
@@ -207,7 +207,7 @@ impl Follower {
     ///
     /// # Errors
     /// Says why the joint does not follow it.
-    pub fn command(&mut self, wanted: Wanted, publisher: Publisher) -> Result<(), Refusal> {
+    pub fn command(&mut self, wanted: SetPoint, publisher: Publisher) -> Result<(), Refusal> {
         if self.is_free() {
             self.begin(wanted)?;
             self.publisher = publisher;
@@ -219,10 +219,10 @@ impl Follower {
         let near = self.config.near();
         match (&mut self.source, wanted) {
             (Source::Trajectory { .. }, _) => return Err(Refusal::Trajectory),
-            (Source::Position { leader, .. }, Wanted::Position(position)) => {
+            (Source::Position { leader, .. }, SetPoint::Position(position)) => {
                 leader.command(position, since, most, near);
             }
-            (Source::Constant(now), Wanted::Velocity(_) | Wanted::Torque(_)) => {
+            (Source::Constant(now), SetPoint::Velocity(_) | SetPoint::Torque(_)) => {
                 // The mode cannot change while the joint follows.
                 *now = wanted;
             }
@@ -232,7 +232,7 @@ impl Follower {
         Ok(())
     }
 
-    fn begin(&mut self, wanted: Wanted) -> Result<(), Refusal> {
+    fn begin(&mut self, wanted: SetPoint) -> Result<(), Refusal> {
         let AxisInput {
             target_position,
             enabled,
@@ -249,7 +249,7 @@ impl Follower {
             return Err(Refusal::Moves);
         }
         self.source = match wanted {
-            Wanted::Position(position) => {
+            SetPoint::Position(position) => {
                 let distance = position - target_position;
                 if distance.abs() > self.config.start_tolerance {
                     return Err(Refusal::Far(distance));
@@ -341,7 +341,7 @@ impl Follower {
 
     /// Advances by `cycles`. Returns the set-point for the next cycle, and why the joint follows no
     /// longer.
-    pub fn advance(&mut self, input: AxisInput, cycles: u64) -> (Option<Wanted>, Option<End>) {
+    pub fn advance(&mut self, input: AxisInput, cycles: u64) -> (Option<SetPoint>, Option<End>) {
         self.input = input;
         self.cycle += cycles;
         let dt_s = self.config.dt_s;
@@ -370,12 +370,12 @@ impl Follower {
                         leader.advance(dt_s);
                         *motion = gear.advance(leader.motion, *motion, dt_s);
                     }
-                    return (Some(Wanted::Position(motion.position)), None);
+                    return (Some(SetPoint::Position(motion.position)), None);
                 }
             }
             Source::Constant(wanted) => match (silent, *wanted) {
                 (false, wanted) => return (Some(wanted), None),
-                (true, Wanted::Velocity(0.0) | Wanted::Torque(0.0)) => Some(End::Silent),
+                (true, SetPoint::Velocity(0.0) | SetPoint::Torque(0.0)) => Some(End::Silent),
                 (true, _) => Some(End::Stale),
             },
             Source::Trajectory {
@@ -389,7 +389,7 @@ impl Follower {
                     for _ in 0..steps {
                         *motion = playback.advance(table, *motion, dt_s);
                     }
-                    return (Some(Wanted::Position(motion.position)), None);
+                    return (Some(SetPoint::Position(motion.position)), None);
                 }
             }
         };

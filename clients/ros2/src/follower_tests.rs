@@ -51,7 +51,7 @@ impl Rig {
     fn step(&mut self, cycles: u64) -> Option<End> {
         let (wanted, end) = self.follower.advance(self.input(), cycles);
         let next = match wanted {
-            Some(Wanted::Position(position)) => position,
+            Some(SetPoint::Position(position)) => position,
             _ => self.position,
         };
         let velocity = (next - self.position) / (cycles as f64 * DT);
@@ -70,13 +70,13 @@ fn followers_begin_where_the_axis_is() {
     let mut rig = Rig::new(20.0);
     // What ros2_control sends before its first state.
     assert_eq!(
-        rig.follower.command(Wanted::Position(0.0), ME),
+        rig.follower.command(SetPoint::Position(0.0), ME),
         Err(Refusal::Far(-20.0))
     );
     assert!(rig.follower.is_free());
-    rig.follower.command(Wanted::Position(20.5), ME).unwrap();
+    rig.follower.command(SetPoint::Position(20.5), ME).unwrap();
     let (first, _) = rig.follower.advance(rig.input(), 1);
-    let Some(Wanted::Position(first)) = first else {
+    let Some(SetPoint::Position(first)) = first else {
         panic!("{first:?}")
     };
     assert!((first - 20.0).abs() < 0.01, "{first}");
@@ -93,7 +93,7 @@ fn followers_track_slow_publishers_within_the_limits() {
             if cycle >= jitter {
                 jitter = cycle + period + (cycle * 7919) % (period / 2 + 1);
                 rig.follower
-                    .command(Wanted::Position(sine(cycle)), ME)
+                    .command(SetPoint::Position(sine(cycle)), ME)
                     .unwrap();
             }
             assert_eq!(rig.step(1), None);
@@ -117,10 +117,10 @@ fn followers_track_slow_publishers_within_the_limits() {
 #[test]
 fn far_commands_are_reached_within_the_limits() {
     let mut rig = Rig::new(0.0);
-    rig.follower.command(Wanted::Position(0.0), ME).unwrap();
+    rig.follower.command(SetPoint::Position(0.0), ME).unwrap();
     rig.step(1);
     for _ in 0..100 {
-        rig.follower.command(Wanted::Position(60.0), ME).unwrap();
+        rig.follower.command(SetPoint::Position(60.0), ME).unwrap();
         for _ in 0..10 {
             assert_eq!(rig.step(1), None);
             assert!(rig.position <= 60.0);
@@ -141,7 +141,7 @@ fn missed_cycles_leave_the_joint_on_its_way() {
     while cycle < 3000 {
         let position = 5.0 * (1.0 - (cycle as f64 * DT * 3.0).cos());
         rig.follower
-            .command(Wanted::Position(position), ME)
+            .command(SetPoint::Position(position), ME)
             .unwrap();
         let cycles = if cycle % 7 == 0 { 5 } else { 1 };
         assert_eq!(rig.step(cycles), None);
@@ -161,20 +161,20 @@ fn joints_without_commands_end() {
     let mut rig = Rig::new(0.0);
     for cycle in 0..200 {
         rig.follower
-            .command(Wanted::Position(cycle as f64 * 0.05), ME)
+            .command(SetPoint::Position(cycle as f64 * 0.05), ME)
             .unwrap();
         rig.step(1);
     }
-    rig.follower.command(Wanted::Position(50.0), ME).unwrap();
+    rig.follower.command(SetPoint::Position(50.0), ME).unwrap();
     let ends: Vec<_> = (0..=STALE).filter_map(|_| rig.step(1)).collect();
     assert_eq!(ends, [End::Stale]);
     assert!(matches!(
-        rig.follower.command(Wanted::Position(50.0), ME),
+        rig.follower.command(SetPoint::Position(50.0), ME),
         Err(Refusal::Moves)
     ));
     // At rest, as the topic interface is near its state: no trouble.
     let mut rig = Rig::new(5.0);
-    rig.follower.command(Wanted::Position(5.0), ME).unwrap();
+    rig.follower.command(SetPoint::Position(5.0), ME).unwrap();
     let ends: Vec<_> = (0..=STALE + 1).filter_map(|_| rig.step(1)).collect();
     assert_eq!(ends, [End::Silent]);
     // A joint that has reached its last command says so as well, if the commands moved it.
@@ -182,7 +182,7 @@ fn joints_without_commands_end() {
     for cycle in 0..200 {
         let position = f64::from(cycle) * 0.02;
         rig.follower
-            .command(Wanted::Position(position), ME)
+            .command(SetPoint::Position(position), ME)
             .unwrap();
         rig.step(1);
     }
@@ -193,7 +193,7 @@ fn joints_without_commands_end() {
     for (velocity, end) in [(10.0, End::Stale), (0.0, End::Silent)] {
         let mut rig = Rig::new(0.0);
         rig.follower
-            .command(Wanted::Velocity(velocity), ME)
+            .command(SetPoint::Velocity(velocity), ME)
             .unwrap();
         let ends: Vec<_> = (0..=STALE + 1).filter_map(|_| rig.step(1)).collect();
         assert_eq!(ends, [end]);
@@ -203,43 +203,43 @@ fn joints_without_commands_end() {
 #[test]
 fn one_publisher_commands_until_it_is_silent() {
     let mut rig = Rig::new(0.0);
-    rig.follower.command(Wanted::Position(0.0), ME).unwrap();
+    rig.follower.command(SetPoint::Position(0.0), ME).unwrap();
     rig.step(1);
-    let other = rig.follower.command(Wanted::Position(0.0), [2; 16]);
+    let other = rig.follower.command(SetPoint::Position(0.0), [2; 16]);
     assert_eq!(other, Err(Refusal::OtherPublisher));
     for _ in 0..=STALE + 1 {
         rig.step(1);
     }
     rig.follower
-        .command(Wanted::Position(0.0), [2; 16])
+        .command(SetPoint::Position(0.0), [2; 16])
         .unwrap();
 }
 
 #[test]
 fn stopped_joints_wait_for_enable() {
     let mut rig = Rig::new(0.0);
-    rig.follower.command(Wanted::Position(0.0), ME).unwrap();
+    rig.follower.command(SetPoint::Position(0.0), ME).unwrap();
     rig.follower.stop(true);
     rig.step(1);
     assert_eq!(
-        rig.follower.command(Wanted::Position(0.0), ME),
+        rig.follower.command(SetPoint::Position(0.0), ME),
         Err(Refusal::Held)
     );
     rig.follower.release();
-    rig.follower.command(Wanted::Position(0.0), ME).unwrap();
+    rig.follower.command(SetPoint::Position(0.0), ME).unwrap();
 }
 
 #[test]
 fn joints_that_cannot_move_do_not_follow() {
     let mut rig = Rig::new(0.0);
-    rig.follower.command(Wanted::Position(0.0), ME).unwrap();
+    rig.follower.command(SetPoint::Position(0.0), ME).unwrap();
     let lost = AxisInput {
         enabled: false,
         ..rig.input()
     };
     assert_eq!(rig.follower.advance(lost, 1), (None, Some(End::Disabled)));
     assert_eq!(
-        rig.follower.command(Wanted::Position(0.0), ME),
+        rig.follower.command(SetPoint::Position(0.0), ME),
         Err(Refusal::Disabled)
     );
     for input in [
@@ -254,7 +254,7 @@ fn joints_that_cannot_move_do_not_follow() {
     ] {
         rig.follower.advance(input, 1);
         assert_eq!(
-            rig.follower.command(Wanted::Position(0.0), ME),
+            rig.follower.command(SetPoint::Position(0.0), ME),
             Err(Refusal::Moves)
         );
     }

@@ -2,54 +2,101 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use serde_json::{Value, json};
+use ecaxis_client::{Cyclic, Error, Machine, Samples};
+use serde_json::json;
 
 use crate::cycle::{Columns, Cycle, Message, Report};
 use crate::follower::Follower;
 use crate::joints::Joint;
 use crate::options::Options;
-use crate::server::{Commands, Connection, Samples};
 use crate::services::LeaseRequest;
 use crate::status::NodeStatus;
 
-const TIMEOUT: Duration = Duration::from_secs(10);
 /// The longest silence of the node.
-const TTL_MS: u64 = 1000;
-const RENEW: Duration = Duration::from_millis(250);
+pub const LEASE: Duration = Duration::from_secs(1);
+/// The pause between two looks at the lease.
+const KEEP: Duration = Duration::from_millis(100);
 /// The pause before the next attempt.
 const RETRY: Duration = Duration::from_millis(500);
 
 /// The samples, and where the values of each joint are in a row.
 pub type KnownSamples = (Samples, Arc<Vec<Columns>>);
 
-/// What the thread shares with the others.
+/// What the threads share.
 #[derive(Debug, Clone)]
 pub struct Shared {
-    pub connection: Arc<Connection>,
+    pub machine: Arc<Machine>,
     pub joints: Arc<Vec<Joint>>,
     pub options: Arc<Options>,
-    pub status: Arc<Mutex<NodeStatus>>,
+    status: Arc<Mutex<NodeStatus>>,
     /// The samples and the columns of the joints, once they are known.
-    pub samples: Arc<Mutex<Option<KnownSamples>>>,
+    samples: Arc<Mutex<Option<KnownSamples>>>,
     /// The node ends.
     pub ends: Arc<AtomicBool>,
 }
 
-impl Shared {
-    /// Changes the state of the node.
-    pub fn update(&self, change: impl FnOnce(&mut NodeStatus)) {
-        change(&mut self.status.lock().unwrap_or_else(PoisonError::into_inner));
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Returns an error as a text of `/diagnostics` and of services.
+#[must_use]
+pub fn text(error: Error) -> String {
+    match error.help {
+        Some(help) => format!("{}; help: {help}", error.cause),
+        None => error.cause.into(),
     }
 }
 
-/// Keeps the lease until the connection is lost or the node ends.
+impl Shared {
+    #[must_use]
+    pub fn new(
+        machine: Machine,
+        joints: Vec<Joint>,
+        options: Options,
+        ends: Arc<AtomicBool>,
+    ) -> Self {
+        Self {
+            machine: Arc::new(machine),
+            status: Arc::new(Mutex::new(NodeStatus::new(joints.len()))),
+            joints: Arc::new(joints),
+            options: Arc::new(options),
+            samples: Arc::default(),
+            ends,
+        }
+    }
+
+    /// Changes the state of the node.
+    pub fn update(&self, change: impl FnOnce(&mut NodeStatus)) {
+        change(&mut lock(&self.status));
+    }
+
+    /// Returns the state of the node.
+    #[must_use]
+    pub fn status(&self) -> NodeStatus {
+        lock(&self.status).clone()
+    }
+
+    /// Returns the samples; `None` before the node has had the lease.
+    #[must_use]
+    pub fn samples(&self) -> Option<KnownSamples> {
+        lock(&self.samples).clone()
+    }
+
+    #[must_use]
+    pub fn ends(&self) -> bool {
+        self.ends.load(Ordering::Relaxed)
+    }
+}
+
+/// Keeps the lease until the node ends.
 ///
 /// # Errors
-/// Says why the connection is lost.
+/// Fails if the system gives no thread.
 pub fn keep_lease(
     shared: &Shared,
     requests: &Receiver<LeaseRequest>,
@@ -59,37 +106,28 @@ pub fn keep_lease(
     // The messages go from one cycle to the next.
     let messages = Arc::new(Mutex::new(messages));
     let mut wanted = true;
-    let mut force = false;
-    let mut answer = None;
-    while !shared.ends.load(Ordering::Relaxed) {
+    // The service `take`, which waits for its answer.
+    let mut taking: Option<Sender<Result<(), String>>> = None;
+    while !shared.ends() {
         if wanted {
-            let result = attach(shared, force);
-            force = false;
-            if let Some(answer) = answer.take() {
-                let answer: Sender<Result<(), String>> = answer;
-                let _ = answer.send(result.as_ref().map(|_| ()).map_err(Clone::clone));
+            let attached = attach(shared, taking.is_some());
+            if let Some(answer) = taking.take() {
+                let _ = answer.send(attached.as_ref().map(drop).map_err(Clone::clone));
             }
-            match result {
-                Ok((samples, commands, columns)) => {
+            match attached {
+                Ok((cyclic, columns)) => {
                     shared.update(|status| status.no_lease = None);
-                    let dt_s = samples.cycle_ns as f64 * 1e-9;
-                    let config =
+                    let dt_s = cyclic.cycle_time().as_secs_f64();
+                    let follower =
                         |joint| Follower::new(Follower::config(joint, &shared.options, dt_s));
-                    let followers = shared.joints.iter().map(config).collect();
-                    let mut cycle = Cycle::new(
-                        samples,
-                        commands,
-                        columns,
-                        shared.joints.to_vec(),
-                        followers,
-                        reports.clone(),
-                    );
+                    let followers = shared.joints.iter().map(follower).collect();
+                    let mut cycle = Cycle::new(cyclic, columns, followers, reports.clone());
                     let ended = Arc::new(AtomicBool::new(false));
                     let (stop, queue) = (Arc::clone(&ended), Arc::clone(&messages));
                     let thread = thread::Builder::new()
                         .name("cycle".to_owned())
                         .spawn(move || {
-                            let queue = queue.lock().unwrap_or_else(PoisonError::into_inner);
+                            let queue = lock(&queue);
                             // Commands from before do not count.
                             while queue.try_recv().is_ok() {}
                             cycle.run(&queue, &stop);
@@ -100,10 +138,9 @@ pub fn keep_lease(
                     let _ = thread.join();
                     match kept {
                         Kept::Lost(why) => shared.update(|status| status.no_lease = Some(why)),
-                        Kept::Take(sender) => (force, answer) = (true, Some(sender)),
-                        Kept::Release(sender) => {
-                            let released = request(shared, json!({"op": "release"}));
-                            let _ = sender.send(released.map(|_| ()));
+                        Kept::Take(answer) => taking = Some(answer),
+                        Kept::Release(answer) => {
+                            let _ = answer.send(shared.machine.release().map_err(text));
                             wanted = false;
                             let why = "the service release has given it back".to_owned();
                             shared.update(|status| status.no_lease = Some(why));
@@ -115,21 +152,16 @@ pub fn keep_lease(
             }
         }
         match requests.recv_timeout(RETRY) {
-            Ok(LeaseRequest::Take(sender)) => {
-                (wanted, force, answer) = (true, true, Some(sender));
-            }
-            Ok(LeaseRequest::Release(sender)) => {
+            Ok(LeaseRequest::Take(answer)) => (wanted, taking) = (true, Some(answer)),
+            Ok(LeaseRequest::Release(answer)) => {
                 wanted = false;
-                let _ = sender.send(Ok(()));
+                let _ = answer.send(Ok(()));
             }
-            Err(RecvTimeoutError::Timeout) => {
-                // Without this, a lost connection would not be seen.
-                request(shared, json!({"op": "hello"}))?;
-            }
+            Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => return Ok(()),
         }
     }
-    let _ = request(shared, json!({"op": "release"}));
+    let _ = shared.machine.release();
     Ok(())
 }
 
@@ -139,41 +171,22 @@ enum Kept {
     Release(Sender<Result<(), String>>),
 }
 
-fn request(shared: &Shared, request: Value) -> Result<Value, String> {
-    shared
-        .connection
-        .request(request, TIMEOUT)
-        .map_err(|error| error.to_string())
-}
-
 /// Gets the lease and the area.
-fn attach(shared: &Shared, force: bool) -> Result<(Samples, Commands, Vec<Columns>), String> {
-    let bus = request(shared, json!({"op": "state"}))?;
+fn attach(shared: &Shared, force: bool) -> Result<(Cyclic, Vec<Columns>), String> {
+    let machine = &shared.machine;
+    let bus = machine.request("state", json!({})).map_err(text)?;
     if bus["bus"]["state"] != "op" {
         let error = bus["bus"]["error"]
             .as_str()
             .map(|error| format!(": {error}"));
         return Err(format!("the bus is not in Op{}", error.unwrap_or_default()));
     }
-    let name = &shared.options.name;
-    request(
-        shared,
-        json!({"op": "take", "name": name, "ttl_ms": TTL_MS, "force": force}),
-    )?;
-    request(shared, json!({"op": "area"}))?;
-    let [samples, commands] = shared
-        .connection
-        .area()
-        .ok_or("the server has sent no memory")?;
-    let samples = Samples::map(&samples)?;
-    let commands = Commands::map(&commands)?;
-    let columns = Columns::of_joints(&samples, &shared.joints)?;
-    let known = (samples.clone(), Arc::new(columns.clone()));
-    *shared
-        .samples
-        .lock()
-        .unwrap_or_else(PoisonError::into_inner) = Some(known);
-    Ok((samples, commands, columns))
+    machine.take(force).map_err(text)?;
+    let cyclic = machine.cyclic().map_err(text)?;
+    let columns = Columns::of_joints(&cyclic, &shared.joints).map_err(text)?;
+    let known = (cyclic.samples().clone(), Arc::new(columns.clone()));
+    *lock(&shared.samples) = Some(known);
+    Ok((cyclic, columns))
 }
 
 /// Renews the lease until it is lost.
@@ -182,24 +195,18 @@ fn keep(
     requests: &Receiver<LeaseRequest>,
     cycle: &thread::JoinHandle<()>,
 ) -> Kept {
-    let mut next = Instant::now() + RENEW;
     loop {
-        let now = Instant::now();
-        match requests.recv_timeout(next.saturating_duration_since(now)) {
-            Ok(LeaseRequest::Take(sender)) => return Kept::Take(sender),
-            Ok(LeaseRequest::Release(sender)) => return Kept::Release(sender),
-            Err(RecvTimeoutError::Disconnected) => return Kept::Lost("the node ends".to_owned()),
-            Err(RecvTimeoutError::Timeout) => {}
+        match requests.recv_timeout(KEEP) {
+            Ok(LeaseRequest::Take(answer)) => return Kept::Take(answer),
+            Ok(LeaseRequest::Release(answer)) => return Kept::Release(answer),
+            Err(RecvTimeoutError::Timeout) if !shared.ends() => {}
+            Err(_) => return Kept::Lost("the node ends".to_owned()),
         }
         if cycle.is_finished() {
             return Kept::Lost("the bus has no cycles".to_owned());
         }
-        if shared.ends.load(Ordering::Relaxed) {
-            return Kept::Lost("the node ends".to_owned());
+        if let Err(error) = shared.machine.keep() {
+            return Kept::Lost(text(error));
         }
-        if let Err(why) = request(shared, json!({"op": "renew"})) {
-            return Kept::Lost(why);
-        }
-        next = Instant::now() + RENEW;
     }
 }

@@ -3,7 +3,6 @@
 //! | module | |
 //! |---|---|
 //! | [`options`], [`joints`] | the command line; the axes as joints in rad or m |
-//! | [`server`] | the socket and the cyclic area of the server |
 //! | [`lease`], [`cycle`] | the thread that keeps the lease, and the one that writes set-points |
 //! | [`command`], [`trajectory`] | messages as set-points, checked as a whole |
 //! | [`follower`] | what a joint follows: commands or a trajectory, and when it stops |
@@ -21,7 +20,6 @@ mod messages;
 mod node;
 mod options;
 mod publish;
-mod server;
 mod services;
 mod signals;
 mod status;

@@ -1,11 +1,12 @@
 //! The node: its topics, services and threads.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, Sender, channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::mpsc::{Sender, channel};
 use std::thread::{self, sleep};
 use std::time::Duration;
 
+use ecaxis_client::{ErrorKind, Machine};
 use futures::channel::{mpsc as futures_mpsc, oneshot};
 use futures::executor::{LocalPool, LocalSpawner};
 use futures::future::LocalFutureObj;
@@ -21,17 +22,14 @@ use serde_json::{Value, json};
 use crate::command::read_command;
 use crate::cycle::Message;
 use crate::joints::Joint;
-use crate::lease::{Shared, keep_lease};
+use crate::lease::{LEASE, Shared, keep_lease, text};
 use crate::messages::{Float64, JointState, JointTrajectory, TriggerRequest, TriggerResponse};
 use crate::options::Options;
 use crate::publish::{publish_diagnostics, publish_states};
-use crate::server::Connection;
 use crate::services::{Service, Worker, services};
 use crate::signals::{InputPublisher, Signal};
-use crate::status::NodeStatus;
 use crate::trajectory::{Start, plan};
 
-const TIMEOUT: Duration = Duration::from_secs(10);
 /// The pause between attempts to connect.
 const PAUSE: Duration = Duration::from_millis(50);
 
@@ -52,21 +50,14 @@ pub fn run(options: Options) -> Result<(), String> {
             let _ = on_signal.unbounded_send(Ok(()));
         }
     });
-    let Some((connection, events)) = connect(&options, &ends) else {
+    let Some(machine) = connect(&options, &ends)? else {
         return Ok(());
     };
-    let connection = Arc::new(connection);
-    let machine = machine(&connection, &options)?;
-    let joints = Arc::new(Joint::of_machine(&machine, &options)?);
-    let shared = Shared {
-        status: Arc::new(Mutex::new(NodeStatus::new(joints.len()))),
-        samples: Arc::default(),
-        ends: Arc::clone(&ends),
-        connection,
-        joints,
-        options: Arc::new(options),
-    };
-    let threads = start(shared.clone(), &machine, events, &stop)?;
+    let events = machine.events().map_err(text)?;
+    let about = machine.request("machine", json!({})).map_err(text)?;
+    let joints = Joint::of_machine(&about, &options)?;
+    let shared = Shared::new(machine, joints, options, Arc::clone(&ends));
+    let threads = start(shared, &about, events, &stop)?;
     let mut pool = threads.pool;
     let result = pool.run_until(stopped.next()).unwrap_or(Ok(()));
     ends.store(true, Ordering::Relaxed);
@@ -74,7 +65,6 @@ pub fn run(options: Options) -> Result<(), String> {
     for thread in threads.threads {
         let _ = thread.join();
     }
-    shared.connection.close();
     result
 }
 
@@ -85,47 +75,41 @@ struct Threads {
     _node: Node,
 }
 
-fn connect(options: &Options, ends: &AtomicBool) -> Option<(Connection, Receiver<Value>)> {
+/// Waits for the server. Returns none at the end of the node.
+fn connect(options: &Options, ends: &AtomicBool) -> Result<Option<Machine>, String> {
     let mut said = false;
     while !ends.load(Ordering::Relaxed) {
-        match Connection::open(&options.socket) {
-            Ok(connected) => return Some(connected),
-            Err(error) if !said => {
-                eprintln!(
-                    "waits for ecaxis serve at {}: {error}",
-                    options.socket.display()
+        let attach = ecaxis_client::Options {
+            name: options.name.clone(),
+            lease: LEASE,
+            timeout: Duration::ZERO,
+            take: false,
+            ..ecaxis_client::Options::default()
+        };
+        match Machine::attach(&options.socket, attach) {
+            Ok(machine) if machine.is_virtual() => {
+                return Err(
+                    "the server runs in virtual time, where no node can follow; \
+                            start it with --sim instead of --virtual"
+                        .to_owned(),
                 );
+            }
+            Ok(machine) => return Ok(Some(machine)),
+            Err(error) if error.kind() != ErrorKind::Lost => return Err(text(error)),
+            Err(error) if !said => {
+                eprintln!("waits for ecaxis serve: {}", error.cause);
                 said = true;
             }
             Err(_) => sleep(PAUSE),
         }
     }
-    None
-}
-
-/// Returns the machine of the server.
-fn machine(connection: &Connection, options: &Options) -> Result<Value, String> {
-    let ask = |request| {
-        connection
-            .request(request, TIMEOUT)
-            .map_err(|error| error.to_string())
-    };
-    let hello = ask(json!({"op": "hello", "name": options.name}))?;
-    if hello["virtual"] == true {
-        return Err(
-            "the server runs in virtual time, where no node can follow; \
-                    start it with --sim instead of --virtual"
-                .to_owned(),
-        );
-    }
-    ask(json!({"op": "subscribe", "topics": ["events"]}))?;
-    ask(json!({"op": "machine"}))
+    Ok(None)
 }
 
 fn start(
     shared: Shared,
     machine: &Value,
-    events: Receiver<Value>,
+    events: ecaxis_client::Subscription,
     stop: &futures_mpsc::UnboundedSender<Result<(), String>>,
 ) -> Result<Threads, String> {
     let ros = |what: &str| {
@@ -178,9 +162,8 @@ fn start(
     let (to_lease, lease_requests) = channel();
     let (reports_in, reports) = channel();
     let worker = Worker {
-        connection: Arc::clone(&shared.connection),
+        shared: shared.clone(),
         cycle: to_cycle.clone(),
-        joints: Arc::clone(&shared.joints),
         lease: to_lease,
     };
     let pool = LocalPool::new();
@@ -216,12 +199,11 @@ fn start(
         let values = subscription::<Float64>(&mut node, &topic, "std_msgs", "Float64", &reliable)?;
         spawn(&spawner, take_outputs(values, signal, to_outputs.clone()));
     }
-    let connection = Arc::clone(&shared.connection);
     let for_outputs = shared.clone();
     thread::spawn(move || {
         for (Signal { device, name, .. }, value) in outputs {
-            let request = json!({"op": "output", "device": device, "output": name, "value": value});
-            let error = connection.request(request, TIMEOUT).err();
+            let set = for_outputs.machine.set_output(&device, &name, value);
+            let error = set.err().map(text);
             let error = error.map(|error| format!("{device}.{name}: {error}"));
             for_outputs.update(|status| status.output = error);
         }
@@ -352,24 +334,17 @@ async fn take_outputs(
 
 /// Returns where the axes are, from the newest cycle.
 fn starts(shared: &Shared) -> Option<(Vec<Start>, f64)> {
-    let known = shared
-        .samples
-        .lock()
-        .unwrap_or_else(PoisonError::into_inner)
-        .clone();
-    let (samples, columns) = known?;
-    let mut row = Vec::new();
-    let read = samples.read_newest(&mut row);
-    let starts = columns.iter().map(|columns| columns.start(&row)).collect();
-    read.then_some((starts, samples.cycle_ns as f64 * 1e-9))
+    let (mut samples, columns) = shared.samples()?;
+    // What is kept is the cycle in which the node got the lease.
+    (samples.poll() > 0).then(|| {
+        let starts = columns.iter().map(|columns| columns.start(&samples));
+        (starts.collect(), samples.cycle_time().as_secs_f64())
+    })
 }
 
 fn no_lease(shared: &Shared) -> Option<String> {
-    let status = shared.status.lock().unwrap_or_else(PoisonError::into_inner);
-    status
-        .no_lease
-        .as_ref()
-        .map(|why| format!("the node does not own the motion: {why}"))
+    let why = shared.status().no_lease?;
+    Some(format!("the node does not own the motion: {why}"))
 }
 
 async fn follow_commands(

@@ -1,28 +1,33 @@
 //! What the node publishes: joint states, `/diagnostics`, inputs.
 
-use std::sync::PoisonError;
-use std::sync::atomic::Ordering;
-use std::sync::mpsc::{Receiver, TryRecvError};
+use std::sync::mpsc::Receiver;
 use std::thread::sleep;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
+use ecaxis_client::Subscription;
 use ros2_client::log::LogLevel;
 use ros2_client::{NodeLoggingHandle, Publisher, rosout};
+use rustix::time::{ClockId, clock_gettime};
 use serde_json::{Value, json};
 
-use crate::cycle::{Report, monotonic_ns, value, wait_for_row};
+use crate::cycle::Report;
 use crate::joints::Joint;
-use crate::lease::Shared;
+use crate::lease::{Shared, text};
 use crate::messages::{DiagnosticArray, DiagnosticStatus, Header, JointState, Time, level};
 use crate::options::Options;
 use crate::signals::InputPublisher;
 use crate::status::{describe, of_server};
 
-const TIMEOUT: Duration = Duration::from_secs(10);
 /// The pause between two looks at inputs and problems, and between states without the area.
 const PAUSE: Duration = Duration::from_millis(50);
 /// The longest time between two diagnostics.
 const DIAGNOSTICS: Duration = Duration::from_secs(1);
+
+/// Returns the time of CLOCK_MONOTONIC in ns.
+fn monotonic_ns() -> u64 {
+    let now = clock_gettime(ClockId::Monotonic);
+    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
+}
 
 /// Returns the header of a message. `monotonic` is its time in ns of CLOCK_MONOTONIC.
 fn header(monotonic: u64) -> Header {
@@ -46,46 +51,32 @@ fn header(monotonic: u64) -> Header {
 /// Publishes the joint states until the node ends.
 pub fn publish_states(shared: &Shared, states: &Publisher<JointState>) {
     let joints = &shared.joints;
-    let mut values = Vec::new();
-    let (mut row, mut next) = (0, 0);
-    while !shared.ends.load(Ordering::Relaxed) {
-        let known = shared
-            .samples
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .clone();
-        let Some((samples, columns)) = known else {
+    while !shared.ends() {
+        let Some((mut samples, columns)) = shared.samples() else {
             if let Some(state) = state_of_server(shared) {
                 let _ = states.publish(state);
             }
             sleep(PAUSE);
             continue;
         };
-        let Some(written) = wait_for_row(&samples, row, &shared.ends) else {
-            continue;
-        };
-        row = written;
-        let every = (1e9 / (shared.options.rate * samples.cycle_ns as f64))
-            .round()
-            .max(1.0);
-        if row < next || !samples.read_newest(&mut values) {
-            continue;
+        let every = 1.0 / (shared.options.rate * samples.cycle_time().as_secs_f64());
+        let every = every.round().max(1.0) as u64;
+        let mut next = 0;
+        // Without cycles the area may be another one.
+        while !shared.ends() && samples.wait().is_ok() {
+            if samples.next_cycle() < next {
+                continue;
+            }
+            next = samples.next_cycle() + every;
+            let mut state = joint_state(joints, samples.time_ns());
+            for (joint, columns) in joints.iter().zip(columns.iter()) {
+                let value = |signal| samples.value(signal);
+                state.position.push(value(columns.position) * joint.scale);
+                state.velocity.push(value(columns.velocity) * joint.scale);
+                state.effort.push(joint.effort(value(columns.torque)));
+            }
+            let _ = states.publish(without_unknown_effort(state));
         }
-        next = row + every as u64;
-        let columns = joints.iter().zip(columns.iter());
-        let mut state = joint_state(joints, values.get(1).copied().unwrap_or_default());
-        for (joint, columns) in columns {
-            state
-                .position
-                .push(value(&values, columns.position) * joint.scale);
-            state
-                .velocity
-                .push(value(&values, columns.velocity) * joint.scale);
-            state
-                .effort
-                .push(joint.effort(value(&values, columns.torque)));
-        }
-        let _ = states.publish(without_unknown_effort(state));
     }
 }
 
@@ -106,10 +97,7 @@ fn without_unknown_effort(mut state: JointState) -> JointState {
 
 /// Returns the joint states without the area: until the node has the lease for the first time.
 fn state_of_server(shared: &Shared) -> Option<JointState> {
-    let answer = shared
-        .connection
-        .request(json!({"op": "state"}), TIMEOUT)
-        .ok()?;
+    let answer = shared.machine.request("state", json!({})).ok()?;
     let mut state = joint_state(&shared.joints, answer["time_ns"].as_u64()?);
     for joint in shared.joints.iter() {
         let axis = &answer["axes"][joint.index];
@@ -133,39 +121,27 @@ pub fn publish_diagnostics(
     publisher: &Publisher<DiagnosticArray>,
     mut inputs: Vec<InputPublisher>,
     log: &NodeLoggingHandle,
-    events: &Receiver<Value>,
+    events: &Subscription,
     reports: &Receiver<(usize, Report)>,
 ) -> Result<(), String> {
     let mut published = Instant::now() - DIAGNOSTICS;
     let mut said: Vec<DiagnosticStatus> = Vec::new();
-    while !shared.ends.load(Ordering::Relaxed) {
+    while !shared.ends() {
         let mut news = false;
         while let Ok((index, report)) = reports.try_recv() {
             take_report(shared, index, report);
             news = true;
         }
-        loop {
-            match events.try_recv() {
-                Ok(event) => news |= take_event(shared, &event),
-                Err(TryRecvError::Empty) => break,
-                Err(TryRecvError::Disconnected) => {
-                    return Err("the connection to the server is lost".to_owned());
-                }
-            }
+        while let Some(event) = events.next_within(Duration::ZERO).map_err(text)? {
+            news |= take_event(shared, &event);
         }
-        if !inputs.is_empty() {
-            let state = shared.connection.request(json!({"op": "state"}), TIMEOUT);
-            if let Ok(state) = state {
-                inputs.iter_mut().for_each(|input| input.publish(&state));
-            }
+        if !inputs.is_empty()
+            && let Ok(state) = shared.machine.request("state", json!({}))
+        {
+            inputs.iter_mut().for_each(|input| input.publish(&state));
         }
         let node = shared.options.name.as_str();
-        let status = shared
-            .status
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .clone();
-        let own = status.diagnostics(node, &shared.joints);
+        let own = shared.status().diagnostics(node, &shared.joints);
         news |= own != said;
         if news || published.elapsed() >= DIAGNOSTICS {
             published = Instant::now();
@@ -186,10 +162,7 @@ pub fn publish_diagnostics(
 }
 
 fn server_diagnostics(shared: &Shared, node: &str) -> Vec<DiagnosticStatus> {
-    match shared
-        .connection
-        .request(json!({"op": "diagnostics"}), TIMEOUT)
-    {
+    match shared.machine.request("diagnostics", json!({})) {
         Ok(answer) => {
             let parts = answer["diagnostics"].as_array().into_iter().flatten();
             parts.map(|part| of_server(node, part)).collect()
@@ -197,7 +170,7 @@ fn server_diagnostics(shared: &Shared, node: &str) -> Vec<DiagnosticStatus> {
         Err(error) => vec![DiagnosticStatus {
             level: level::ERROR,
             name: format!("{node}: server"),
-            message: error.to_string(),
+            message: text(error),
             ..DiagnosticStatus::default()
         }],
     }

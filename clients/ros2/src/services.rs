@@ -1,6 +1,5 @@
 //! The services: `std_srvs/Trigger` for the node and for each joint.
 
-use std::sync::Arc;
 use std::sync::mpsc::Sender;
 use std::time::Duration;
 
@@ -8,8 +7,8 @@ use serde_json::{Value, json};
 
 use crate::cycle::Message;
 use crate::joints::Joint;
+use crate::lease::{Shared, text};
 use crate::messages::TriggerResponse;
-use crate::server::Connection;
 
 /// The longest wait for an outcome: a homing may take minutes.
 const TIMEOUT: Duration = Duration::from_secs(600);
@@ -103,9 +102,8 @@ pub fn name_token(name: &str) -> String {
 /// What a service needs.
 #[derive(Debug, Clone)]
 pub struct Worker {
-    pub connection: Arc<Connection>,
+    pub shared: Shared,
     pub cycle: Sender<Message>,
-    pub joints: Arc<Vec<Joint>>,
     /// Gets or gives back the lease.
     pub lease: Sender<LeaseRequest>,
 }
@@ -131,7 +129,7 @@ impl Worker {
     fn try_carry_out(&self, service: &Service) -> Result<(), String> {
         let joint = service.joint;
         let axis = joint
-            .and_then(|index| self.joints.get(index))
+            .and_then(|index| self.shared.joints.get(index))
             .map_or("*", |joint| &joint.axis);
         let stop = |hold| {
             let _ = self.cycle.send(Message::Stop { joint, hold });
@@ -139,47 +137,48 @@ impl Worker {
         let release = || {
             let _ = self.cycle.send(Message::Release(joint));
         };
+        let request = |op| self.request(op, axis, json!({"axis": axis}));
         match &service.action {
             Action::Enable => {
-                self.request(json!({"op": "enable", "axis": axis}))?;
+                request("enable")?;
                 release();
                 Ok(())
             }
             Action::Disable => {
                 stop(false);
-                self.request(json!({"op": "disable", "axis": axis}))
+                request("disable")
             }
-            Action::Reset => self.request(json!({"op": "reset", "axis": axis})),
+            Action::Reset => request("reset"),
             Action::Stop => {
                 stop(true);
                 match joint {
-                    None => self.request(json!({"op": "stop"})),
-                    Some(_) => self.request(json!({"op": "halt", "axis": axis})),
+                    None => self.request("stop", "", json!({})),
+                    Some(_) => request("halt"),
                 }
             }
             Action::Home => {
                 stop(true);
                 std::thread::sleep(LET_GO);
-                let result = self.request(json!({"op": "home", "axis": axis}));
+                let result = request("home");
                 release();
                 result
             }
             Action::Mode(mode) => {
                 stop(false);
                 std::thread::sleep(LET_GO);
-                self.request(json!({"op": "mode", "axis": axis, "mode": mode}))
+                self.request("mode", axis, json!({"axis": axis, "mode": mode}))
             }
             Action::Take => self.ask_lease(LeaseRequest::Take),
             Action::Release => self.ask_lease(LeaseRequest::Release),
         }
     }
 
-    fn request(&self, mut request: Value) -> Result<(), String> {
-        request["wait"] = json!(true);
-        self.connection
-            .request(request, TIMEOUT)
-            .map(|_| ())
-            .map_err(|error| error.to_string())
+    fn request(&self, op: &str, axis: &str, keys: Value) -> Result<(), String> {
+        let machine = &self.shared.machine;
+        let outcome = machine.command(op, axis, keys);
+        outcome
+            .and_then(|request| machine.wait(request, TIMEOUT))
+            .map_err(text)
     }
 
     fn ask_lease(

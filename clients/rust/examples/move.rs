@@ -9,7 +9,7 @@ fn main() -> Result<()> {
 }
 
 pub fn run(socket: &str) -> Result<()> {
-    let mut machine = Machine::attach(socket, Options::default())?;
+    let machine = Machine::attach(socket, Options::default())?;
     machine.enable("*")?;
     let moves = [
         machine.move_to("x", 20.0, 0.5)?,

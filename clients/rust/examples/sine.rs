@@ -12,7 +12,7 @@ fn main() -> Result<()> {
 }
 
 pub fn run(socket: &str, seconds: f64) -> Result<()> {
-    let mut machine = Machine::attach(socket, Options::default())?;
+    let machine = Machine::attach(socket, Options::default())?;
     machine.enable("x")?;
     let mut cyclic = machine.cyclic()?;
     let x = cyclic.axis("x")?;

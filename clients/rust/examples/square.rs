@@ -21,7 +21,7 @@ pub fn run(socket: &str, squares: usize) -> Result<Vec<String>> {
         name: "square".to_owned(),
         ..Options::default()
     };
-    let mut machine = Machine::attach(socket, options)?;
+    let machine = Machine::attach(socket, options)?;
     machine.enable("*")?;
     let homing = [machine.home("x")?, machine.home("y")?];
     for request in homing {
@@ -29,18 +29,18 @@ pub fn run(socket: &str, squares: usize) -> Result<Vec<String>> {
     }
 
     machine.set_output("io", "Output 1", 1.0)?; // clamp
-    while !is_clamped(&mut machine)? {
+    while !is_clamped(&machine)? {
         machine.sleep(Duration::from_millis(20))?;
     }
 
     let (mut done, mut faults) = (0, Vec::new());
-    while done < squares && is_clamped(&mut machine)? {
-        match square(&mut machine) {
+    while done < squares && is_clamped(&machine)? {
+        match square(&machine) {
             Ok(()) => done += 1,
             // A fault of a drive stops the group of its axis.
             Err(error) if matches!(error.kind(), ErrorKind::Failed | ErrorKind::Refused) => {
                 machine.stop()?;
-                let found = present_faults(&mut machine)?;
+                let found = present_faults(&machine)?;
                 if found.is_empty() {
                     return Err(error);
                 }
@@ -55,7 +55,7 @@ pub fn run(socket: &str, squares: usize) -> Result<Vec<String>> {
     Ok(faults)
 }
 
-fn square(machine: &mut Machine) -> Result<()> {
+fn square(machine: &Machine) -> Result<()> {
     for (x, y) in CORNERS {
         let moves = [machine.move_to("x", x, 0.3)?, machine.move_to("y", y, 0.3)?];
         for request in moves {
@@ -66,11 +66,11 @@ fn square(machine: &mut Machine) -> Result<()> {
 }
 
 /// Returns true once the part is clamped: a switch at the first input.
-fn is_clamped(machine: &mut Machine) -> Result<bool> {
+fn is_clamped(machine: &Machine) -> Result<bool> {
     Ok(machine.input("io", "Input 1")? != 0.0)
 }
 
-fn present_faults(machine: &mut Machine) -> Result<Vec<String>> {
+fn present_faults(machine: &Machine) -> Result<Vec<String>> {
     let mut faults = Vec::new();
     for name in ["x", "y"] {
         let axis = machine.axis(name)?;

@@ -62,6 +62,8 @@ pub mod samples {
     pub const DESCRIPTION_BYTES: usize = 9;
     /// The words before the description.
     pub const HEADER: usize = 16;
+    /// The word of the due time of a row in ns of `CLOCK_MONOTONIC`.
+    pub const TIME_NS: usize = 1;
     /// The word of the flags in a row.
     pub const FLAGS: usize = 3;
     /// A flag: all devices are in Op.

@@ -1,13 +1,13 @@
 //! A machine, its axes and its commands.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde::{Deserialize, Deserializer};
 use serde_json::{Value, json};
 
 use crate::connection::{Connection, Request};
-use crate::{Cyclic, Error, Result};
+use crate::{Cyclic, Error, Result, Subscription};
 
 /// The time for commands that wait themselves.
 const OUTCOME: Duration = Duration::from_secs(60);
@@ -19,7 +19,7 @@ pub struct Options {
     pub name: String,
     /// The longest silence of this client, after which what it moved stops.
     pub lease: Duration,
-    /// The time until the bus is in Op.
+    /// The time until the bus is in Op; zero: attaches in any state.
     pub timeout: Duration,
     /// Takes the lease. Without it, commands are refused.
     pub take: bool,
@@ -124,10 +124,12 @@ fn number_or_nan<'de, D: Deserializer<'de>>(deserializer: D) -> std::result::Res
 ///
 /// The client owns the motion until this value is dropped. Its lease ends if the program calls
 /// nothing here for the time of [`Options::lease`]: what it moved then stops. [`Machine::wait`] and
-/// [`Machine::sleep`] keep it.
+/// [`Machine::sleep`] keep it. Threads may share a machine, by reference or in an `Arc`.
 #[derive(Debug)]
 pub struct Machine {
     connection: Connection,
+    path: PathBuf,
+    name: String,
     lease: Duration,
     virtual_time: bool,
     axes: Vec<AxisInfo>,
@@ -139,20 +141,24 @@ impl Machine {
     /// # Errors
     /// Fails without a server, if the bus does not come up, or if another client owns the motion.
     pub fn attach(socket: impl AsRef<Path>, options: Options) -> Result<Self> {
-        let mut connection = Connection::open(socket.as_ref())?;
+        let connection = Connection::open(socket.as_ref(), None)?;
         let hello = connection.ask("hello", "", json!({"name": options.name}))?;
         if hello["protocol"] != json!(1) {
             let error = Error::protocol("the server speaks another version of the protocol");
             return Err(error.at("attach", ""));
         }
-        let timeout_ms = u64::try_from(options.timeout.as_millis()).unwrap_or(u64::MAX);
-        let bus = json!({"bus": "op", "timeout_ms": timeout_ms});
-        let timeout = options.timeout.saturating_add(Duration::from_secs(1));
-        connection.ask_within("await", "", bus, timeout)?;
+        if !options.timeout.is_zero() {
+            let timeout_ms = u64::try_from(options.timeout.as_millis()).unwrap_or(u64::MAX);
+            let bus = json!({"bus": "op", "timeout_ms": timeout_ms});
+            let timeout = options.timeout.saturating_add(Duration::from_secs(1));
+            connection.ask_within("await", "", bus, timeout)?;
+        }
         let mut machine = connection.ask("machine", "", json!({}))?;
         let axes = read(machine["axes"].take(), "machine")?;
-        let mut machine = Self {
+        let machine = Self {
             connection,
+            path: socket.as_ref().to_owned(),
+            name: options.name,
             lease: options.lease,
             virtual_time: hello["virtual"] == json!(true),
             axes,
@@ -161,6 +167,12 @@ impl Machine {
             machine.take(options.force)?;
         }
         Ok(machine)
+    }
+
+    /// Returns true if time advances only while a client waits: `ecaxis serve --virtual`.
+    #[must_use]
+    pub fn is_virtual(&self) -> bool {
+        self.virtual_time
     }
 
     /// Returns the axes in the order of the machine file.
@@ -173,7 +185,7 @@ impl Machine {
     ///
     /// # Errors
     /// Fails if the axis is unknown or the bus is not in Op.
-    pub fn axis(&mut self, name: &str) -> Result<AxisState> {
+    pub fn axis(&self, name: &str) -> Result<AxisState> {
         let mut state = self.connection.ask("state", name, json!({}))?;
         let axes = state["axes"].as_array_mut();
         let mut axes = axes.into_iter().flatten();
@@ -191,7 +203,7 @@ impl Machine {
     ///
     /// # Errors
     /// Fails if the input is unknown or the bus is not in Op.
-    pub fn input(&mut self, device: &str, name: &str) -> Result<f64> {
+    pub fn input(&self, device: &str, name: &str) -> Result<f64> {
         let state = self.connection.ask("state", device, json!({}))?;
         let mut inputs = state["inputs"].as_array().into_iter().flatten();
         let found = inputs.find(|i| i["device"] == json!(device) && i["name"] == json!(name));
@@ -209,7 +221,7 @@ impl Machine {
     ///
     /// # Errors
     /// Fails if the axis has a fault or does not get there.
-    pub fn enable(&mut self, axis: &str) -> Result<()> {
+    pub fn enable(&self, axis: &str) -> Result<()> {
         self.complete("enable", axis, json!({"axis": axis}))
     }
 
@@ -217,7 +229,7 @@ impl Machine {
     ///
     /// # Errors
     /// Fails if the axis is not enabled or its group has stopped.
-    pub fn disable(&mut self, axis: &str) -> Result<()> {
+    pub fn disable(&self, axis: &str) -> Result<()> {
         self.complete("disable", axis, json!({"axis": axis}))
     }
 
@@ -225,7 +237,7 @@ impl Machine {
     ///
     /// # Errors
     /// Fails if the fault stays.
-    pub fn reset(&mut self, axis: &str) -> Result<()> {
+    pub fn reset(&self, axis: &str) -> Result<()> {
         self.complete("reset", axis, json!({"axis": axis}))
     }
 
@@ -233,7 +245,7 @@ impl Machine {
     ///
     /// # Errors
     /// Fails if the output is unknown or the value does not fit.
-    pub fn set_output(&mut self, device: &str, name: &str, value: f64) -> Result<()> {
+    pub fn set_output(&self, device: &str, name: &str, value: f64) -> Result<()> {
         let keys = json!({"device": device, "output": name, "value": value});
         self.complete("output", device, keys)
     }
@@ -243,7 +255,7 @@ impl Machine {
     /// # Errors
     /// As for all motions: fails only if the request cannot be sent. [`Machine::wait`] has the
     /// outcome.
-    pub fn home(&mut self, axis: &str) -> Result<Request> {
+    pub fn home(&self, axis: &str) -> Result<Request> {
         self.connection.command("home", axis, json!({"axis": axis}))
     }
 
@@ -251,7 +263,7 @@ impl Machine {
     ///
     /// # Errors
     /// As [`Machine::home`].
-    pub fn move_to(&mut self, axis: &str, to: f64, speed: f64) -> Result<Request> {
+    pub fn move_to(&self, axis: &str, to: f64, speed: f64) -> Result<Request> {
         let keys = json!({"axis": axis, "to": finite(to, axis)?, "speed": finite(speed, axis)?});
         self.connection.command("move", axis, keys)
     }
@@ -260,7 +272,7 @@ impl Machine {
     ///
     /// # Errors
     /// As [`Machine::home`].
-    pub fn move_by(&mut self, axis: &str, by: f64, speed: f64) -> Result<Request> {
+    pub fn move_by(&self, axis: &str, by: f64, speed: f64) -> Result<Request> {
         let keys = json!({"axis": axis, "by": finite(by, axis)?, "speed": finite(speed, axis)?});
         self.connection.command("move", axis, keys)
     }
@@ -269,7 +281,7 @@ impl Machine {
     ///
     /// # Errors
     /// As [`Machine::home`].
-    pub fn run(&mut self, axis: &str, velocity: f64) -> Result<Request> {
+    pub fn run(&self, axis: &str, velocity: f64) -> Result<Request> {
         let keys = json!({"axis": axis, "velocity": finite(velocity, axis)?});
         self.connection.command("velocity", axis, keys)
     }
@@ -278,7 +290,7 @@ impl Machine {
     ///
     /// # Errors
     /// As [`Machine::home`].
-    pub fn halt(&mut self, axis: &str) -> Result<Request> {
+    pub fn halt(&self, axis: &str) -> Result<Request> {
         self.connection.command("halt", axis, json!({"axis": axis}))
     }
 
@@ -286,7 +298,7 @@ impl Machine {
     ///
     /// # Errors
     /// Fails if the command was refused, did not reach its end, or has no outcome in time.
-    pub fn wait(&mut self, request: Request, timeout: Duration) -> Result<()> {
+    pub fn wait(&self, request: Request, timeout: Duration) -> Result<()> {
         self.connection.wait(request, timeout)
     }
 
@@ -294,7 +306,7 @@ impl Machine {
     ///
     /// # Errors
     /// Fails if it was refused or did not reach its end.
-    pub fn is_done(&mut self, request: Request) -> Result<bool> {
+    pub fn is_done(&self, request: Request) -> Result<bool> {
         self.connection
             .outcome(request)
             .transpose()
@@ -305,7 +317,7 @@ impl Machine {
     ///
     /// # Errors
     /// Fails if the connection is lost.
-    pub fn stop(&mut self) -> Result<()> {
+    pub fn stop(&self) -> Result<()> {
         self.connection.ask("stop", "", json!({})).map(drop)
     }
 
@@ -313,7 +325,7 @@ impl Machine {
     ///
     /// # Errors
     /// Fails if the connection is lost.
-    pub fn emergency_stop(&mut self) -> Result<()> {
+    pub fn emergency_stop(&self) -> Result<()> {
         self.connection
             .ask("emergency_stop", "", json!({}))
             .map(drop)
@@ -323,7 +335,7 @@ impl Machine {
     ///
     /// # Errors
     /// Fails if the lease has ended or the connection is lost.
-    pub fn sleep(&mut self, time: Duration) -> Result<()> {
+    pub fn sleep(&self, time: Duration) -> Result<()> {
         if !self.virtual_time {
             return self.connection.sleep(time);
         }
@@ -338,7 +350,7 @@ impl Machine {
     ///
     /// # Errors
     /// Fails once the lease has ended.
-    pub fn keep(&mut self) -> Result<()> {
+    pub fn keep(&self) -> Result<()> {
         self.connection.keep()
     }
 
@@ -346,7 +358,7 @@ impl Machine {
     ///
     /// # Errors
     /// Fails if another client owns the motion.
-    pub fn take(&mut self, force: bool) -> Result<()> {
+    pub fn take(&self, force: bool) -> Result<()> {
         let ttl_ms = u64::try_from(self.lease.as_millis()).unwrap_or(u64::MAX);
         self.connection
             .ask("take", "", json!({"ttl_ms": ttl_ms, "force": force}))?;
@@ -358,7 +370,7 @@ impl Machine {
     ///
     /// # Errors
     /// Fails if this client does not own the motion.
-    pub fn release(&mut self) -> Result<()> {
+    pub fn release(&self) -> Result<()> {
         self.connection.set_lease(None);
         self.connection.ask("release", "", json!({})).map(drop)
     }
@@ -367,23 +379,50 @@ impl Machine {
     ///
     /// # Errors
     /// Fails if the server refuses it.
-    pub fn request(&mut self, op: &str, keys: Value) -> Result<Value> {
+    pub fn request(&self, op: &str, keys: Value) -> Result<Value> {
         self.connection.ask_within(op, "", keys, OUTCOME)
+    }
+
+    /// Any command of `docs/server.md` that has an outcome, such as `mode`. `device` names the axis
+    /// or device in errors.
+    ///
+    /// # Errors
+    /// As [`Machine::home`].
+    pub fn command(&self, op: &str, device: &str, keys: Value) -> Result<Request> {
+        self.connection.command(op, device, keys)
+    }
+
+    /// Returns the events of the server from now on, such as `fault`.
+    ///
+    /// # Errors
+    /// Fails if the connection is lost.
+    pub fn events(&self) -> Result<Subscription> {
+        Subscription::open(&self.path, &self.name, json!({"topics": ["events"]}))
+    }
+
+    /// Returns the values of signals in every cycle, a batch of cycles each `interval`. The names
+    /// are those of [`Samples::signal`](crate::Samples::signal).
+    ///
+    /// # Errors
+    /// Fails if a signal is unknown or the connection is lost.
+    pub fn samples(&self, signals: &[&str], interval: Duration) -> Result<Subscription> {
+        let interval_ms = u64::try_from(interval.as_millis()).unwrap_or(u64::MAX);
+        let keys = json!({"topics": ["samples"], "signals": signals, "interval_ms": interval_ms});
+        Subscription::open(&self.path, &self.name, keys)
     }
 
     /// Maps the memory for set-points in every cycle.
     ///
     /// # Errors
     /// Fails without the lease, or if the memory is not as `docs/server.md` describes it.
-    pub fn cyclic(&mut self) -> Result<Cyclic> {
-        self.connection.ask("area", "", json!({}))?;
+    pub fn cyclic(&self) -> Result<Cyclic> {
+        let descriptors = self.connection.ask_descriptors("area")?;
         let names = self.axes.iter().map(|axis| axis.name.clone()).collect();
         let other = || Error::protocol("the shared memory of the server has another layout");
-        Cyclic::map(&self.connection.take_descriptors(), names)
-            .ok_or_else(|| other().at("area", ""))
+        Cyclic::map(&descriptors, names).ok_or_else(|| other().at("area", ""))
     }
 
-    fn complete(&mut self, op: &str, device: &str, keys: Value) -> Result<()> {
+    fn complete(&self, op: &str, device: &str, keys: Value) -> Result<()> {
         let request = self.connection.command(op, device, keys)?;
         self.connection.wait(request, OUTCOME)
     }

@@ -20,6 +20,8 @@ pub(crate) struct Memory {
 // SAFETY: this value alone owns the mapping, which is not tied to a thread, and gives access to
 // atomic words only.
 unsafe impl Send for Memory {}
+// SAFETY: as above; atomic words may be shared.
+unsafe impl Sync for Memory {}
 
 impl Memory {
     /// Maps a file with at least `words` words that cannot shrink: an access would end the program.

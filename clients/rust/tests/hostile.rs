@@ -52,7 +52,7 @@ fn good(request: &Value) -> Value {
 
 /// Uses what a program uses.
 fn exercise(path: &std::path::Path) -> Result<()> {
-    let mut machine = Machine::attach(path, Options::default())?;
+    let machine = Machine::attach(path, Options::default())?;
     machine.enable("*")?;
     let request = machine.move_to("x", 1.0, 1.0)?;
     machine.wait(request, Duration::from_millis(100))?;

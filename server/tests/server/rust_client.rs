@@ -45,7 +45,7 @@ fn examples_of_the_readme_are_those_that_run() {
 fn example_moves_two_axes() {
     let server = Server::in_virtual_time(demo());
     simple::run(&path(&server)).expect("the example runs");
-    let mut machine = attach(&server);
+    let machine = attach(&server);
     assert!((machine.axis("x").unwrap().target_position - 20.0).abs() < 1e-6);
     assert!((machine.axis("y").unwrap().target_position + 10.0).abs() < 1e-6);
 }
@@ -54,7 +54,7 @@ fn example_moves_two_axes() {
 fn example_writes_set_points_in_every_cycle() {
     let server = Server::in_real_time(demo());
     sine::run(&path(&server), 1.0).expect("the example runs");
-    let mut machine = attach(&server);
+    let machine = attach(&server);
     let state = machine.request("state", serde_json::json!({})).unwrap();
     // A computer that stands still makes sets late; none is refused.
     assert!(
@@ -73,7 +73,7 @@ fn example_moves_squares_and_resets_a_fault() {
     let faults = square::run(&path(&server), 4).expect("the example runs");
     assert_eq!(faults.len(), 1, "{faults:?}");
     assert!(faults[0].starts_with("x: drive fault"), "{faults:?}");
-    let mut machine = attach(&server);
+    let machine = attach(&server);
     for name in ["x", "y"] {
         let axis = machine.axis(name).unwrap();
         assert!(
@@ -86,7 +86,7 @@ fn example_moves_squares_and_resets_a_fault() {
 #[test]
 fn errors_say_where_and_what_to_do() {
     let server = Server::in_virtual_time(demo());
-    let mut machine = attach(&server);
+    let machine = attach(&server);
     let second = Machine::attach(server.socket(), Options::default()).unwrap_err();
     assert_eq!(second.kind(), ErrorKind::NotOwner);
     let text = second.to_string();
@@ -134,7 +134,7 @@ fn a_silent_client_loses_the_lease_and_learns_it() {
         lease,
         ..Options::default()
     };
-    let mut machine = Machine::attach(server.socket(), options).unwrap();
+    let machine = Machine::attach(server.socket(), options).unwrap();
     machine.enable("x").unwrap();
     let request = machine.move_to("x", 50.0, 0.02).unwrap();
     machine.sleep(2 * lease).expect("`sleep` keeps the lease");
@@ -150,11 +150,78 @@ fn a_silent_client_loses_the_lease_and_learns_it() {
     assert!(axis.enabled && axis.position < 40.0, "{axis:?}");
 }
 
+#[test]
+fn threads_share_a_machine_and_its_events_come() {
+    let server = Server::in_real_time(demo());
+    let machine = attach(&server);
+    let mut events = machine.events().unwrap();
+    let samples = machine
+        .samples(&["x.position", "y.position"], TIMEOUT / 1000)
+        .unwrap();
+    assert_eq!(
+        machine
+            .samples(&["z.position"], TIMEOUT)
+            .unwrap_err()
+            .kind(),
+        ErrorKind::Invalid
+    );
+    std::thread::scope(|scope| {
+        for (axis, to) in [("x", 0.5), ("y", -0.5)] {
+            let machine = &machine;
+            scope.spawn(move || {
+                machine.enable(axis).unwrap();
+                let request = machine.move_to(axis, to, 0.5).unwrap();
+                machine.wait(request, TIMEOUT).unwrap();
+            });
+        }
+    });
+    let ends = events.by_ref().filter(|event| event["event"] == "done");
+    let axes: Vec<_> = ends
+        .take(4)
+        .map(|event| event["axis"].as_str().unwrap_or_default().to_owned())
+        .collect();
+    assert_eq!(
+        axes.iter().filter(|axis| *axis == "y").count(),
+        2,
+        "{axes:?}"
+    );
+    let arrived = samples.take(1000).any(|batch| {
+        let rows = batch["rows"].as_array().into_iter().flatten();
+        rows.filter_map(|row| Some((row[0].as_f64()?, row[1].as_f64()?)))
+            .any(|(x, y)| x > 0.4 && y < -0.4)
+    });
+    assert!(arrived);
+    drop(server);
+    // The events end with the server.
+    events.for_each(drop);
+    assert_eq!(machine.keep().unwrap_err().kind(), ErrorKind::Lost);
+}
+
+/// A clone of the samples goes on without the area.
+#[test]
+fn samples_are_read_in_another_thread() {
+    let server = Server::in_real_time(demo());
+    let machine = attach(&server);
+    let mut samples = machine.cyclic().unwrap().samples().clone();
+    let read = std::thread::spawn(move || {
+        let (first, begin) = (samples.next_cycle(), samples.time_ns());
+        let passed: u64 = (0..50).map(|_| samples.wait().unwrap()).sum();
+        assert_eq!(samples.next_cycle() - first, passed);
+        (passed, samples.time_ns() - begin)
+    });
+    let (cycles, ns) = read.join().unwrap();
+    // The cycle follows the reference clock.
+    assert!(
+        ns.abs_diff(cycles * 1_000_000) < cycles * 1_000 + 100_000,
+        "{cycles} {ns}"
+    );
+}
+
 /// What the server refuses stops the axis, and the client sees it.
 #[test]
 fn a_set_point_that_is_no_number_stops_the_axis() {
     let server = Server::in_virtual_time(demo());
-    let mut machine = attach(&server);
+    let machine = attach(&server);
     machine.enable("x").unwrap();
     let mut cyclic = machine.cyclic().unwrap();
     let axis = cyclic.axis("x").unwrap();
@@ -219,6 +286,7 @@ fn client_and_cycle_agree_on_the_samples() {
     ];
     assert_eq!(of_client, of_cycle);
     assert_eq!(samples::COUNT_COLUMNS[client::FLAGS], "flags");
+    assert_eq!(samples::COUNT_COLUMNS[client::TIME_NS], "time_ns");
     let flags = (samples::flags::IN_OP, samples::flags::STOPPING);
     assert_eq!((client::IN_OP, client::STOPPING), flags);
 }
