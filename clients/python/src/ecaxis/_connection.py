@@ -17,10 +17,21 @@ Event = Dict[str, Any]
 Answer = Dict[str, Any]
 
 # Outcomes that came before the answer that names their request.
-_KEPT = 1024
+KEPT = 1024
 # No request has the number 0.
 _RENEWAL = b'{"id": 0, "op": "renew"}\n'
-OUTCOMES = frozenset({"done", "failed", "refused", "replaced", "let_go"})
+_OUTCOMES = frozenset({"done", "failed", "refused", "replaced", "let_go"})
+
+
+def line_of(number: int, op: str, keys: Mapping[str, Any]) -> bytes:
+    """Returns a request as a line. Keys that are None are left out."""
+    given = {name: value for name, value in keys.items() if value is not None}
+    return json.dumps({"id": number, "op": op, **given}, allow_nan=False).encode() + b"\n"
+
+
+def is_outcome(message: Mapping[str, Any]) -> bool:
+    """True for the event that ends a command."""
+    return message.get("event") in _OUTCOMES and "request" in message
 
 
 class Outcome:
@@ -75,14 +86,13 @@ class Connection:
         Raises the exception of the answer; `TimedOut` and `ConnectionLost` without one."""
         number = next(self._numbers)
         answers: "queue.SimpleQueue[Answer]" = queue.SimpleQueue()
-        given = {name: value for name, value in keys.items() if value is not None}
-        line = json.dumps({"id": number, "op": op, **given}, allow_nan=False)
+        line = line_of(number, op, keys)
         with self._lock:
             if self._lost:
                 raise self._lost
             self._answers[number] = answers
             try:
-                self._socket.sendall(line.encode() + b"\n")
+                self._socket.sendall(line)
             except OSError as error:
                 raise ConnectionLost(f"the connection is lost: {error.strerror}") from error
         wait = self.timeout if timeout is None else timeout
@@ -180,10 +190,10 @@ class Connection:
             if answers:
                 answers.put(dict(message))
             return
-        if message.get("event") in OUTCOMES and "request" in message:
+        if is_outcome(message):
             with self._lock:
                 outcome = self._outcomes.setdefault(int(message["request"]), Outcome())
-                while len(self._outcomes) > _KEPT:
+                while len(self._outcomes) > KEPT:
                     self._outcomes.pop(next(iter(self._outcomes)))
             outcome.set(dict(message))
         self._notify(dict(message))

@@ -12,6 +12,7 @@ import time
 from types import TracebackType
 from typing import Any, Dict, Iterator, List, Mapping, Optional, Type
 
+from ._axes import AxesByName
 from ._connection import Connection
 from ._errors import ConnectionLost, EcaxisError, TimedOut
 
@@ -78,7 +79,7 @@ class CyclicAxis:
         return self._cyclic.value(f"{self.name}.target_position")
 
 
-class Cyclic:
+class Cyclic(AxesByName["CyclicAxis"]):
     """Set-points in every cycle:
 
         with machine.cyclic() as cyclic:
@@ -145,15 +146,6 @@ class Cyclic:
             view.release()
         for area in self._maps:
             area.close()
-
-    def __getattr__(self, name: str) -> CyclicAxis:
-        axes: Dict[str, CyclicAxis] = self.__dict__.get("axes", {})
-        if name in axes:
-            return axes[name]
-        raise AttributeError(f"the machine has no axis `{name}`; it has {', '.join(axes) or 'none'}")
-
-    def __getitem__(self, name: str) -> CyclicAxis:
-        return self.axes[name]
 
     @property
     def used(self) -> int:

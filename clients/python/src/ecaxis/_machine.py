@@ -14,6 +14,7 @@ import time
 from types import TracebackType
 from typing import Any, Dict, Iterator, List, Mapping, NamedTuple, Optional, Sequence, Type, Union
 
+from ._axes import AxesByName, AxisOf, input_of
 from ._connection import Connection, Event, Outcome
 from ._cyclic import Cyclic
 from ._errors import EcaxisError, StartFailed, TimedOut, of_outcome
@@ -57,23 +58,17 @@ class Motion:
             raise error
 
 
-class Axis:
+class Axis(AxisOf):
     """An axis of the machine, with its present values and its commands."""
 
     def __init__(self, machine: "Machine", about: Mapping[str, Any]) -> None:
+        super().__init__(about)
         self._machine = machine
-        self.about = dict(about)
-        self.name = str(about["name"])
-        self.unit = str(about.get("unit") or "")
-
-    def __repr__(self) -> str:
-        return f"<axis {self.name} in {self.unit}>"
 
     @property
     def state(self) -> Dict[str, Any]:
         """The object of this axis in the state of the machine."""
-        axes = self._machine.state["axes"]
-        return next(axis for axis in axes if axis["name"] == self.name)
+        return self.of_state(self._machine.state)
 
     def _value(self, key: str) -> float:
         value = self.state[key]
@@ -166,14 +161,6 @@ class Recording(NamedTuple):
         return array
 
 
-def input_of(state: Mapping[str, Any], device: str, name: str) -> float:
-    """Returns an input from the state of a machine."""
-    for signal in state["inputs"]:
-        if (signal["device"], signal["name"]) == (device, name):
-            return float(signal["value"])
-    raise KeyError(f"the machine has no input `{name}` of `{device}`")
-
-
 def recording_of(batches: Sequence[Event], signals: Sequence[str], begin: int, end: int) -> Recording:
     """Returns the samples of a time from events `samples`."""
     times = [at for batch in batches for at in batch["time_ns"]]
@@ -240,7 +227,7 @@ class Server:
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
-class Machine:
+class Machine(AxesByName["Axis"]):
     """A machine that `ecaxis serve` runs. Use it in a `with` statement.
 
     Axes are attributes and items: `machine.x`, `machine["x"]`. The client owns the motion until the end
@@ -268,15 +255,6 @@ class Machine:
         trace: Optional[TracebackType],
     ) -> None:
         self.close()
-
-    def __getattr__(self, name: str) -> Axis:
-        axes: Dict[str, Axis] = self.__dict__.get("axes", {})
-        if name in axes:
-            return axes[name]
-        raise AttributeError(f"the machine has no axis `{name}`; it has {', '.join(axes) or 'none'}")
-
-    def __getitem__(self, name: str) -> Axis:
-        return self.axes[name]
 
     def close(self) -> None:
         """Ends the connection: what this program moved stops. Ends a server that `open` has started:

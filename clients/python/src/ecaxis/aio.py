@@ -21,13 +21,13 @@ import json
 import os
 from typing import Any, AsyncGenerator, Dict, List, Mapping, Optional, Sequence
 
-from ._connection import OUTCOMES, Answer, Event
+from ._axes import AxesByName, AxisOf, input_of
+from ._connection import KEPT, Answer, Event, is_outcome, line_of
 from ._errors import ConnectionLost, EcaxisError, TimedOut, of_answer, of_outcome
-from ._machine import STEP_S, Path, Recording, Server, client_name, input_of, recording_of
+from ._machine import STEP_S, Path, Recording, Server, client_name, recording_of
 
 __all__ = ["Axis", "Connection", "Machine", "attach", "open"]
 
-_KEPT = 1024
 _MOST_LINE = 1 << 26
 _TIMEOUT_S = 10.0
 
@@ -66,10 +66,9 @@ class Connection:
         number = next(self._numbers)
         answer: "asyncio.Future[Answer]" = asyncio.get_running_loop().create_future()
         self._answers[number] = answer
-        given = {name: value for name, value in keys.items() if value is not None}
-        line = json.dumps({"id": number, "op": op, **given}, allow_nan=False)
+        line = line_of(number, op, keys)
         try:
-            self._writer.write(line.encode() + b"\n")
+            self._writer.write(line)
             await self._writer.drain()
             body = await asyncio.wait_for(answer, timeout)
         except asyncio.TimeoutError:
@@ -87,7 +86,7 @@ class Connection:
         outcome = self._outcomes.get(request)
         if outcome is None:
             outcome = self._outcomes[request] = asyncio.get_running_loop().create_future()
-            while len(self._outcomes) > _KEPT:
+            while len(self._outcomes) > KEPT:
                 self._outcomes.pop(next(iter(self._outcomes)))
             if self._lost:
                 outcome.set_result({"event": "lost", "text": str(self._lost)})
@@ -125,7 +124,7 @@ class Connection:
             if answer is not None and not answer.done():
                 answer.set_result(dict(message))
             return
-        if message.get("event") in OUTCOMES and "request" in message:
+        if is_outcome(message):
             outcome = self.outcome(int(message["request"]))
             if not outcome.done():
                 outcome.set_result(dict(message))
@@ -136,19 +135,16 @@ class Connection:
             events.put_nowait(event)
 
 
-class Axis:
+class Axis(AxisOf):
     """An axis of the machine. Its commands end with their outcome; `asyncio.create_task` starts one."""
 
     def __init__(self, machine: "Machine", about: Mapping[str, Any]) -> None:
+        super().__init__(about)
         self._machine = machine
-        self.about = dict(about)
-        self.name = str(about["name"])
-        self.unit = str(about.get("unit") or "")
 
     async def state(self) -> Dict[str, Any]:
         """Returns the object of this axis in the state of the machine."""
-        axes = (await self._machine.state())["axes"]
-        return next(axis for axis in axes if axis["name"] == self.name)
+        return self.of_state(await self._machine.state())
 
     async def _command(self, op: str, what: str, **keys: Any) -> None:
         await self._machine.command(op, f"{self.name}: {what}", axis=self.name, **keys)
@@ -185,7 +181,7 @@ class Axis:
         await self._command("mode", f"mode {mode}", mode=mode)
 
 
-class Machine:
+class Machine(AxesByName["Axis"]):
     """A machine that `ecaxis serve` runs. Use it in an `async with` statement of `open` or `attach`."""
 
     def __init__(self, connection: Connection, path: Path, lease: float) -> None:
@@ -195,15 +191,6 @@ class Machine:
         self.about: Dict[str, Any] = {}
         self.axes: Dict[str, Axis] = {}
         self.virtual = False
-
-    def __getattr__(self, name: str) -> Axis:
-        axes: Dict[str, Axis] = self.__dict__.get("axes", {})
-        if name in axes:
-            return axes[name]
-        raise AttributeError(f"the machine has no axis `{name}`; it has {', '.join(axes) or 'none'}")
-
-    def __getitem__(self, name: str) -> Axis:
-        return self.axes[name]
 
     async def _begin(self, timeout: float) -> None:
         request = self.connection.request
