@@ -8,7 +8,6 @@ Needs the packages of requirements-ros2.txt. `ECAXIS` and `ECAXIS_ROS2` name the
 
 import argparse
 import contextlib
-import json
 import math
 import os
 import pathlib
@@ -17,14 +16,13 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from unittest import mock
 
 import rig
 from launch_file import processes
 from report import Report, Stop
-from server import Server, limit_broken
+from server import Samples, Server, limit_broken
 
 # Nothing else on this computer has this domain, and the participants only use it.
 os.environ["ROS_DOMAIN_ID"] = str(random.SystemRandom().randint(20, 100))
@@ -42,32 +40,6 @@ SLIDE_LIMITS = [limit / MM for limit in LIMITS["slide"]]
 FAULTS = '[[fault]]\nkind = "drive-fault"\ndevice = 1\nat = "9s"\ncode = 0x4210\n'
 TTL_S = 1.0
 STALE_MS = 500
-
-
-class Samples:
-    """Every cycle's values of some signals while the block runs."""
-
-    def __init__(self, path, *signals):
-        self.server, self.signals, self.rows = Server(path), signals, []
-        self.begin = self.server.ask("state")["time_ns"]
-        self.server.ask("subscribe", topics=["samples"], signals=list(signals), interval_ms=10)
-        # A slow reader would miss rows.
-        threading.Thread(target=self.read, daemon=True).start()
-
-    def read(self):
-        with contextlib.suppress(OSError, ValueError):
-            for line in self.server.lines:
-                event = json.loads(line)
-                if event.get("event") == "samples":
-                    rows = zip(event["time_ns"], event["rows"])
-                    self.rows += [(at, *values) for at, values in rows if at > self.begin]
-
-    def until_now(self):
-        """Returns the rows: time in ns, then the values."""
-        end = time.monotonic_ns()
-        while not self.rows or self.rows[-1][0] < end:
-            time.sleep(0.01)
-        return list(self.rows)
 
 
 class Ros:

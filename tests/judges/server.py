@@ -1,7 +1,10 @@
 """The socket of `ecaxis serve`, written from docs/server.md alone, and the check of set-points against limits."""
 
+import contextlib
 import json
 import socket
+import threading
+import time
 
 
 class Server:
@@ -23,6 +26,32 @@ class Server:
 
     def axis(self, name):
         return next(axis for axis in self.ask("state")["axes"] if axis["name"] == name)
+
+
+class Samples:
+    """Every cycle's values of some signals while the block runs."""
+
+    def __init__(self, path, *signals):
+        self.server, self.signals, self.rows = Server(path), signals, []
+        self.begin = self.server.ask("state")["time_ns"]
+        self.server.ask("subscribe", topics=["samples"], signals=list(signals), interval_ms=10)
+        # A slow reader would miss rows.
+        threading.Thread(target=self.read, daemon=True).start()
+
+    def read(self):
+        with contextlib.suppress(OSError, ValueError):
+            for line in self.server.lines:
+                event = json.loads(line)
+                if event.get("event") == "samples":
+                    rows = zip(event["time_ns"], event["rows"])
+                    self.rows += [(at, *values) for at, values in rows if at > self.begin]
+
+    def until_now(self):
+        """Returns the rows: time in ns, then the values."""
+        end = time.monotonic_ns()
+        while not self.rows or self.rows[-1][0] < end:
+            time.sleep(0.01)
+        return list(self.rows)
 
 
 def limit_broken(rows, velocity, acceleration, reach, dt=1e-3):
