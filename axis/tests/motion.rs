@@ -233,6 +233,55 @@ fn cst_ramps_and_stops() {
     assert_eq!(rig.out.target_torque, -10);
 }
 
+/// Turns a motor by torque that accelerates `strength` times as much as its limits say, against
+/// friction in per mille. Returns the fastest and the last speed.
+fn turned(percent: f64, strength: f64, friction: f64) -> [f64; 2] {
+    let limits = Limits {
+        position: None,
+        // The drive of these tests reaches 250 mm/s² with its whole torque.
+        acceleration: 250.0 / strength,
+        ..LIMITS
+    };
+    let mut config = AxisConfig::new(Mode::Cst, scale(), limits);
+    config.dead_time_s = 2.0 * DT;
+    let mut rig = Rig::new(Axis::new(config).unwrap(), Drive::at(0));
+    rig.axis.command(Command::Enable).unwrap();
+    rig.until(|s| s.ready, 100);
+    let ramp_s = 0.0;
+    rig.axis
+        .command(Command::Torque { percent, ramp_s })
+        .unwrap();
+    let (mut fastest, mut last): (f64, f64) = (0.0, 0.0);
+    for _ in 0..12_000 {
+        rig.drive.load = -friction * rig.drive.velocity.signum();
+        let status = rig.cycle();
+        assert!(status.trip.is_none(), "{:?}", status.trip);
+        last = status.velocity;
+        fastest = fastest.max(last.abs());
+    }
+    [fastest, last]
+}
+
+/// The speed rises to the velocity limit and stays there, with less torque than commanded.
+#[test]
+fn cst_reduces_the_torque_at_the_velocity_limit() {
+    for percent in [30.0, 100.0, -60.0] {
+        for strength in [0.5, 1.0, 3.0] {
+            for friction in [0.0, 100.0] {
+                let [fastest, last] = turned(percent, strength, friction);
+                let limit = LIMITS.velocity;
+                let at =
+                    format!("{percent} % x {strength}, friction {friction}: {fastest}, {last}");
+                assert!(fastest < limit * 1.03, "{at}");
+                assert!(
+                    (last - limit * percent.signum()).abs() < limit * 0.01,
+                    "{at}"
+                );
+            }
+        }
+    }
+}
+
 #[test]
 fn rejected_commands_give_a_reason_and_change_nothing() {
     let mut rig = Rig::of(Mode::Csp);

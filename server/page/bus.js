@@ -11,6 +11,7 @@ export class Bus {
   #part = {};
   #rows = [];
   #io = [];
+  #switches = [];
   #shape = "";
   #boxes = [];
   #wires = [];
@@ -33,6 +34,7 @@ export class Bus {
     this.#rows = machine.devices.map((device) => new DeviceRow(device));
     const io = [...(machine.inputs ?? []).map((line) => ({ ...line, output: false })), ...(machine.outputs ?? []).map((line) => ({ ...line, output: true }))];
     this.#io = io.map((line) => new Line(line, control));
+    this.#switches = (machine.sim_inputs ?? []).map((line) => new Switch(line, control));
     this.#root.replaceChildren(
       h("div", { class: "panel" },
         h("dl", { class: "stats" }, ...stat("state", "State"), ...stat("up", "In Op for"), ...stat("cycle", "Cycle time"), ...stat("cycles", "Cycles"), ...stat("wkc_errors", "Working counter errors"),
@@ -43,6 +45,7 @@ export class Bus {
       h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Devices" },
         h("table", {}, h("thead", {}, h("tr", {}, ...["", "Device", "Product", "AL state", "AL status code", "Clock difference", "Processing errors", "PDI errors", "Port", "Link", "Invalid frames", "RX errors", "Forwarded errors", "Lost links"].map((text, k) => h("th", { text, scope: "col", class: k > 5 && k !== 9 ? "number" : null })))),
           ...this.#rows.map(({ body }) => body))),
+      ...(this.#switches.length && connection.control ? [h("h2", { text: "Simulated inputs" }), h("div", { class: "lines" }, ...this.#switches.map(({ root }) => root))] : []),
       ...(io.length ? [h("h2", { text: "Inputs and outputs" }), h("div", { class: "lines" }, ...this.#io.map(({ root }) => root))] : []));
   }
 
@@ -76,6 +79,7 @@ export class Bus {
     machine.devices.forEach((device, k) => this.#rows[k].update(devices.get(device.name), windowNs(device)));
     const values = new Map([...(state.inputs ?? []).map((line) => [`i/${line.device}/${line.name}`, line.value]), ...(state.outputs ?? []).map((line) => [`o/${line.device}/${line.name}`, line.value])]);
     for (const line of this.#io) line.update(values.get(line.key), control.mine);
+    for (const line of this.#switches) line.update(values.get(line.key));
     this.#draw(machine.devices, devices, windowNs);
   }
 
@@ -239,6 +243,37 @@ class DeviceRow {
         mark(cells[key + row], "data-level", port[name] > 0 ? "near" : null);
       }
     });
+  }
+}
+
+/** An input of the simulated bus with a name of `[signals]`. */
+class Switch {
+  #value;
+  #field;
+  #bit;
+
+  constructor(line, control) {
+    this.key = `i/${line.device}/${line.name}`;
+    this.#bit = line.bits === 1;
+    this.#value = h("span", { class: "value" });
+    const write = (value) => control.command("sim_input", { input: line.input, value });
+    this.#field = this.#bit
+      ? h("button", { type: "button", class: "commands", "data-switch": line.input, text: "Press", onclick: () => write(this.#field.dataset.on ? 0 : 1) })
+      : h("input", { type: "text", inputmode: "decimal", class: "commands", size: 8, "aria-label": `New value of ${line.input}`, onchange: () => {
+        const value = Number(this.#field.value.replace(",", "."));
+        if (this.#field.value.trim() !== "" && Number.isFinite(value)) write(value);
+      } });
+    this.root = h("div", { class: "line" }, this.#bit ? h("span", { class: "lamp" }) : h("span"), h("span", { class: "name", text: line.input }), h("span", { class: "way", text: `${line.device} · ${line.name}` }), this.#value, this.#field);
+  }
+
+  update(value) {
+    const known = value !== null && value !== undefined;
+    set(this.#value, !known ? NONE : this.#bit ? (value ? "on" : "off") : figure(value, Number.isInteger(value) ? 0 : 4));
+    mark(this.root, "data-on", known && value !== 0);
+    this.#field.disabled = !known;
+    if (!this.#bit) return;
+    mark(this.#field, "data-on", known && value !== 0);
+    set(this.#field, value ? "Release" : "Press");
   }
 }
 

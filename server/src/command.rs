@@ -126,6 +126,9 @@ pub enum Op {
         output: String,
         value: f64,
     },
+    /// Switches an input of the simulated bus: a name of `[signals]`, or `io.Input 1`. Needs no
+    /// lease.
+    SimInput { input: String, value: f64 },
     /// Scales the speed of all motions, of the machine or of a group.
     Override {
         /// From 0 to 1.2.
@@ -296,6 +299,7 @@ impl Op {
             | Self::Renew {}
             | Self::Release {}
             | Self::SdoRead { .. }
+            | Self::SimInput { .. }
             | Self::Advance { .. } => Access::Command,
             Self::Disable { axis } if axis == ALL => Access::Command,
             _ => Access::Lease,

@@ -29,6 +29,7 @@ pub fn keep_up(hub: &Arc<Hub>, options: &Options, stop: &Arc<CancelToken>, descr
         });
         let (controller, client) = external(&hub.machine, &hub.area, hold);
         let attachments = Attachments {
+            control: Arc::default(),
             controller: Some(Box::new(controller)),
             operator: Some(Box::new(ServerOperator::new(Arc::clone(hub), client))),
             samples: hub.samples.writer(),

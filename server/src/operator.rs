@@ -109,6 +109,12 @@ impl ServerOperator {
                     "replaced by another command",
                 )),
             ),
+            RequestEvent::Input { result, .. } => {
+                let refused = |why: &String| OpError::new(ErrorCode::Refused, why);
+                let outcome = result.as_ref().map(|()| Map::new()).map_err(refused);
+                self.hub.finish(ticket, outcome);
+                return;
+            }
             RequestEvent::Program { result, .. } => {
                 self.hub.set_step(RunningStep::default());
                 if ticket == 0 {
@@ -305,6 +311,7 @@ impl ServerOperator {
             | Request::Reset { .. }
             | Request::SetMode { .. }
             | Request::SetOutput { .. }
+            | Request::SimInput(_)
             | Request::Override { .. }
             | Request::Hold { .. }
             | Request::Program(ProgramRequest::Pause | ProgramRequest::Resume) => return None,

@@ -9,7 +9,7 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 use ecaxis_esi::address;
 use ecaxis_master::acyclic::AlState;
 use ecaxis_master::acyclic::topology::ports;
-use ecaxis_master::config::{AxisSetup, Machine, Signal, si_factor};
+use ecaxis_master::config::{AxisSetup, Machine, Nic, Signal, si_factor};
 use ecaxis_master::link::redundant::{RingState, RingStatus};
 use ecaxis_master::report::events::describe_stop;
 use ecaxis_master::rt::exchange::{DiagnosticRegister, SubDeviceDiagnostics};
@@ -45,9 +45,16 @@ pub fn machine(hub: &Hub) -> Value {
         json!({"device": device, "name": name, "bits": signal.field.bit_len,
                "address": address(signal.field.index, signal.field.sub).to_string()})
     };
+    let simulated = machine.bus.nic == Nic::Sim;
+    let sim_inputs = machine.named_inputs().filter(|_| simulated);
+    let sim_inputs = sim_inputs.map(|(name, input)| {
+        let mut input = signal(&input);
+        input["input"] = json!(name);
+        input
+    });
     let steps = machine.steps.iter().enumerate().map(|(index, step)| {
         json!({"number": (index + 1).to_string(), "line": step.line,
-               "text": machine.describe(&step.action)})
+               "text": machine.describe_step(step)})
     });
     json!({
         "name": name,
@@ -62,6 +69,7 @@ pub fn machine(hub: &Hub) -> Value {
         "devices": devices.collect::<Vec<_>>(),
         "inputs": machine.inputs.iter().map(signal).collect::<Vec<_>>(),
         "outputs": hub.outputs.iter().map(|(_, output)| signal(output)).collect::<Vec<_>>(),
+        "sim_inputs": sim_inputs.collect::<Vec<_>>(),
         "steps": steps.collect::<Vec<_>>(),
         "samples": hub.samples.layout(),
     })

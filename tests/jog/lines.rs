@@ -9,8 +9,12 @@ use ecaxis_test_support::program;
 
 /// Returns exit code, standard output and standard error.
 fn script(lines: &str, more: &[&str]) -> (i32, String, String) {
+    script_for("configs/demo.toml", lines, more)
+}
+
+fn script_for(file: &str, lines: &str, more: &[&str]) -> (i32, String, String) {
     let mut child = program::command()
-        .args(["jog", "configs/demo.toml", "--sim", "--lines", "--virtual"])
+        .args(["jog", file, "--sim", "--lines", "--virtual"])
         .args(more)
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
@@ -173,4 +177,42 @@ fn a_missing_device_leaves_a_fault_report() {
     let (code, _, err) = script(lines, &options);
     assert_eq!(code, 2, "{err}");
     assert!(err.contains("report.txt exists already"), "{err}");
+}
+
+/// Inputs of the simulated bus are pressed, released and set; wrong ones are refused.
+#[test]
+fn a_script_presses_inputs() {
+    let file = "configs/pick-and-place.toml";
+    let lines =
+        "press start\nwait 10ms\nstatus\nrelease start\nset io.Input 6 = 1\nwait 10ms\nstatus\n";
+    let (code, out, err) = script_for(file, lines, &[]);
+    assert_eq!(code, 0, "{err}");
+    let inputs: Vec<_> = out
+        .lines()
+        .filter(|line| line.starts_with("io.Input"))
+        .collect();
+    let value = |at: usize, name: &str| {
+        let mut all = inputs.iter().filter(|line| line.starts_with(name));
+        all.nth(at).and_then(|line| line.split(" = ").nth(1))
+    };
+    assert_eq!(
+        [value(0, "io.Input 5"), value(0, "io.Input 6")],
+        [Some("1"), Some("0")],
+        "{out}"
+    );
+    assert_eq!(
+        [value(1, "io.Input 5"), value(1, "io.Input 6")],
+        [Some("0"), Some("1")],
+        "{out}"
+    );
+    for (line, part) in [
+        ("press begin", "inputs of [signals]: `start`"),
+        ("press x.Statusword", "which the drive sets"),
+        ("set start = 2", "not a value"),
+        ("set start", "write `set"),
+        ("press", "takes the name of an input"),
+    ] {
+        let (code, _, err) = script_for(file, &format!("{line}\n"), &[]);
+        assert!(code == 2 && err.contains(part), "{line}: {code} {err}");
+    }
 }

@@ -50,6 +50,7 @@ fn tool_that_is_taken_away_with_power_is_a_failure() {
     let last = machine.steps[1].clone();
     machine.steps.push(ecaxis_master::config::Step {
         action: ecaxis_master::config::Action::Dwell { ns: 8_000_000_000 },
+        uses: Vec::new(),
         ..last
     });
     let script = "[[fault]]\nkind = \"absent\"\ndevice = 1\nat = \"6s\"\n\

@@ -20,6 +20,10 @@ pub(super) struct LoopState {
     correction: f64,
     pub(super) torque: f64,
     integral: Integral,
+    /// The part of a commanded torque that the velocity limit takes away.
+    reduction: f64,
+    /// The torque that keeps the axis at the velocity limit, in the direction of the command.
+    holding: f64,
     /// True: the PID loop continues from `torque`.
     takes_over: bool,
     velocity_offset: f64,
@@ -52,13 +56,27 @@ impl DerivedConstants {
 
 impl LoopState {
     /// Lets the loops continue from the last outputs.
-    pub(super) const fn take_over(&mut self) {
+    pub(super) fn take_over(&mut self) {
+        self.torque = self.limited_torque();
+        self.release_speed();
         self.takes_over = true;
+    }
+
+    /// Returns the commanded torque within the velocity limit.
+    pub(super) fn limited_torque(&self) -> f64 {
+        self.torque - self.reduction
+    }
+
+    /// Ends the reduction of the torque.
+    pub(super) const fn release_speed(&mut self) {
+        self.reduction = 0.0;
+        self.holding = 0.0;
     }
 
     /// Enters a mode: the velocity prepared for the switch contains no correction.
     pub(super) const fn enter(&mut self) {
         self.correction = 0.0;
+        self.release_speed();
         self.takes_over = true;
     }
 }
@@ -126,6 +144,39 @@ impl Axis {
         }
     }
 
+    /// Reduces a commanded torque so that the speed stays at the velocity limit. A PI controller of
+    /// the speed asks for torque, and the smaller torque counts. Its gain assumes that the torque
+    /// limit gives the acceleration limit. `before`: the torque of the last cycle; it grows with the
+    /// configured slope. RT: O(1).
+    pub(super) fn keep_speed(&mut self, before: f64, fresh: bool, dt_s: f64) {
+        let limits = self.config.limits;
+        let torque = self.loop_state.torque;
+        let wanted = torque.abs();
+        if wanted == 0.0 {
+            self.loop_state.release_speed();
+            return;
+        }
+        let filter_s = match self.actual.velocity_is_measured() {
+            true => 0.0,
+            false => FILTER_S,
+        };
+        // A quarter of the delay's bandwidth; the integral part is eight times slower.
+        let bandwidth = 0.25 / (self.config.dead_time_s + 2.0 * dt_s + filter_s);
+        let gain = bandwidth * limits.torque / limits.acceleration;
+        let room = limits.velocity - self.actual.velocity() * torque.signum();
+        let direct = gain * room;
+        let state = &mut self.loop_state;
+        if direct >= wanted {
+            state.holding = 0.0;
+        } else if fresh {
+            let holding = state.holding + direct * bandwidth * 0.125 * dt_s;
+            state.holding = holding.clamp(-limits.torque, wanted);
+        }
+        let allowed = (direct + state.holding).clamp(-limits.torque, wanted);
+        let most = (before * torque.signum()).max(0.0) + self.config.torque_slope * dt_s;
+        state.reduction = (wanted - allowed.min(most)) * torque.signum();
+    }
+
     fn close_torque(&mut self, dt_s: f64) {
         let Some(pid) = self.config.loops.cst else {
             return;
@@ -181,7 +232,7 @@ impl Axis {
             out.target_velocity = raw;
         }
         if counts(Mode::Cst) {
-            let PerMille(raw) = scale.torque_to_raw(Percent(self.loop_state.torque));
+            let PerMille(raw) = scale.torque_to_raw(Percent(self.loop_state.limited_torque()));
             out.target_torque = raw;
         }
         if self.mode == Mode::Csp && self.switch.is_none() {

@@ -206,7 +206,9 @@ impl Axis {
             }
             Plan::Velocity(ramp) => self.motion = self.run(self.at_rate(ramp), before, dt_s),
             Plan::Torque(ramp) => {
+                let before = self.loop_state.limited_torque();
                 self.loop_state.torque = ramp.advance(self.loop_state.torque, dt_s);
+                self.keep_speed(before, fresh, dt_s);
                 self.motion = self.uncommanded();
             }
             Plan::DriveProfile => {

@@ -2,6 +2,7 @@
 
 pub(crate) mod bus;
 pub(crate) mod change_log;
+pub(crate) mod console;
 pub(crate) mod device;
 pub(crate) mod rights;
 pub(crate) mod signals;

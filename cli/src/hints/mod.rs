@@ -192,6 +192,7 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         Cause::StepTimeout { .. } => "check the drive's state and fault; the step waits for `bus.enable_timeout`, or for the longest stop time of an axis".to_owned(),
         Cause::NotSwitched { .. } => "check 0x6502 (supported drive modes) and the mode's requirements in the drive's manual".to_owned(),
         Cause::NotHomed { error, .. } => not_homed(*error).to_owned(),
+        Cause::VariableRange { .. } => "test the variable with `if` before this step, or correct its range under [variables]".to_owned(),
         Cause::Alarm { .. } => "remove its cause, then start again".to_owned(),
         Cause::WaitTimeout { .. } => "check the sensor and its wiring, or give the step a longer `timeout`".to_owned(),
         Cause::TooLarge(_) => "map fewer objects with `pdo.rx` and `pdo.tx`".to_owned(),

@@ -1,15 +1,16 @@
 //! `ecaxis run`: brings a machine up, runs its program and prints a summary.
 
+use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{Machine, Nic, duration};
-use ecaxis_master::session::{self, Options, Outcome, Summary};
+use ecaxis_master::session::{self, Attachments, Options, Outcome, Summary};
 use serde_json::{Value, json};
 
-use crate::access::{rights, signals};
+use crate::access::{console, rights, signals};
 use crate::args::LogArgs;
 use crate::args::bus::BusArgs;
 use crate::args::can_log::CanLog;
@@ -32,6 +33,9 @@ Examples:
   ecaxis run m.toml --sim --faults f.toml   with a fault script
   ecaxis run m.toml --no-enable             to Op, axes without power
   ecaxis run m.toml --json                  the result as JSON
+
+During the run, the lines `p` (pause), `s` (one step), `c` (continue) and, on the
+simulated bus, `press INPUT` and `release INPUT` control the program.
 
 Ctrl-C, SIGTERM, or a terminal that closes: the axes decelerate within their
 limits, lose power, and the bus goes back to Init; the exit code is 130. Ctrl-Z
@@ -64,6 +68,10 @@ pub(crate) struct Args {
     /// Enable the axes even if the file has `enable = false`
     #[arg(long)]
     enable: bool,
+    /// Read `pause`, `continue`, `step` and `press INPUT` from the standard input also without a
+    /// terminal
+    #[arg(long, conflicts_with = "virtual_time")]
+    console: bool,
     /// Print the result as JSON
     #[arg(long)]
     json: bool,
@@ -128,13 +136,17 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let (nic, devices) = (machine.bus.nic.clone(), machine.devices.len());
     let stop = Arc::<CancelToken>::default();
     signals::stop_on_interrupt(&stop);
+    let attachments = Attachments::default();
+    if options.clock == Clock::Real && (args.console || std::io::stdin().is_terminal()) {
+        console::control(&machine, Arc::clone(&attachments.control))?;
+    }
     let mut teller = ProgressPrinter::new(options.clock, &machine.bus, args.verbosity.plain());
     let Outcome {
         summary,
         result: ended,
         fault_report,
         ..
-    } = session::run(machine, options, stop, &mut teller);
+    } = session::run_attached(machine, options, stop, &mut teller, attachments);
     drop(teller);
     if let Some(error) = can_log.as_mut().and_then(|log| log.write().err()) {
         note(&format!("warning: writing the CAN log: {error}"));

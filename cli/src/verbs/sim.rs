@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use ecaxis_master::cancel::CancelToken;
-use ecaxis_master::config;
+use ecaxis_master::config::{self, Machine};
 use ecaxis_master::link::OpenError;
 use ecaxis_master::link::SocketKind;
 use ecaxis_master::link::lock::{NicInUse, NicLock};
@@ -18,7 +18,7 @@ use serde_json::{Value, json};
 
 use ecaxis_master::text::pluralize;
 
-use crate::access::signals;
+use crate::access::{console, signals};
 use crate::args::bus;
 use crate::args::can_log::CanLog;
 use crate::args::files::{Inputs, check_output, unwritable, write_new};
@@ -35,6 +35,11 @@ Examples:
   ecaxis sim m.toml --nic veth0 --nic2 veth2
   ecaxis sim m.toml --nic veth0 --faults f.toml --sii eeproms
   ecaxis sim m.toml --nic veth0 --trace t.csv
+  echo 'press start' | ecaxis sim m.toml --nic veth0
+
+It reads lines such as `press start`, `release start`, `set io.Input 1 = 1`
+from the standard input: inputs of simulated I/O devices.
+
 
 `ip link add veth0 type veth peer name veth1` makes two interfaces that are
 connected; needs root, or cap_net_raw.";
@@ -163,6 +168,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         nics.join("` and `"),
     );
     note(&format!("{devices} {answer} on `{nics}`; Ctrl-C ends it"));
+    let lines = console::lines()?;
     // Real devices answer independently of the computer's load.
     for denied in rt_thread::become_realtime(PRIORITY, None) {
         note(&format!("warning: {denied}"));
@@ -172,6 +178,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             &mut segment,
             || stop.is_cancelled(),
             |segment, now| {
+                while let Ok(line) = lines.try_recv() {
+                    switch_input(segment, &machine, &line);
+                }
                 if let Some(script) = &on_signal
                     && signalled.swap(false, Ordering::Relaxed)
                 {
@@ -199,6 +208,23 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     } else {
         text(&report)
     })
+}
+
+/// Carries out a line of the console.
+fn switch_input(segment: &mut Segment, machine: &Machine, line: &str) {
+    if line.trim().is_empty() {
+        return;
+    }
+    let help = "write `press start`, `release start`, or `set io.Input 1 = 1`";
+    match machine.parse_input_line(line) {
+        None => note(&format!("`{}`: not understood; {help}", line.trim())),
+        Some(Err(why)) => note(&format!("`{}`: {why}", line.trim())),
+        Some(Ok(input)) => {
+            if let Some(device) = segment.device_mut(input.position) {
+                device.set_input(input.index, input.sub, input.value);
+            }
+        }
+    }
 }
 
 /// Locks an interface: two simulated buses would both answer each frame. Returns `None` if the

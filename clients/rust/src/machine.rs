@@ -241,6 +241,15 @@ impl Machine {
         self.complete("reset", axis, json!({"axis": axis}))
     }
 
+    /// Switches an input of the simulated bus: a name of `[signals]`, or `io.Input 1`.
+    ///
+    /// # Errors
+    /// Fails if the bus is real, or the input is unknown or cannot have the value.
+    pub fn set_input(&mut self, name: &str, value: f64) -> Result<()> {
+        let keys = json!({"input": name, "value": value});
+        self.complete("sim_input", name, keys)
+    }
+
     /// Sets an output that no axis writes.
     ///
     /// # Errors

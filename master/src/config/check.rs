@@ -92,7 +92,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         folder,
         cycle_s,
     };
-    let names = (raw.signals, raw.variables, raw.sim);
+    let names = (raw.signals, raw.variables, raw.program, raw.sim);
     let program = steps::check(
         raw.steps,
         (raw.stop, raw.overrides),
@@ -149,6 +149,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         outputs: program.outputs,
         signals: program.signals,
         variables: program.variables,
+        program: program.buttons,
         switched: program.switched,
         copies,
         stop: program.stop,

@@ -106,6 +106,7 @@ fn adopt_rescales_program_and_homing() {
     let step = |action| Step {
         number: "1".to_owned(),
         line: 1,
+        uses: Vec::new(),
         action,
     };
     machine.steps = vec![

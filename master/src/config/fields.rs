@@ -300,7 +300,18 @@ pub(crate) fn wrong<T>(p: &mut Problems<'_>, value: Value<'_>, wanted: &str) -> 
         DeValue::Array(_) => "a list",
         DeValue::Table(_) => "a table",
     };
-    p.add(value.span(), format!("expected {wanted}, found {found}"));
+    let hint = match wanted {
+        "a number" => "write a number, such as 5.0",
+        "a whole number" => "write a number, such as 5",
+        "a string" => "write a name or a text in quotes: \"…\"",
+        "true or false" => "write `true` or `false`, without quotes",
+        "a table" => "write keys and values in braces: `{ … }`",
+        wanted if wanted.starts_with("a duration") => "write a number with its unit: \"500ms\"",
+        wanted if wanted.starts_with("[[") => "write each one below its name in two brackets",
+        _ => "write a list in brackets: `[ … ]`",
+    };
+    let message = format!("expected {wanted}, found {found}");
+    p.add_hint(value.span(), message, hint);
     None
 }
 
@@ -312,7 +323,8 @@ fn wrong_range<T>(p: &mut Problems<'_>, value: Value<'_>, wanted: &str) -> Optio
         Some((at, _)) => format!("{}…", &text[..at]),
         None => text.to_owned(),
     };
-    p.add(value.span(), format!("expected {wanted}, found {text}"));
+    let message = format!("expected {wanted}, found {text}");
+    p.add_hint(value.span(), message, "write a number within this range");
     None
 }
 
@@ -496,8 +508,12 @@ impl Domain<Ns> for RangeInclusive<Ns> {
             return Some(ns);
         }
         let [ns, low, high] = [ns, *self.start(), *self.end()].map(show);
-        let message = format!("`{key}` of {ns} is not possible; it must be from {low} to {high}");
-        p.add(value.span(), message);
+        let message = format!("`{key}` of {ns} is not possible");
+        p.add_hint(
+            value.span(),
+            message,
+            format!("it must be from {low} to {high}"),
+        );
         None
     }
 

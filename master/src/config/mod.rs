@@ -53,9 +53,11 @@ pub mod schema;
 mod sdo;
 mod signal;
 pub mod sim;
+mod sim_input;
 mod startup;
 pub mod state_timeouts;
 pub(crate) mod steps;
+mod subprograms;
 mod syntax;
 #[cfg(test)]
 mod tests;
@@ -72,8 +74,8 @@ pub use gateway::{GatewaySetup, NodeSetup};
 pub use locator::{Locator, SegmentHead};
 pub use problem::{ConfigError, Problem};
 pub use program::{
-    Action, AxisValue, NamedSignal, Step, StopGroup, StopSetup, Subject, SwitchedInput, TableFile,
-    Test, Variable, VariableRef, When,
+    Action, AxisValue, NamedSignal, NumberPlace, ProgramInputs, Step, StopGroup, StopSetup,
+    Subject, SwitchedInput, TableFile, Test, Variable, VariableRef, VariableUse, When,
 };
 pub use signal::{NameError, Signal};
 pub use startup::{Startup, StartupOptions};
@@ -83,6 +85,7 @@ pub use units::si_factor;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 use ecaxis_esi as esi;
 
+pub(crate) use fields::LARGEST;
 use fields::Read;
 use raw::RawMachine;
 
@@ -123,6 +126,8 @@ pub struct Machine {
     pub signals: Vec<NamedSignal>,
     /// The variables of the program.
     pub variables: Vec<Variable>,
+    /// The inputs that pause the program and step it.
+    pub program: ProgramInputs,
     /// What the simulated bus does with its inputs.
     pub switched: Vec<SwitchedInput>,
     pub copies: Vec<CopySetup>,
@@ -563,7 +568,7 @@ fn parse_file(
         return Err(problems.into_error());
     }
     let (document, mut errors) = toml::de::DeTable::parse_recoverable(text);
-    let root = toml::Spanned::new(0..0, toml::de::DeValue::Table(document.into_inner()));
+    let mut root = toml::Spanned::new(0..0, toml::de::DeValue::Table(document.into_inner()));
     // Checks after a syntax error would only report consequences of it.
     if !errors.is_empty() {
         // A malformed table would make its subtables look incomplete.
@@ -581,6 +586,9 @@ fn parse_file(
             problems.add(next.span().unwrap_or(0..0), message);
         }
         return Err(problems.into_error());
+    }
+    if let toml::de::DeValue::Table(table) = root.get_mut() {
+        subprograms::expand(table, &mut problems);
     }
     let raw = RawMachine::read(&root, "", &mut problems);
     match raw.and_then(|raw| check::machine(&file, raw, &mut problems)) {

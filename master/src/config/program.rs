@@ -2,13 +2,15 @@
 
 use std::path::PathBuf;
 
+mod describe;
+mod variables;
+
+pub use variables::{NumberPlace, Variable, VariableRef, VariableUse};
+
 use ecaxis_axis::{AxisStatus, Edge, StopMethod};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex};
 
-use super::{
-    AxisSetup, Bounds, Condition, GroupStopScope, InputRef, Machine, OutputRef, Signal, duration,
-};
-use crate::text::{percent, rounded};
+use super::{AxisSetup, Bounds, Condition, GroupStopScope, InputRef, OutputRef, Signal};
 
 /// One step of the program.
 #[derive(Debug, Clone, PartialEq)]
@@ -18,6 +20,8 @@ pub struct Step {
     /// The line in the machine file.
     pub line: u32,
     pub action: Action,
+    /// The numbers of the action that are values of variables.
+    pub uses: Vec<VariableUse>,
 }
 
 /// The action of a step. Targets are pairs of an axis and a value in user units.
@@ -162,50 +166,91 @@ pub enum Action {
         steps: Vec<Step>,
         otherwise: Vec<Step>,
     },
+    /// Run the steps of a named subprogram.
+    Call {
+        name: String,
+        steps: Vec<Step>,
+    },
+    /// Run all branches at the same time. Each axis belongs to one branch.
+    Parallel {
+        branches: Vec<Vec<Step>>,
+    },
 }
 
 impl Action {
-    /// Returns the steps inside the step.
-    pub fn inner(&self) -> impl Iterator<Item = &Step> {
-        let (steps, otherwise): (&[Step], &[Step]) = match self {
-            Self::Repeat { steps, .. } | Self::While { steps, .. } => (steps, &[]),
+    /// Returns the lists of steps inside the step.
+    #[must_use]
+    pub fn lists(&self) -> Vec<&[Step]> {
+        match self {
+            Self::Repeat { steps, .. } | Self::While { steps, .. } | Self::Call { steps, .. } => {
+                vec![steps]
+            }
             Self::If {
                 steps, otherwise, ..
-            } => (steps, otherwise),
-            _ => (&[], &[]),
-        };
-        steps.iter().chain(otherwise)
+            } => vec![steps, otherwise],
+            Self::Parallel { branches } => branches.iter().map(Vec::as_slice).collect(),
+            _ => Vec::new(),
+        }
+    }
+
+    /// Returns the axes to which the step gives commands.
+    pub fn commanded(&self) -> Vec<AxisIndex> {
+        match self {
+            Self::Enable { axes }
+            | Self::Disable { axes }
+            | Self::Reset { axes }
+            | Self::Home { axes }
+            | Self::Stop { axes } => axes.clone(),
+            Self::Move { targets, .. }
+            | Self::Line { targets, .. }
+            | Self::Velocity { targets, .. }
+            | Self::Torque { targets, .. } => targets.iter().map(|&(axis, _)| axis).collect(),
+            Self::Mode { targets } => targets.iter().map(|&(axis, _)| axis).collect(),
+            Self::Wave { axis, .. }
+            | Self::Table { axis, .. }
+            | Self::Probe { axis, .. }
+            | Self::Gear { axis, .. } => vec![*axis],
+            _ => Vec::new(),
+        }
+    }
+
+    /// Returns the steps inside the step.
+    pub fn inner(&self) -> impl Iterator<Item = &Step> {
+        self.lists().into_iter().flatten()
     }
 
     /// True for a step after which no other one runs.
     pub(crate) fn never_ends(&self) -> bool {
+        let ends_never = |steps: &&[Step]| steps.last().is_some_and(|s| s.action.never_ends());
+        let mut lists = self.lists().into_iter();
         match self {
-            Self::Alarm { .. } => true,
-            Self::Repeat {
+            Self::Alarm { .. }
+            | Self::Repeat {
                 times: None,
                 until: None,
                 ..
             } => true,
-            Self::Repeat { steps, .. } => steps.last().is_some_and(|s| s.action.never_ends()),
-            Self::If {
-                steps, otherwise, ..
-            } => [steps, otherwise]
-                .iter()
-                .all(|steps| steps.last().is_some_and(|s| s.action.never_ends())),
+            Self::If { .. } => lists.all(|steps| ends_never(&steps)),
+            Self::Repeat { .. } | Self::Call { .. } | Self::Parallel { .. } => {
+                lists.any(|steps| ends_never(&steps))
+            }
             _ => false,
         }
     }
 
     /// As [`Action::inner`].
     pub(crate) fn inner_mut(&mut self) -> impl Iterator<Item = &mut Step> {
-        let (steps, otherwise): (&mut [Step], &mut [Step]) = match self {
-            Self::Repeat { steps, .. } | Self::While { steps, .. } => (steps, &mut []),
+        let lists: Vec<&mut Vec<Step>> = match self {
+            Self::Repeat { steps, .. } | Self::While { steps, .. } | Self::Call { steps, .. } => {
+                vec![steps]
+            }
             Self::If {
                 steps, otherwise, ..
-            } => (steps, otherwise),
-            _ => (&mut [], &mut []),
+            } => vec![steps, otherwise],
+            Self::Parallel { branches } => branches.iter_mut().collect(),
+            _ => Vec::new(),
         };
-        steps.iter_mut().chain(otherwise)
+        lists.into_iter().flatten()
     }
 }
 
@@ -236,6 +281,15 @@ pub enum Subject {
     Variable(VariableRef),
 }
 
+/// Conditions of `[program]` that pause the program.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct ProgramInputs {
+    /// No step begins while it holds.
+    pub pause: Option<When>,
+    /// One step of a paused program begins when it becomes true.
+    pub step: Option<When>,
+}
+
 /// A name of `[signals]`, for a signal of a device.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NamedSignal {
@@ -253,17 +307,6 @@ pub struct SwitchedInput {
     pub for_ns: Option<u64>,
     pub input: Signal,
     pub value: f64,
-}
-
-/// A variable by its place in [`Machine::variables`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct VariableRef(pub usize);
-
-/// A variable of the program.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Variable {
-    pub name: String,
-    pub initial: f64,
 }
 
 /// What a condition may test of an axis. Yes is 1, no is 0.
@@ -355,244 +398,4 @@ pub struct StopGroup {
 pub struct TableFile {
     pub path: PathBuf,
     pub table: ecaxis_axis::setpoint::Table,
-}
-
-impl Machine {
-    /// Returns a step as text: `move x → 50 mm at 50 % of the velocity …`.
-    #[must_use]
-    pub fn describe(&self, action: &Action) -> String {
-        match action {
-            Action::Enable { axes } => format!("enable {}", self.names(axes)),
-            Action::Disable { axes } => format!("disable {}", self.names(axes)),
-            Action::Reset { axes } => format!("reset the faults of {}", self.names(axes)),
-            Action::Home { axes } => format!("find home with {}", self.names(axes)),
-            Action::Stop { axes } => format!("stop {}", self.names(axes)),
-            Action::Move {
-                relative,
-                targets,
-                speed,
-                ramp,
-                together,
-            } => format!(
-                "move {} at {} % of the velocity and {} % of the acceleration limit{}",
-                self.targets(targets, if *relative { "by" } else { "→" }, ""),
-                percent(*speed),
-                percent(*ramp),
-                if *together {
-                    ", to arrive together"
-                } else {
-                    ""
-                },
-            ),
-            Action::Probe {
-                axis,
-                probe,
-                edge,
-                relative,
-                target,
-                speed,
-                ramp,
-            } => format!(
-                "probe {} until input {} {}, at {} % of the velocity and {} % of the acceleration limit",
-                self.targets(&[(*axis, *target)], if *relative { "by" } else { "→" }, ""),
-                probe.number(),
-                match edge {
-                    Edge::Positive => "rises",
-                    Edge::Negative => "falls",
-                },
-                percent(*speed),
-                percent(*ramp),
-            ),
-            Action::Line {
-                relative,
-                targets,
-                speed,
-                ramp,
-            } => format!(
-                "straight line {} at {} % of the velocity and {} % of the acceleration limits",
-                self.targets(targets, if *relative { "by" } else { "→" }, ""),
-                percent(*speed),
-                percent(*ramp),
-            ),
-            Action::Wave { axis, wave } => format!(
-                "swing {} for {} s",
-                self.names(&[*axis]),
-                rounded(wave.duration_s())
-            ),
-            Action::Table { axis, table, .. } => {
-                let file = self
-                    .tables
-                    .get(*table)
-                    .map(|t| t.path.display().to_string());
-                format!(
-                    "move {} along {}",
-                    self.names(&[*axis]),
-                    file.unwrap_or_default()
-                )
-            }
-            Action::Gear {
-                axis,
-                master,
-                actual,
-                ratio,
-                ..
-            } => format!(
-                "gear {} to {}{} with a ratio of {ratio}",
-                self.names(&[*axis]),
-                if *actual {
-                    "the reported position of "
-                } else {
-                    ""
-                },
-                self.names(&[*master]),
-            ),
-            Action::Velocity { targets, ramp } => format!(
-                "turn {} at {} % of the acceleration limit",
-                self.targets(targets, "→", "/s"),
-                percent(*ramp),
-            ),
-            Action::Torque { targets, ramp_ns } => format!(
-                "torque {} within {}",
-                self.targets(targets, "→", TORQUE),
-                duration::show(*ramp_ns),
-            ),
-            Action::Mode { targets } => {
-                let each = targets.iter().filter_map(|(axis, mode)| {
-                    Some(format!("{} to {mode}", self.axes.get(*axis)?.name))
-                });
-                format!("switch {}", each.collect::<Vec<_>>().join(", "))
-            }
-            Action::Dwell { ns } => format!("wait {}", duration::show(*ns)),
-            Action::Wait {
-                when,
-                timeout_ns: None,
-            } => format!("wait until {}", self.when(when)),
-            Action::Wait {
-                when,
-                timeout_ns: Some(ns),
-            } => format!(
-                "wait until {}, {} at most",
-                self.when(when),
-                duration::show(*ns)
-            ),
-            Action::Assign { add, values } => {
-                let sign = if *add { "+=" } else { "=" };
-                let each = values.iter().filter_map(|&(variable, value)| {
-                    Some(format!(
-                        "{} {sign} {value}",
-                        self.variables.get(variable.0)?.name
-                    ))
-                });
-                each.collect::<Vec<_>>().join(", ")
-            }
-            Action::Override(values) => self.describe_overrides(values),
-            Action::Message { text } => text.clone(),
-            Action::Alarm { text } => format!("alarm: {text}"),
-            Action::Set { values } => {
-                let each = values.iter().filter_map(|&(output, value)| {
-                    Some(format!(
-                        "{} = {value}",
-                        self.short(self.outputs.get(output.0)?)
-                    ))
-                });
-                format!("set {}", each.collect::<Vec<_>>().join(", "))
-            }
-            Action::Repeat { times, until, .. } => {
-                let times = match times {
-                    None => "for ever".to_owned(),
-                    Some(1) => "once".to_owned(),
-                    Some(times) => format!("{times} times"),
-                };
-                let until = until
-                    .as_ref()
-                    .map(|when| format!(", until {}", self.when(when)));
-                times + &until.unwrap_or_default()
-            }
-            Action::While { when, .. } => format!("while {}", self.when(when)),
-            Action::If { when, .. } => format!("if {}", self.when(when)),
-        }
-    }
-
-    /// Returns a condition as text: `io.Input 3 = 1`.
-    #[must_use]
-    pub fn condition(&self, condition: &Condition) -> String {
-        self.test(&Test {
-            of: Subject::Input(condition.input),
-            bounds: condition.bounds,
-        })
-    }
-
-    /// Returns the condition of a step as text: `io.Input 3 = 1 and x.position > 5, or …`.
-    #[must_use]
-    pub fn when(&self, when: &When) -> String {
-        let all = |tests: &Vec<Test>| {
-            let each: Vec<_> = tests.iter().map(|test| self.test(test)).collect();
-            each.join(" and ")
-        };
-        when.0.iter().map(all).collect::<Vec<_>>().join(", or ")
-    }
-
-    /// Returns the name of `[signals]`, otherwise the signal's own.
-    fn short(&self, signal: &Signal) -> String {
-        let named = self
-            .signals
-            .iter()
-            .find(|named| named.signal == signal.name);
-        named.map_or_else(|| signal.name.clone(), |named| named.name.clone())
-    }
-
-    pub(crate) fn test(&self, test: &Test) -> String {
-        let name = match test.of {
-            Subject::Input(input) => self.inputs.get(input.0).map(|input| self.short(input)),
-            Subject::Variable(at) => self.variables.get(at.0).map(|known| known.name.clone()),
-            Subject::Axis(axis, value) => {
-                let word = AxisValue::ALL.iter().find(|(_, each)| *each == value);
-                let axis = self.axes.get(axis);
-                axis.zip(word)
-                    .map(|(axis, (word, _))| format!("{}.{word}", axis.name))
-            }
-        };
-        let Bounds {
-            equal,
-            above,
-            below,
-        } = test.bounds;
-        let bounds = [("=", equal), (">", above), ("<", below)].into_iter();
-        let bounds = bounds.filter_map(|(sign, n)| Some(format!("{sign} {}", n?)));
-        let bounds: Vec<_> = bounds.collect();
-        format!(
-            "{} {}",
-            name.as_deref().unwrap_or("?"),
-            bounds.join(" and ")
-        )
-    }
-
-    fn names(&self, axes: &[AxisIndex]) -> String {
-        let names = axes.iter().filter_map(|&axis| self.axes.get(axis));
-        names
-            .map(|axis| axis.name.as_str())
-            .collect::<Vec<_>>()
-            .join(", ")
-    }
-
-    fn targets(&self, targets: &[(AxisIndex, f64)], arrow: &str, suffix: &str) -> String {
-        let each = targets.iter().filter_map(|&(index, target)| {
-            let axis = self.axes.get(index)?;
-            if suffix == TORQUE {
-                let (torque, unit) = (short(axis.torque.shown(target)), axis.torque.unit);
-                return Some(format!("{} {arrow} {torque} {unit}", axis.name));
-            }
-            let unit = &axis.unit;
-            Some(format!("{} {arrow} {target} {unit}{suffix}", axis.name))
-        });
-        each.collect::<Vec<_>>().join(", ")
-    }
-}
-
-/// The placeholder of the axis's torque unit.
-const TORQUE: &str = "torque";
-
-/// Rounds to six significant digits.
-fn short(x: f64) -> f64 {
-    format!("{x:.5e}").parse().unwrap_or(x)
 }

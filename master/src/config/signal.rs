@@ -257,6 +257,12 @@ pub(super) fn place<'n>(
 }
 
 impl NameError {
+    /// Returns the message and the hint.
+    #[must_use]
+    pub fn parts(&self) -> (&str, &str) {
+        (&self.message, &self.hint)
+    }
+
     pub(super) fn of_signal(message: String, hint: impl Into<String>) -> Self {
         Self {
             message,
@@ -464,7 +470,12 @@ impl Machine {
         outputs
     }
 
-    fn signal(&self, device: &str, name: &str, way: SignalDirection) -> Result<Signal, NameError> {
+    pub(super) fn signal(
+        &self,
+        device: &str,
+        name: &str,
+        way: SignalDirection,
+    ) -> Result<Signal, NameError> {
         let names = self.devices.iter().map(|d| d.name.as_str());
         let index = DeviceIndex(place(device, names)?);
         one(name, way, index, &self.devices[index])

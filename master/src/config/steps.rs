@@ -1,15 +1,17 @@
 //! The program: axes and signals by name, targets within limits.
 
 use std::cell::RefCell;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use toml::Spanned;
 
 mod condition;
+mod endings;
 mod follow;
 mod modes;
+mod number;
 mod overrides;
 mod preconditions;
 mod probe;
@@ -19,24 +21,32 @@ mod target;
 use super::fields::{Key, KeyExt};
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{
-    Levels, NamedValues, RawAction, RawAxes, RawOverride, RawSimulation, RawStep, RawStop,
-    TimeLimit,
+    Levels, NamedValues, RawAction, RawAxes, RawNumber, RawOverride, RawProgram, RawSimulation,
+    RawStep, RawStop, RawVariable, TimeLimit,
 };
+use super::subprograms::MOST_STEPS;
 use super::{
-    Action, AxisSetup, DeviceConfig, NamedSignal, OverrideConfig, Signal, Step, StopSetup,
-    SwitchedInput, TableFile, Variable,
+    Action, AxisSetup, DeviceConfig, NamedSignal, NumberPlace, OverrideConfig, ProgramInputs,
+    Signal, Step, StopSetup, SwitchedInput, TableFile, Variable, VariableUse,
 };
 use ecaxis_axis::Mode;
-pub(crate) use preconditions::enables;
-use target::{TargetKind, fraction};
+use target::TargetKind;
 
 /// The default fraction of the limits for the move to the beginning of a table.
 const GENTLE: f64 = 0.1;
 const WHOLE_TORQUE_RAMP_NS: u64 = 100_000_000;
 /// The default timeout for an input in ns.
 const WAIT_NS: u64 = 10_000_000_000;
-/// The maximum number of steps in a program, including those inside repetitions.
-const MOST_STEPS: usize = 10_000;
+
+/// Returns `true` if the program itself enables axes.
+pub(crate) fn enables(steps: &[Step]) -> bool {
+    steps.iter().any(|step| match &step.action {
+        Action::Enable { .. } => true,
+        action => action
+            .inner()
+            .any(|step| enables(std::slice::from_ref(step))),
+    })
+}
 
 /// What steps know about a device; `None`: it is invalid and has been reported.
 #[derive(Clone, Copy)]
@@ -76,6 +86,7 @@ pub(crate) struct Program {
     pub tables: Vec<TableFile>,
     pub signals: Vec<NamedSignal>,
     pub variables: Vec<Variable>,
+    pub buttons: ProgramInputs,
     pub switched: Vec<SwitchedInput>,
 }
 
@@ -83,7 +94,12 @@ pub(crate) struct Program {
 pub(crate) fn check(
     steps: Vec<RawStep>,
     (stop, overrides): (RawStop, RawOverride),
-    (signals, variables, sim): (NamedValues<String>, NamedValues<f64>, RawSimulation),
+    (signals, variables, buttons, sim): (
+        NamedValues<String>,
+        NamedValues<RawVariable>,
+        RawProgram,
+        RawSimulation,
+    ),
     known: Resolved<'_>,
     repeat: u32,
     p: &mut Problems<'_>,
@@ -107,14 +123,23 @@ pub(crate) fn check(
         groups: (stop.groups.iter())
             .map(|group| (group.name.as_ref()).map_or_else(String::new, |n| n.get_ref().clone()))
             .collect(),
+        uses: Vec::new(),
     };
     checker.name_signals(signals, p);
     checker.name_variables(variables, p);
     let steps = checker.all(steps, "", p);
     // After an invalid step, the state of the axes is unknown.
     if p.count() == before {
+        checker.check_endings(&steps, &BTreeSet::new(), p);
+    }
+    if p.count() == before {
         checker.flow(&steps, repeat, p);
     }
+    let mut button = |raw: Option<Spanned<_>>| raw.and_then(|raw| checker.when(raw.get_ref(), p));
+    let buttons = ProgramInputs {
+        pause: button(buttons.pause),
+        step: button(buttons.step),
+    };
     let stop = checker.stop(&stop, p);
     let overrides = checker.overrides(&overrides, p);
     let switched = checker.switched_inputs(sim, p);
@@ -128,6 +153,7 @@ pub(crate) fn check(
         tables: checker.tables,
         signals: checker.signals,
         variables: checker.variables,
+        buttons,
         switched,
     }
 }
@@ -153,6 +179,8 @@ struct ProgramChecker<'c> {
     variables: Vec<Variable>,
     /// The names of `[[stop.group]]`.
     groups: Vec<String>,
+    /// The variables of the step being checked.
+    uses: Vec<VariableUse>,
 }
 
 impl ProgramChecker<'_> {
@@ -162,7 +190,8 @@ impl ProgramChecker<'_> {
             let span = step.span.clone();
             self.count += 1;
             if self.count == MOST_STEPS + 1 {
-                p.add(span, format!("a program has {MOST_STEPS} steps at most"));
+                let message = format!("a program has {MOST_STEPS} steps at most");
+                p.add_hint(span, message, "repeat steps with `repeat`");
                 break;
             }
             let number = format!("{prefix}{}", index + 1);
@@ -185,11 +214,15 @@ impl ProgramChecker<'_> {
                 );
                 break;
             }
-            if let Some(action) = self.one(step, &number, p) {
+            let outer = std::mem::take(&mut self.uses);
+            let action = self.one(step, &number, p);
+            let uses = std::mem::replace(&mut self.uses, outer);
+            if let Some(action) = action {
                 checked.push(Step {
                     number,
                     line,
                     action,
+                    uses,
                 });
             }
         }
@@ -223,7 +256,10 @@ impl ProgramChecker<'_> {
                 together,
             } => {
                 let at = ramp.place();
-                let (speed, ramp) = (fraction(&speed, "speed", p), fraction(&ramp, "ramp", p));
+                let (speed, ramp) = (
+                    self.fraction(&speed, NumberPlace::Speed, p),
+                    self.fraction(&ramp, NumberPlace::Ramp, p),
+                );
                 let targets = self.targets(targets, TargetKind::of_move(relative), p)?;
                 let (speed, ramp) = (speed?, ramp?);
                 self.check_ramp_time(&targets, ramp, at, p, |_, limit| limit * speed);
@@ -236,11 +272,17 @@ impl ProgramChecker<'_> {
                 }
             }
             RawAction::Probe(axis, probe) => {
-                let pace = (fraction(&speed, "speed", p), fraction(&ramp, "ramp", p));
+                let pace = (
+                    self.fraction(&speed, NumberPlace::Speed, p),
+                    self.fraction(&ramp, NumberPlace::Ramp, p),
+                );
                 self.probe(&axis, &probe, pace, p)?
             }
             RawAction::Line { relative, targets } => {
-                let (speed, ramp) = (fraction(&speed, "speed", p), fraction(&ramp, "ramp", p));
+                let (speed, ramp) = (
+                    self.fraction(&speed, NumberPlace::Speed, p),
+                    self.fraction(&ramp, NumberPlace::Ramp, p),
+                );
                 Action::Line {
                     relative,
                     targets: self.targets(targets, TargetKind::of_move(relative), p)?,
@@ -250,17 +292,18 @@ impl ProgramChecker<'_> {
             }
             RawAction::Wave { square, axis, wave } => self.wave(square, &axis, &wave, p)?,
             RawAction::Table { axis, file } => {
-                let gentle = |value: &Key<f64>, what, p: &mut Problems<'_>| match value {
-                    Some(_) => fraction(value, what, p),
+                let mut gentle = |value: &Key<RawNumber>, place| match value {
+                    Some(_) => self.fraction(value, place, p),
                     None => Some(GENTLE),
                 };
-                let (speed, ramp) = (gentle(&speed, "speed", p), gentle(&ramp, "ramp", p));
+                let speed = gentle(&speed, NumberPlace::Speed);
+                let ramp = gentle(&ramp, NumberPlace::Ramp);
                 self.table(&axis, &file, [speed?, ramp?], p)?
             }
             RawAction::Gear(axis, gear) => self.gear(&axis, &gear, p)?,
             RawAction::Velocity(targets) => {
                 let at = ramp.place();
-                let ramp = fraction(&ramp, "ramp", p);
+                let ramp = self.fraction(&ramp, NumberPlace::Ramp, p);
                 let targets = self.targets(targets, TargetKind::Velocity, p)?;
                 self.check_ramp_time(&targets, ramp?, at, p, |target, _| target.abs());
                 Action::Velocity {
@@ -281,15 +324,13 @@ impl ProgramChecker<'_> {
                 targets.sort_by_key(|(index, _)| *index);
                 (count > 0 && targets.len() == count).then_some(Action::Mode { targets })?
             }
-            RawAction::Dwell(ns) => Action::Dwell { ns },
+            RawAction::Dwell(time) => Action::Dwell {
+                ns: self.time(&time, p)?,
+            },
             RawAction::Wait { when, timeout } => {
-                let checked = self.when(&when, p)?;
                 let TimeLimit(timeout_ns) = timeout.unwrap_or(TimeLimit(Some(WAIT_NS)));
-                if timeout_ns.is_none() {
-                    self.check_can_end(&checked, &span, p)?;
-                }
                 Action::Wait {
-                    when: checked,
+                    when: self.when(&when, p)?,
                     timeout_ns,
                 }
             }
@@ -301,17 +342,11 @@ impl ProgramChecker<'_> {
                     .collect();
                 (count > 0 && values.len() == count).then_some(Action::Set { values })?
             }
-            RawAction::Assign { add, values } => {
-                let count = values.len();
-                let values: Vec<_> = values
-                    .into_iter()
-                    .filter_map(|(name, value)| {
-                        Some((self.variable(&name, p)?, value.into_inner()))
-                    })
-                    .collect();
-                (count > 0 && values.len() == count).then_some(Action::Assign { add, values })?
-            }
             RawAction::Override(values) => self.override_step(values, p)?,
+            RawAction::Assign { add, values } => Action::Assign {
+                add,
+                values: self.assignments(add, values, p)?,
+            },
             RawAction::Message(text) => Action::Message { text },
             RawAction::Alarm(text) => Action::Alarm { text },
             RawAction::Repeat {
@@ -344,6 +379,18 @@ impl ProgramChecker<'_> {
                     when: when?,
                     steps,
                     otherwise,
+                }
+            }
+            RawAction::Call { name, steps } => Action::Call {
+                name,
+                steps: self.all(steps, &format!("{number}."), p),
+            },
+            RawAction::Parallel(branches) => {
+                let branches = ('a'..).zip(branches);
+                Action::Parallel {
+                    branches: branches
+                        .map(|(letter, steps)| self.all(steps, &format!("{number}.{letter}."), p))
+                        .collect(),
                 }
             }
         })

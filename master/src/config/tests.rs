@@ -1,5 +1,6 @@
 mod flow;
 mod mistakes;
+mod wrong_programs;
 
 use std::path::PathBuf;
 

@@ -277,6 +277,10 @@ impl Link for CapturingLink {
         self.inner.ring()
     }
 
+    fn take_sim_inputs(&mut self) -> Option<super::sim::SimInputSender> {
+        self.inner.take_sim_inputs()
+    }
+
     fn exhausted_reason(&self) -> Option<&'static str> {
         self.inner.exhausted_reason()
     }

@@ -80,6 +80,11 @@ pub trait Link: fmt::Debug + Send {
         None
     }
 
+    /// Returns the sender of input values, once, if the link has a simulated bus.
+    fn take_sim_inputs(&mut self) -> Option<sim::SimInputSender> {
+        None
+    }
+
     /// Returns why no more frames can arrive, if the link knows it. Not for the cycle.
     fn exhausted_reason(&self) -> Option<&'static str> {
         None

@@ -61,6 +61,11 @@ pub trait RingEnds: std::fmt::Debug + Send {
 
     /// As [`Link::stats`], the sum of both interfaces.
     fn stats(&mut self) -> LinkStats;
+
+    /// As [`Link::take_sim_inputs`].
+    fn take_sim_inputs(&mut self) -> Option<super::sim::SimInputSender> {
+        None
+    }
 }
 
 /// Two network interfaces.
@@ -403,6 +408,10 @@ impl Link for RedundantLink {
 
     fn ring(&self) -> Option<&'static RingStatus> {
         Some(self.status)
+    }
+
+    fn take_sim_inputs(&mut self) -> Option<super::sim::SimInputSender> {
+        self.ends.take_sim_inputs()
     }
 }
 

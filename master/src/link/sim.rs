@@ -7,6 +7,23 @@ use super::redundant::{End, RingEnds};
 use super::{FrameQueue, Link, LinkError, MAX_FRAME, Nanos};
 use crate::clock;
 
+/// The value of an input of a simulated I/O device.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SimInput {
+    /// The position of the device on the bus.
+    pub position: usize,
+    pub index: u16,
+    pub sub: u8,
+    /// The bits of the value.
+    pub value: i64,
+}
+
+/// Sends values to the inputs of the simulated bus. Full if the bus carries no frames.
+pub type SimInputSender = rtrb::Producer<SimInput>;
+
+/// The maximum of values that wait for the next frame.
+const INPUTS: usize = 256;
+
 /// The maximum of frames in flight.
 const IN_FLIGHT: usize = 64;
 
@@ -20,13 +37,18 @@ pub struct SimLink {
     /// The frames on their way to each port of the MainDevice.
     queues: [FrameQueue; 2],
     stats: LinkStats,
+    inputs: rtrb::Consumer<SimInput>,
+    sender: Option<SimInputSender>,
 }
 
 impl SimLink {
     /// Creates the link. The segment's time starts now.
     #[must_use]
     pub fn new(segment: Segment) -> Self {
+        let (sender, inputs) = rtrb::RingBuffer::new(INPUTS);
         Self {
+            inputs,
+            sender: Some(sender),
             segment,
             start: clock::now(),
             queues: [FrameQueue::new(IN_FLIGHT), FrameQueue::new(IN_FLIGHT)],
@@ -45,6 +67,11 @@ impl SimLink {
 
     fn send_from(&mut self, from: Nic, frame: &[u8]) -> Result<(), LinkError> {
         let now = clock::now().saturating_sub(self.start);
+        while let Ok(input) = self.inputs.pop() {
+            if let Some(device) = self.segment.device_mut(input.position) {
+                device.set_input(input.index, input.sub, input.value);
+            }
+        }
         let [first, second] = &mut self.queues;
         // The frame waits where it was sent, until its destination is known.
         let (own, other) = match from {
@@ -103,6 +130,10 @@ impl Link for SimLink {
     fn next_arrival(&self) -> Option<Nanos> {
         self.queues[0].next_due()
     }
+
+    fn take_sim_inputs(&mut self) -> Option<SimInputSender> {
+        self.sender.take()
+    }
 }
 
 /// Both ends of a simulated ring.
@@ -132,6 +163,10 @@ impl RingEnds for SimRing {
 
     fn stats(&mut self) -> LinkStats {
         self.0.stats
+    }
+
+    fn take_sim_inputs(&mut self) -> Option<SimInputSender> {
+        self.0.sender.take()
     }
 }
 

@@ -327,6 +327,13 @@ pub enum Cause {
     /// A step `alarm` of the program.
     #[error("alarm: {text}")]
     Alarm { text: String },
+    #[error("the variable `{name}` would be {value}, outside its range, {low} to {high}")]
+    VariableRange {
+        name: String,
+        value: f64,
+        low: f64,
+        high: f64,
+    },
     #[error(
         "{condition} did not come within {timeout_ms} ms{}",
         if value.is_nan() { String::new() } else { format!(": it is {value}") }

@@ -23,6 +23,7 @@ use crate::rt::controller::Controller;
 use crate::rt::cycle::EngineReport;
 use crate::rt::samples::SampleWriter;
 use crate::rt::stats::Stats;
+use crate::supervise::ProgramControl;
 use crate::supervise::operator::{self, Operator};
 
 mod bus;
@@ -128,6 +129,8 @@ pub struct Attachments {
     pub samples: Option<SampleWriter>,
     /// The link in place of the file's `nic`.
     pub link: Option<Box<dyn Link>>,
+    /// Pauses the program and steps it.
+    pub control: Arc<ProgramControl>,
 }
 
 /// Runs a machine until its program, its time limit, `stop` ([`stop_on_signals`]) or an error ends

@@ -24,7 +24,6 @@ use crate::link::replay::Replay;
 use crate::link::sim::{SimLink, SimRing};
 use crate::link::{self, Link, NicWarning, OpenError};
 use crate::recording;
-use crate::rt::image::NumericFormat;
 use crate::sys::rt_thread;
 
 /// Opens the link of the machine. Blocks.
@@ -177,7 +176,6 @@ pub fn simulated_bus(
     };
     let mut segment = Segment::with_topology(devices, topology, options);
     let mut faults = faults.cloned().unwrap_or_default();
-    let order = bus_order(&machine.devices);
     for switched in &machine.switched {
         let SwitchedInput {
             at_ns,
@@ -185,14 +183,10 @@ pub fn simulated_bus(
             input,
             value,
         } = switched;
-        let name = &machine.devices[input.device].name;
-        if let Some(device) = order.iter().position(|other| other.name == *name) {
-            let object = (device, input.field.index, input.field.sub);
-            let value = match input.kind() {
-                NumericFormat::Real => (*value as f32).to_bits().into(),
-                NumericFormat::Signed | NumericFormat::Unsigned => *value as i64,
-            };
-            faults.add_input(object, value, (*at_ns, *for_ns));
+        // The check has seen that the input can have the value.
+        if let Ok(input) = machine.sim_input(input, *value) {
+            let object = (input.position, input.index, input.sub);
+            faults.add_input(object, input.value, (*at_ns, *for_ns));
         }
     }
     segment.set_faults(faults);

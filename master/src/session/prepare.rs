@@ -32,7 +32,7 @@ use crate::rt::exchange::{Exchange, ExchangeDevice};
 use crate::rt::gateway::{Gateway, GatewayConfig, NodePlace};
 use crate::rt::image::{self, AxisBits, BitField, DeviceRegion, ImagePlan, NotMapped, SignalBits};
 use crate::rt::phase::Phase;
-use crate::supervise::{MissedTargets, ReportedLimits, RingWatch, Supervisor};
+use crate::supervise::{Buttons, MissedTargets, ReportedLimits, RingWatch, Supervisor};
 
 /// A segment in SafeOp with everything that the cycle needs.
 #[derive(Debug)]
@@ -144,7 +144,9 @@ impl RunBuilder<'_> {
                     operator,
                     samples,
                     link: _,
+                    control,
                 } = attachments;
+                let sim_inputs = link.take_sim_inputs();
                 let controlled = controller.is_some();
                 let parts = EngineConfig {
                     clock,
@@ -194,6 +196,9 @@ impl RunBuilder<'_> {
                     returns: None,
                     ring,
                     variables: Vec::new(),
+                    control,
+                    sim_inputs,
+                    buttons: Buttons::default(),
                     ring_delays,
                     device_log: DeviceLog::default(),
                 };

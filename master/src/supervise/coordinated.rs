@@ -8,8 +8,7 @@ use ecaxis_axis::setpoint::{
 use ecaxis_axis::{Command, Limits};
 use ecaxis_ecat::index::AxisIndex;
 
-use super::Supervisor;
-use super::program::{Settling, TargetKind};
+use super::program::{Settling, TargetKind, Turn};
 use crate::clock::{self, Nanos};
 use crate::config::Step;
 use crate::report::Error;
@@ -23,7 +22,7 @@ const ENGAGE_TIMEOUT: Nanos = 30_000_000_000;
 /// slightly below 1.
 const WHOLE: f64 = 1.0 - 1e-9;
 
-impl Supervisor {
+impl Turn<'_, '_> {
     pub(super) fn limits(&self, axis: AxisIndex) -> Limits {
         self.machine.axes[axis].config.limits
     }

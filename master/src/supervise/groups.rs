@@ -133,29 +133,9 @@ impl Supervisor {
 /// Returns the axes that a step needs to run. Resetting and disabling work in a
 /// stopped group.
 pub(super) fn needed(action: &Action) -> Vec<AxisIndex> {
-    let targets = |targets: &[(AxisIndex, f64)]| targets.iter().map(|&(axis, _)| axis).collect();
     match action {
-        Action::Enable { axes } | Action::Home { axes } | Action::Stop { axes } => axes.clone(),
-        Action::Move { targets: t, .. }
-        | Action::Line { targets: t, .. }
-        | Action::Velocity { targets: t, .. }
-        | Action::Torque { targets: t, .. } => targets(t),
-        Action::Mode { targets } => targets.iter().map(|&(axis, _)| axis).collect(),
-        Action::Wave { axis, .. } | Action::Table { axis, .. } | Action::Probe { axis, .. } => {
-            vec![*axis]
-        }
+        Action::Disable { .. } | Action::Reset { .. } => Vec::new(),
         Action::Gear { axis, master, .. } => vec![*axis, *master],
-        Action::Disable { .. }
-        | Action::Reset { .. }
-        | Action::Dwell { .. }
-        | Action::Wait { .. }
-        | Action::Set { .. }
-        | Action::Override(_)
-        | Action::Assign { .. }
-        | Action::Message { .. }
-        | Action::Alarm { .. }
-        | Action::Repeat { .. }
-        | Action::While { .. }
-        | Action::If { .. } => Vec::new(),
+        action => action.commanded(),
     }
 }

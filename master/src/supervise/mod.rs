@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::sync::mpsc::Sender;
 use std::time::Duration;
 
-use ecaxis_axis::{Command, CommandError};
+use ecaxis_axis::CommandError;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
 use tokio::sync::{Mutex, watch};
@@ -19,9 +19,10 @@ use crate::acyclic::{AlState, DeviceRef, Transition, al};
 use crate::bringup::{Bus, BusDevice, RingDelays, enable_op_only};
 use crate::cancel::CancelToken;
 use crate::clock::{self, Nanos};
+use crate::config::Machine;
 use crate::config::steps::enables;
-use crate::config::{Machine, Step};
 use crate::datagram::{CyclicMailboxTransport, DatagramClient};
+use crate::link::sim::SimInputSender;
 use crate::mailbox::worker::{MailboxWorker, run_with_workers};
 use crate::mailbox::{DatagramError, Mailboxes};
 use crate::post_mortem::Witnessed;
@@ -35,6 +36,8 @@ use crate::rt::exchange::{BusStatus, DiagnosticRegister, SubDeviceDiagnostics};
 use clock_tree::ClockTree;
 use groups::StoppedGroup;
 pub(crate) use limits::{MissedTargets, ReportedLimits};
+pub(crate) use program::Buttons;
+pub use program::ProgramControl;
 use returns::ReturnPort;
 pub(crate) use ring::RingWatch;
 
@@ -82,6 +85,12 @@ pub struct Supervisor {
     pub enable: bool,
     /// `true` if a controller replaces the program.
     pub controlled: bool,
+    /// Switches inputs of the simulated bus. `None`: the bus is real.
+    pub sim_inputs: Option<SimInputSender>,
+    /// Pauses the program from outside the run.
+    pub control: Arc<ProgramControl>,
+    /// The inputs of `[program]`.
+    pub(crate) buttons: Buttons,
     /// The values of the program's variables.
     pub variables: Vec<f64>,
     /// The operator that replaces the program.
@@ -371,48 +380,6 @@ impl Supervisor {
             .map(|(device, found)| (device.at.clone(), found.clock_difference))
     }
 
-    async fn enable_axes(&mut self, step: Option<&Step>, axes: &[AxisIndex]) -> Result<(), Error> {
-        let snapshot = self.poll_and_query().await?;
-        let mut commands = Vec::with_capacity(2 * axes.len());
-        self.ensure_not_stopped(step, axes)?;
-        for &axis in axes {
-            if snapshot.axes.get(axis).is_some_and(|s| s.fault.is_some()) {
-                self.report_preexisting_fault(axis).await;
-                let command = Command::ResetFault;
-                commands.push(RtCommand::Axis { axis, command });
-            }
-            let command = Command::Enable;
-            commands.push(RtCommand::Axis { axis, command });
-        }
-        self.send_all(&commands).await;
-        let start = clock::now();
-        let timeout = self.machine.bus.enable_timeout_ns + self.longest_release(axes);
-        loop {
-            let snapshot = self.poll_and_query().await?;
-            self.ensure_not_stopped(step, axes)?;
-            if let Some((axis, reason)) = self.refused.pop_front() {
-                return Err(Cause::EnableRefused {
-                    reason: reason.to_string(),
-                }
-                .with_device(self.device_of(axis)));
-            }
-            let status = |axis: AxisIndex| snapshot.axes.get(axis).copied();
-            let late = axes
-                .iter()
-                .find_map(|&axis| Some((axis, status(axis)?)).filter(|(_, s)| !s.ready));
-            let Some((waiting, status)) = late else {
-                break;
-            };
-            let failed = status.reset_failed && snapshot.commands_taken >= self.commands_sent;
-            if failed || clock::now().saturating_sub(start) > timeout {
-                return Err(self.not_enabled(waiting, status, timeout).await);
-            }
-        }
-        self.confirm_modes(axes).await?;
-        self.report(Progress::Enabled { axes: axes.len() });
-        Ok(())
-    }
-
     /// Returns the longest time in ns that an axis needs to stop from full speed.
     fn longest_stop(&self) -> Nanos {
         let times = self.machine.axes.iter().map(|axis| {
@@ -443,6 +410,11 @@ impl Supervisor {
     /// machine.
     async fn poll_snapshot(&mut self) -> Result<Snapshot, Error> {
         clock::delay(TICK).await;
+        self.take_snapshot().await
+    }
+
+    /// Returns the newest snapshot, after everything that depends on it.
+    async fn take_snapshot(&mut self) -> Result<Snapshot, Error> {
         if self.outer.commands.is_abandoned() {
             return Err(Cause::Thread("the cycle has ended by itself".to_owned()).into());
         }
@@ -460,6 +432,7 @@ impl Supervisor {
         {
             return Err(self.explain_stop(cause, None, &snapshot).await);
         }
+        self.watch_buttons(&snapshot);
         self.attend(&snapshot).await?;
         Ok(snapshot)
     }

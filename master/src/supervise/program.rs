@@ -3,31 +3,42 @@
 //! | file | |
 //! |---|---|
 //! | here | the order of steps and their execution |
+//! | `enable` | power for axes |
 //! | `moves` | axes to their own targets, in all modes |
+//! | `pause` | no step begins until the user continues |
 //! | `probe` | a move that ends at an edge |
+//! | `turn` | branches that run at the same time |
 //! | `waits` | waiting for a condition |
 
 use std::fmt::Display;
 use std::future::Future;
 use std::pin::Pin;
+use std::sync::Arc;
 
 use ecaxis_axis::setpoint::{GearConfig, GearInMode};
 use ecaxis_axis::units::UserUnits;
-use ecaxis_axis::{AxisStatus, Command};
+use ecaxis_axis::{AxisStatus, Command, CommandError};
 use ecaxis_ecat::index::{AxisIndex, GroupIndex, IndexVec};
+use tokio::sync::Mutex;
 
 use super::groups::needed;
 use super::{ProgramOutcome, Supervisor};
 use crate::clock::{self, Nanos};
-use crate::config::{Action, AxisSetup, Step};
+use crate::config::{Action, AxisSetup, LARGEST, Step, VariableRef};
 use crate::report::{Cause, Error, Progress, StepRef};
 use crate::rt::channel::{RtCommand, Snapshot};
 
+mod enable;
 mod moves;
+mod pause;
 mod probe;
+mod turn;
 mod waits;
 
+pub(crate) use pause::Buttons;
+pub use pause::ProgramControl;
 use probe::ProbeMove;
+pub(super) use turn::Turn;
 
 /// The timeout in ns for an axis to follow after its set-point has arrived.
 const SETTLE_TIMEOUT: Nanos = 5_000_000_000;
@@ -65,28 +76,18 @@ impl From<&Step> for StepRef {
 
 impl Supervisor {
     pub(super) async fn run_program(&mut self, ended: &mut ProgramOutcome) -> Result<(), Error> {
-        let start = clock::now();
-        let steps = self.machine.steps.clone();
-        if steps.is_empty() {
-            // Without a program the axes hold their position until the run is stopped.
-            return self.hold(start).await;
-        }
-        loop {
-            let begun = clock::now();
-            self.variables = self.machine.variables.iter().map(|v| v.initial).collect();
-            self.run_steps(&steps, ended.runs + 1, start).await?;
-            if self.over(start) {
-                return Ok(());
-            }
-            ended.runs += 1;
-            if self.limit.is_none() && ended.runs >= self.repeat {
-                return Ok(());
-            }
-            // A program that takes no time must not block the cycle in virtual time.
-            if clock::now() == begun {
-                self.poll_and_query().await?;
-            }
-        }
+        let shared = Mutex::new(self);
+        Turn::take(&shared).await.run_program(ended).await
+    }
+
+    pub(super) async fn enable_axes(
+        &mut self,
+        step: Option<&Step>,
+        axes: &[AxisIndex],
+    ) -> Result<(), Error> {
+        let shared = Mutex::new(self);
+        let mut turn = Turn::take(&shared).await;
+        turn.enable_axes(step, axes).await
     }
 
     /// Enables every axis and hands control to the controller until it has finished.
@@ -119,6 +120,52 @@ impl Supervisor {
         Ok(())
     }
 
+    pub(super) fn setup(&self, axis: AxisIndex) -> Option<&AxisSetup> {
+        self.machine.axes.get(axis)
+    }
+
+    /// Sends all commands in the same cycle.
+    pub(super) async fn command(&mut self, commands: impl Iterator<Item = (AxisIndex, Command)>) {
+        let commands = commands.map(|(axis, command)| RtCommand::Axis { axis, command });
+        self.send_all(&commands.collect::<Vec<_>>()).await;
+    }
+}
+
+impl Turn<'_, '_> {
+    async fn run_program(&mut self, ended: &mut ProgramOutcome) -> Result<(), Error> {
+        let start = clock::now();
+        let steps = self.machine.steps.clone();
+        if steps.is_empty() {
+            // Without a program the axes hold their position until the run is stopped.
+            return self.hold(start).await;
+        }
+        loop {
+            let begun = clock::now();
+            self.variables = self.machine.variables.iter().map(|v| v.initial).collect();
+            self.run_steps(&steps, ended.runs + 1, start).await?;
+            if self.over(start) {
+                return Ok(());
+            }
+            ended.runs += 1;
+            if self.limit.is_none() && ended.runs >= self.repeat {
+                return Ok(());
+            }
+            // A program that takes no time must not block the cycle in virtual time.
+            if clock::now() == begun {
+                self.poll_and_query().await?;
+            }
+        }
+    }
+
+    /// Returns the first refusal of one of these axes. The others belong to other branches.
+    fn take_refusal(&mut self, axes: &[AxisIndex]) -> Option<(AxisIndex, CommandError)> {
+        let at = self
+            .refused
+            .iter()
+            .position(|(axis, _)| axes.contains(axis))?;
+        self.refused.remove(at)
+    }
+
     /// Runs steps; boxed because steps may contain steps.
     fn run_steps<'s>(
         &'s mut self,
@@ -131,16 +178,18 @@ impl Supervisor {
                 if self.over(start) {
                     return Ok(());
                 }
-                self.await_program_step().await?;
+                self.await_program_step(step, start).await?;
                 if self.run_branches(step, run, start).await? {
                     continue;
                 }
+                let machine = Arc::clone(&self.machine);
+                let step = machine.filled(step, &self.variables);
                 self.report(Progress::Program {
                     run,
-                    step: step.into(),
-                    what: self.machine.describe(&step.action),
+                    step: step.as_ref().into(),
+                    what: machine.describe(&step.action),
                 });
-                self.run_step(step, run, start).await?;
+                self.run_step(&step, run, start).await?;
             }
             Ok(())
         })
@@ -165,6 +214,14 @@ impl Supervisor {
                     false => otherwise,
                 };
                 self.run_steps(steps, run, start).await?;
+                return Ok(true);
+            }
+            Action::Call { steps, .. } => {
+                self.run_steps(steps, run, start).await?;
+                return Ok(true);
+            }
+            Action::Parallel { branches } => {
+                self.run_parallel(branches, run, start).await?;
                 return Ok(true);
             }
             _ => return Ok(false),
@@ -213,7 +270,7 @@ impl Supervisor {
                 self.command(axes.iter().map(|&axis| (axis, Command::ResetFault)))
                     .await;
                 let of = self.groups();
-                let machine = std::sync::Arc::clone(&self.machine);
+                let machine = Arc::clone(&self.machine);
                 // A stopped group first comes to rest, then returns, unless faults of its other
                 // axes prevent this.
                 let coming = |s: &Snapshot, group: GroupIndex| {
@@ -334,10 +391,8 @@ impl Supervisor {
             }
             Action::Wait { when, timeout_ns } => self.wait(step, start, when, *timeout_ns).await,
             Action::Assign { add, values } => {
-                for (variable, value) in values {
-                    if let Some(number) = self.variables.get_mut(variable.0) {
-                        *number = if *add { *number + value } else { *value };
-                    }
+                for &(variable, value) in values {
+                    self.assign(step, variable, value, *add)?;
                 }
                 Ok(())
             }
@@ -361,8 +416,42 @@ impl Supervisor {
                 self.taken(start).await
             }
             // `run_branches` runs them.
-            Action::Repeat { .. } | Action::While { .. } | Action::If { .. } => Ok(()),
+            Action::Repeat { .. }
+            | Action::While { .. }
+            | Action::If { .. }
+            | Action::Call { .. }
+            | Action::Parallel { .. } => Ok(()),
         }
+    }
+
+    /// Sets a variable, or adds to it. Fails if the value is out of its range.
+    fn assign(
+        &mut self,
+        step: &Step,
+        variable: VariableRef,
+        value: f64,
+        add: bool,
+    ) -> Result<(), Error> {
+        let machine = Arc::clone(&self.machine);
+        let known = machine.variables.get(variable.0);
+        let (Some(known), Some(number)) = (known, self.variables.get_mut(variable.0)) else {
+            return Ok(());
+        };
+        let value = if add { *number + value } else { value };
+        let [low, high] = known.range.unwrap_or([-LARGEST, LARGEST]);
+        // Also a value that is not a number.
+        if !(low..=high).contains(&value) {
+            let name = known.name.clone();
+            let cause = Cause::VariableRange {
+                name,
+                value,
+                low,
+                high,
+            };
+            return Err(Error::from(cause).with_step(step));
+        }
+        *number = value;
+        Ok(())
     }
 
     /// Returns the group of each axis.
@@ -370,10 +459,6 @@ impl Supervisor {
         let axes = self.machine.axes.iter();
         axes.map(|axis| self.machine.group_of(axis.device))
             .collect()
-    }
-
-    pub(super) fn setup(&self, axis: AxisIndex) -> Option<&AxisSetup> {
-        self.machine.axes.get(axis)
     }
 
     /// Returns the position for a target; on a modulo axis the one that its direction leads to.
@@ -384,12 +469,6 @@ impl Supervisor {
         let scale = &setup.config.scale;
         let to = UserUnits(target);
         scale.destination(UserUnits(from), to, setup.way).0
-    }
-
-    /// Sends all commands in the same cycle.
-    pub(super) async fn command(&mut self, commands: impl Iterator<Item = (AxisIndex, Command)>) {
-        let commands = commands.map(|(axis, command)| RtCommand::Axis { axis, command });
-        self.send_all(&commands.collect::<Vec<_>>()).await;
     }
 
     /// Waits until the cycle has taken every command.
@@ -420,7 +499,7 @@ impl Supervisor {
             if snapshot.commands_taken < self.commands_sent {
                 continue;
             }
-            if let Some((axis, reason)) = self.refused.pop_front() {
+            if let Some((axis, reason)) = self.take_refusal(&step.action.commanded()) {
                 return Err(Cause::Refused {
                     reason: reason.to_string(),
                     by_axis: Some(Box::new(reason)),

@@ -74,6 +74,7 @@ impl Client {
                 output,
                 value,
             } => self.output(&device, &output, value),
+            Op::SimInput { input, value } => self.sim_input(&input, value),
             Op::Override { factor, group } if (0.0..=MAX_RATE).contains(&factor) => {
                 let group = self.group(group.as_deref())?;
                 let request = MachineRequest::Override { group, factor };
@@ -233,6 +234,17 @@ impl Client {
             output,
             value,
         })])
+    }
+
+    fn sim_input(&self, name: &str, value: f64) -> Result<Vec<Work>, OpError> {
+        let machine = &self.hub.machine;
+        let input = machine.switchable_input(name);
+        let input = input.and_then(|input| machine.sim_input(&input, value));
+        let input = input.map_err(|error| {
+            let (message, hint) = error.parts();
+            OpError::new(ErrorCode::UnknownName, message).help(hint)
+        })?;
+        Ok(vec![Work::Request(MachineRequest::SimInput(input))])
     }
 
     fn stream(

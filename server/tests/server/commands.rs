@@ -282,3 +282,40 @@ fn commands_are_in_the_change_log_with_their_client() {
     let refused = changes[5]["outcome"].as_str().unwrap();
     assert!(refused.contains("cell"), "{refused}");
 }
+
+/// A client presses the inputs of a simulated bus, without the lease.
+#[test]
+fn a_client_presses_inputs_of_the_simulated_bus() {
+    let mut machine = ecaxis_test_support::load("pick-and-place.toml");
+    machine.steps.truncate(1);
+    let server = Server::in_virtual_time(machine);
+    let mut client = server.client();
+    let named = client.ok("machine", json!({}))["sim_inputs"].clone();
+    let names: Vec<_> = named
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|each| each["input"].clone())
+        .collect();
+    assert!(
+        names.contains(&json!("start")) && !names.contains(&json!("lamp")),
+        "{names:?}"
+    );
+    let mut value = |name: &str, value: f64| {
+        client.ok(
+            "sim_input",
+            json!({"input": name, "value": value, "wait": true}),
+        );
+        client.ok("advance", json!({"cycles": 5}));
+        let state = client.ok("state", json!({}));
+        let inputs = state["inputs"].as_array().unwrap().clone();
+        let input = inputs.iter().find(|each| each["name"] == json!("Input 5"));
+        input.unwrap()["value"].clone()
+    };
+    assert_eq!(value("start", 1.0), json!(1.0));
+    assert_eq!(value("io.Input 5", 0.0), json!(0.0));
+    let refused = client.refused("sim_input", json!({"input": "lamp", "value": 1.0}));
+    assert_eq!(refused["code"], json!("unknown_name"));
+    let refused = client.refused("sim_input", json!({"input": "start", "value": 2.0}));
+    assert!(refused["message"].as_str().unwrap().contains("not a value"));
+}

@@ -471,7 +471,7 @@ fn steps<'s>(machine: &Machine, each: impl Iterator<Item = &'s Step>, out: &mut 
     for step in each {
         let indent = " ".repeat(3 * step.number.matches('.').count());
         let lead = format!("{indent}{}. ", step.number);
-        out.item(lead, machine.describe(&step.action));
+        out.item(lead, machine.describe_step(step));
         steps(machine, step.action.inner(), out);
     }
 }

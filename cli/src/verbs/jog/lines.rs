@@ -37,15 +37,17 @@ by AXIS DISTANCE          move AXIS POSITION
 speed PERCENT             of moves, of the velocity limit: first 5, at most 25
 home AXIS                 mode AXIS MODE          reset [AXIS…]
 stop [AXIS…]              brake and hold
+press INPUT               release INPUT           of the simulated bus
+set INPUT = VALUE         an input of the simulated bus, such as io.Input 1
 estop                     emergency stop: no motion and no power
 status                    how the axes are
 wait                      until everything asked for is done
 wait DURATION             such as 500ms
 quit                      or the end of the input: stop, disable, bus down";
 
-const VERBS: [&str; 15] = [
+const VERBS: [&str; 18] = [
     "enable", "disable", "reset", "stop", "estop", "home", "jog", "by", "move", "mode", "speed",
-    "wait", "status", "help", "quit",
+    "wait", "status", "help", "quit", "press", "release", "set",
 ];
 
 /// A parsed line.
@@ -167,6 +169,17 @@ impl Answers {
         });
     }
 
+    /// Prints the inputs that the program reads.
+    fn inputs(&self, view: &View<'_>) {
+        for (input, value) in view.machine.inputs.iter().zip(&view.snapshot.inputs) {
+            self.say(&if self.json {
+                json!({ "input": input.name, "value": value }).to_string()
+            } else {
+                format!("{} = {value}", input.name)
+            });
+        }
+    }
+
     fn status(&self, panel: &Panel) {
         for axis in &panel.axes {
             let AxisPanel {
@@ -257,7 +270,11 @@ impl Operator for Script {
         let began = *self.began.get_or_insert(view.now);
         let replaced = |event: &&RequestEvent| matches!(event, RequestEvent::Replaced { .. });
         for news in view.news.iter().filter(|event| !replaced(event)) {
-            let (axis, text) = (view.name(news.axis().unwrap_or_default()), news.to_string());
+            let (axis, text) = match news {
+                RequestEvent::Input { result: Ok(()), .. } => continue,
+                RequestEvent::Input { .. } => ("input", news.to_string()),
+                _ => (view.name(news.axis().unwrap_or_default()), news.to_string()),
+            };
             self.answers.news(axis, &text, news.is_failure());
             if news.is_failure() && self.fail(hints::FAILED, format!("{axis}: {text}")) {
                 return gone;
@@ -287,7 +304,10 @@ impl Operator for Script {
                     return turn;
                 }
                 Ok(Line::Speed(speed)) => self.speed = speed,
-                Ok(Line::Status) => self.answers.status(&Panel::new(view, began)),
+                Ok(Line::Status) => {
+                    self.answers.status(&Panel::new(view, began));
+                    self.answers.inputs(view);
+                }
                 Ok(Line::Help) => self.answers.say(HELP),
                 Ok(Line::Wait(time)) => {
                     self.waiting = Some(time.map(|time| view.now.saturating_add(time)));
@@ -317,6 +337,9 @@ fn parse(line: &str, view: &View<'_>, speed: f64) -> Result<Line, String> {
     let Some((&verb, rest)) = words.split_first() else {
         return Ok(Line::Nothing);
     };
+    if let Some(input) = view.machine.parse_input_line(line) {
+        return Ok(Line::For(vec![Request::SimInput(input?)]));
+    }
     let axis = |name: &str| {
         let mut axes = view.machine.axes.indices();
         axes.find(|&axis| view.name(axis) == name).ok_or_else(|| {
@@ -395,6 +418,7 @@ fn parse(line: &str, view: &View<'_>, speed: f64) -> Result<Line, String> {
             }
             _ => Err("`mode` takes the name of an axis and a mode".to_owned()),
         },
+        "press" | "release" | "set" => Err(format!("`{verb}` takes the name of an input")),
         "speed" => {
             let percent = match rest {
                 [value] => value.trim_end_matches('%').parse::<f64>().ok(),

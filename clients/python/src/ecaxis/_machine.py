@@ -335,6 +335,10 @@ class Machine(AxesByName["Axis"]):
     def set_output(self, device: str, name: str, value: float) -> None:
         self._await("output", device=device, output=name, value=value)
 
+    def set_input(self, name: str, value: float = True) -> None:
+        """Switches an input of the simulated bus: a name of `[signals]`, or `io.Input 1`. Needs no lease."""
+        self.connection.request("sim_input", input=name, value=float(value), wait=True)
+
     def sdo_read(self, device: str, index: int, sub: int = 0) -> Any:
         """Reads an object: its value where the type is known, else its bytes."""
         answer = self._await("sdo_read", device=device, index=index, sub=sub)

@@ -73,9 +73,17 @@ table! { "a condition",
 }
 
 /// Reads `{ io."Input 3" = … }`: by device, then by signal.
-fn signals<'d>(value: Value<'d>, p: &mut Problems<'_>) -> Option<Vec<(RawSignal, Value<'d>)>> {
-    let example =
-        "write `{ io.\"Input 1\" = true }`, or `{ start = true }` with a name of [signals]";
+fn signals<'d>(
+    value: Value<'d>,
+    key: &str,
+    p: &mut Problems<'_>,
+) -> Option<Vec<(RawSignal, Value<'d>)>> {
+    let example = match key {
+        "set" => {
+            "write `{ io.\"Output 1\" = true }`, or `{ lamp = true }` with a name of [signals]"
+        }
+        _ => "write `{ io.\"Input 1\" = true }`, or `{ start = true }` with a name of [signals]",
+    };
     let DeValue::Table(devices) = value.get_ref() else {
         p.add_hint(value.span(), "expected devices and their signals", example);
         return None;
@@ -124,7 +132,7 @@ impl Field for Levels {
 
 impl Read for Levels {
     fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
-        let signals = signals(value, p)?.into_iter();
+        let signals = signals(value, key, p)?.into_iter();
         let levels = signals.filter_map(|(signal, v)| Some((signal, level(v, key, p)?)));
         Some(Self(levels.collect()))
     }
@@ -147,6 +155,15 @@ fn is_bounds(table: &toml::de::DeTable<'_>) -> bool {
 fn level(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Key<f64> {
     match value.get_ref() {
         DeValue::Boolean(on) => Some(Spanned::new(value.span(), f64::from(u8::from(*on)))),
+        DeValue::String(word) => {
+            let message = format!("expected a number, found \"{word}\"");
+            p.add_hint(
+                value.span(),
+                message,
+                "write a number, true or false, without quotes",
+            );
+            None
+        }
         _ => Spanned::read(value, key, p),
     }
 }
@@ -156,7 +173,7 @@ pub(crate) struct Conditions(pub Vec<RawCondition>);
 
 impl Read for Conditions {
     fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
-        let signals = signals(value, p)?.into_iter();
+        let signals = signals(value, key, p)?.into_iter();
         Some(Self(
             signals
                 .filter_map(|(signal, v)| condition(signal, v, key, p))
@@ -224,7 +241,12 @@ pub(crate) struct RawWhen(pub Vec<Conditions>);
 impl Read for RawWhen {
     fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
         let each = match value.get_ref() {
-            DeValue::Array(each) if !each.is_empty() => each.iter().collect(),
+            DeValue::Array(each) if each.is_empty() => {
+                let hint = "write `{ io.\"Input 1\" = true }`";
+                p.add_hint(value.span(), "no condition is named", hint);
+                return None;
+            }
+            DeValue::Array(each) => each.iter().collect(),
             _ => vec![value],
         };
         let read: Vec<_> = each

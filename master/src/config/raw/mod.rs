@@ -10,15 +10,18 @@ use super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Writte
 use super::gateway::{RawCan, RawNode};
 use super::problem::{Problems, Span};
 use super::schema::{self, Schema, any_of};
+use super::subprograms::RawSub;
 use super::travel::RawTrack;
 use super::{ExchangeMode, GroupStopScope, MailboxSource, SocketKind, Spin, UnknownDeviceRule};
 
 mod axis;
 mod condition;
+mod number;
 mod step;
 
 pub(crate) use axis::{AxisTables, RawAxis, RawHoming, RawLimits};
 pub(crate) use condition::{Conditions, Levels, NamedValues, RawCondition, RawSignal, RawWhen};
+pub(crate) use number::{RawNumber, RawVariable};
 pub(crate) use step::{Named, RawAction, RawAxes, RawGear, RawProbe, RawStep, RawWave, TimeLimit};
 
 table! { "the machine file",
@@ -45,9 +48,22 @@ table! { "the machine file",
         /// Names of inputs and outputs, `start = "io.Input 1"`
         signals: NamedValues<String>,
         /// Variables of the program with their values at its start, `parts = 0`
-        variables: NamedValues<f64>,
+        variables: NamedValues<RawVariable>,
+        /// Inputs that pause the program
+        program: RawProgram,
+        /// Steps with a name and parameters
+        subs: Vec<RawSub> as "sub",
         /// The program: one verb for each step
         steps: Vec<RawStep> as "step",
+    }
+}
+
+table! { "[program]",
+    table RawProgram {
+        /// Condition while which no step begins, `{ hold = true }` (table; default none)
+        pause: Key<RawWhen>,
+        /// Condition that lets one step of the paused program begin when it becomes true (table; default none)
+        step: Key<RawWhen>,
     }
 }
 

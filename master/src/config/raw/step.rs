@@ -3,14 +3,18 @@
 use std::ops::RangeInclusive;
 
 use ecaxis_axis::Edge;
-use serde_json::{Map, Value as Json, json};
 use toml::Spanned;
 use toml::de::DeValue;
 
-use super::super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Written, array};
-use super::super::problem::{Problems, Span};
-use super::super::schema::{self, Schema, any_of, described, named};
+use super::super::fields::{
+    Domain, Field, Key, Ns, Read, Table, TableKey, Value, Written, array, unquoted,
+};
+use super::super::problem::{Problems, Span, list};
+use super::super::schema::{self, Schema};
 use super::condition::{Levels, RawWhen};
+use super::number::RawNumber;
+
+mod definition;
 
 /// Axes with a parameter each.
 pub(crate) type Named<T> = Vec<(Spanned<String>, Spanned<T>)>;
@@ -22,8 +26,8 @@ pub(crate) type RawAxes = Option<Vec<Spanned<String>>>;
 pub(crate) struct RawStep {
     pub span: Span,
     pub action: RawAction,
-    pub speed: Key<f64>,
-    pub ramp: Key<f64>,
+    pub speed: Key<RawNumber>,
+    pub ramp: Key<RawNumber>,
 }
 
 #[derive(Debug)]
@@ -35,13 +39,13 @@ pub(crate) enum RawAction {
     Home(RawAxes),
     Move {
         relative: bool,
-        targets: Named<f64>,
+        targets: Named<RawNumber>,
         together: bool,
     },
     Probe(Spanned<String>, RawProbe),
     Line {
         relative: bool,
-        targets: Named<f64>,
+        targets: Named<RawNumber>,
     },
     Wave {
         square: bool,
@@ -53,13 +57,13 @@ pub(crate) enum RawAction {
         file: Spanned<String>,
     },
     Gear(Spanned<String>, RawGear),
-    Velocity(Named<f64>),
+    Velocity(Named<RawNumber>),
     Torque {
-        targets: Named<f64>,
+        targets: Named<RawNumber>,
         ramp: Option<Ns>,
     },
     Mode(Named<String>),
-    Dwell(Ns),
+    Dwell(Spanned<RawNumber<Ns>>),
     Wait {
         when: RawWhen,
         timeout: Option<TimeLimit>,
@@ -69,7 +73,7 @@ pub(crate) enum RawAction {
     Override(Named<f64>),
     Assign {
         add: bool,
-        values: Named<f64>,
+        values: Named<RawNumber>,
     },
     Message(String),
     Alarm(String),
@@ -88,6 +92,11 @@ pub(crate) enum RawAction {
         steps: Vec<RawStep>,
         otherwise: Vec<RawStep>,
     },
+    Call {
+        name: String,
+        steps: Vec<RawStep>,
+    },
+    Parallel(Vec<Vec<RawStep>>),
 }
 
 /// The time-out of `wait`; `None`: without limit.
@@ -98,6 +107,11 @@ impl Read for TimeLimit {
     fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
         match value.get_ref() {
             DeValue::String(word) if word == NONE => Some(Self(None)),
+            DeValue::String(word) if !word.starts_with(|c: char| c.is_ascii_digit()) => {
+                let hint = format!("write a time such as \"5s\", or \"{NONE}\"");
+                p.add_hint(value.span(), format!("`{key}` cannot be \"{word}\""), hint);
+                None
+            }
             _ => TIMEOUTS.read(value, key, p).map(|ns| Self(Some(ns))),
         }
     }
@@ -148,7 +162,7 @@ table! { "a probe",
 /// The verbs, each with an example and the keys that go with it. The key of a step that is a verb
 /// defines the action.
 #[rustfmt::skip] // one row per verb
-const VERBS: [(&str, &str, &[&str]); 28] = [
+const VERBS: [(&str, &str, &[&str]); 30] = [
     ("enable", "enable = [\"x\"]", &[]),
     ("disable", "disable = true", &[]),
     ("reset", "reset = [\"x\"]", &[]),
@@ -174,6 +188,8 @@ const VERBS: [(&str, &str, &[&str]); 28] = [
     ("add", "add = { parts = 1 }", &[]),
     ("message", "message = \"load the magazine\"", &[]),
     ("alarm", "alarm = \"no part in the gripper\"", &[]),
+    ("call", "call = \"pick\"", &["with", "step"]),
+    ("parallel", "parallel = [{ step = [{ move = { x = 5.0 } }] }, { step = [{ move = { y = 5.0 } }] }]", &[]),
     ("repeat", "repeat = 3", &["step", "until"]),
     ("while", "while = { io.\"Input 1\" = true }", &["step"]),
     ("if", "if = { io.\"Input 1\" = true }", &["step", "else"]),
@@ -181,12 +197,13 @@ const VERBS: [(&str, &str, &[&str]); 28] = [
 
 /// Keys that go with verbs, each with its description.
 #[rustfmt::skip] // one row per key
-const COMPANIONS: [(&str, &str); 7] = [
+const COMPANIONS: [(&str, &str); 8] = [
     ("speed", "Fraction of each axis' velocity limit (above 0, up to 1; default 1)"),
     ("ramp", "Fraction of the acceleration limit (above 0, up to 1); with `torque`: the time to the new torque"),
     ("arrive", "If `\"together\"`, all axes arrive in the same cycle (`\"each\"`, `\"together\"`; default `\"each\"`)"),
     ("timeout", "Time after which the step fails (time, 1 ms to a week, or `\"none\"`; default `\"10s\"`)"),
     ("step", "The steps that are repeated, or run if the condition holds"),
+    ("with", "The values of the subprogram's parameters"),
     ("until", "Condition that ends the repetition after a round"),
     ("else", "The steps that run if the condition does not hold"),
 ];
@@ -201,6 +218,8 @@ const TIMEOUTS: RangeInclusive<Ns> = 1_000_000..=606_600_000_000_000;
 
 /// The maximum depth of nested steps.
 const DEEPEST: usize = 8;
+/// The maximum number of branches that run at the same time.
+const MOST_BRANCHES: usize = 8;
 
 impl Read for RawStep {
     const LIST: &'static str = "[[step]] with two brackets";
@@ -240,7 +259,13 @@ fn read(value: Value<'_>, depth: usize, p: &mut Problems<'_>) -> Option<RawStep>
     let wrong = COMPANIONS.iter().map(|(key, _)| key);
     for key in wrong.filter(|key| !companions.contains(key)) {
         if let Some(value) = table.get(key) {
-            p.add(value.span(), format!("`{key}` does not go with `{verb}`"));
+            let with = VERBS.iter().filter(|(.., keys)| keys.contains(key));
+            let hint = format!("`{key}` goes with {}", list(with.map(|(verb, ..)| *verb)));
+            p.add_hint(
+                value.span(),
+                format!("`{key}` does not go with `{verb}`"),
+                hint,
+            );
         }
     }
     let fraction = |key, p: &mut Problems<'_>| {
@@ -319,7 +344,7 @@ impl<'d> Step<'_, 'd> {
                 targets: self.named(value, p)?,
             },
             "mode" => RawAction::Mode(self.named(value, p)?),
-            "dwell" => RawAction::Dwell(Ns::read(value, verb, p)?),
+            "dwell" => RawAction::Dwell(Spanned::read(value, verb, p)?),
             "wait" => {
                 let timeout = self.table.get("timeout");
                 RawAction::Wait {
@@ -341,6 +366,11 @@ impl<'d> Step<'_, 'd> {
             },
             "message" => RawAction::Message(String::read(value, verb, p)?),
             "alarm" => RawAction::Alarm(String::read(value, verb, p)?),
+            "call" => RawAction::Call {
+                name: String::read(value, verb, p)?,
+                steps: self.inner(self.table.get("step")?, p)?,
+            },
+            "parallel" => RawAction::Parallel(self.branches(value, p)?),
             "while" => {
                 let (when, steps) = (RawWhen::read(value, verb, p), self.steps(value, "step", p));
                 RawAction::While {
@@ -361,6 +391,12 @@ impl<'d> Step<'_, 'd> {
             _ => {
                 let times = match value.get_ref() {
                     DeValue::String(word) if word == FOREVER => Some(None),
+                    DeValue::String(word) if unquoted(word).is_none() => {
+                        let message = format!("`repeat` cannot be \"{word}\"");
+                        let hint = format!("write a number, or \"{FOREVER}\"");
+                        p.add_hint(value.span(), message, hint);
+                        None
+                    }
                     _ => (1..=1_000_000).read(value, verb, p).map(Some),
                 };
                 let until = self.table.get("until");
@@ -388,14 +424,56 @@ impl<'d> Step<'_, 'd> {
             p.add_hint(value.span(), message, hint);
             return None;
         };
+        array(p, inner, &format!("[[step.{key}]] with two brackets"))?;
+        self.inner(inner, p)
+    }
+
+    /// Reads a list of steps.
+    fn inner(&self, inner: Value<'d>, p: &mut Problems<'_>) -> Option<Vec<RawStep>> {
         let depth = self.depth + 1;
         if depth >= DEEPEST {
             let message = format!("steps in steps go {DEEPEST} levels deep at most");
-            p.add(inner.span(), message);
+            p.add_hint(
+                inner.span(),
+                message,
+                "write the inner ones as steps of their own",
+            );
             return None;
         }
-        let inner = array(p, inner, &format!("[[step.{key}]] with two brackets"))?.into_iter();
+        let inner = array(p, inner, RawStep::LIST)?.into_iter();
         Some(inner.filter_map(|v| read(v, depth, p)).collect())
+    }
+
+    /// Reads the branches of `parallel`.
+    fn branches(&self, value: Value<'d>, p: &mut Problems<'_>) -> Option<Vec<Vec<RawStep>>> {
+        let all = array(p, value, "[[step.parallel]] with two brackets")?;
+        if !(2..=MOST_BRANCHES).contains(&all.len()) {
+            let message = format!(
+                "`parallel` has 2 to {MOST_BRANCHES} branches, not {}",
+                all.len()
+            );
+            p.add_hint(
+                value.span(),
+                message,
+                "write each branch under [[step.parallel]]",
+            );
+            return None;
+        }
+        let branches: Vec<_> = all.into_iter().map(|v| self.branch(v, p)).collect();
+        branches.into_iter().collect()
+    }
+
+    fn branch(&self, value: Value<'d>, p: &mut Problems<'_>) -> Option<Vec<RawStep>> {
+        const KEYS: [TableKey; 1] = [("step", Some("[{ move = { x = 5.0 } }]"))];
+        let table = Table::of(value, "[[step.parallel]]", &KEYS, p)?;
+        let steps = table.get("step").and_then(|steps| self.inner(steps, p));
+        table.done(p);
+        if steps.as_ref().is_some_and(Vec::is_empty) {
+            let hint = "write its steps under [[step.parallel.step]]";
+            p.add_hint(value.span(), "this branch has no steps", hint);
+            return None;
+        }
+        steps
     }
 
     /// Reads one axis and its parameter.
@@ -467,92 +545,5 @@ fn axes(value: Value<'_>, verb: &str, p: &mut Problems<'_>) -> Option<RawAxes> {
             p.add_hint(value.span(), "no axis is named", hint);
             None
         }
-    }
-}
-
-impl Schema for RawStep {
-    fn schema() -> Json {
-        schema::definition("step")
-    }
-}
-
-impl RawStep {
-    /// Returns the schema of a step: one verb, and the keys that go with it.
-    pub fn definition() -> Json {
-        let verbs = VERBS.map(|(verb, example, _)| {
-            let text = format!("`{example}`");
-            (verb.to_owned(), described(argument(verb), &text))
-        });
-        let companions =
-            COMPANIONS.map(|(key, text)| (key.to_owned(), described(companion(key), text)));
-        let with = |(key, _): &(&str, &str)| {
-            let goes = VERBS.iter().filter(|(.., keys)| keys.contains(key));
-            let any = goes.map(|(verb, ..)| match *key {
-                "ramp" if *verb == "torque" => typed(verb, key, Ns::schema()),
-                "ramp" => typed(verb, key, f64::schema()),
-                _ => json!({ "required": [verb] }),
-            });
-            (
-                (*key).to_owned(),
-                json!({ "anyOf": any.collect::<Vec<_>>() }),
-            )
-        };
-        json!({
-            "type": "object",
-            "properties": Map::from_iter(verbs.into_iter().chain(companions)),
-            "additionalProperties": false,
-            "oneOf": VERBS.map(|(verb, ..)| json!({ "required": [verb] })),
-            "dependencies": Map::from_iter(COMPANIONS.iter().map(with)),
-        })
-    }
-}
-
-/// Returns the schema of a step with this verb, in which a key has a type.
-fn typed(verb: &str, key: &str, schema: Json) -> Json {
-    json!({ "required": [verb], "properties": { key: schema } })
-}
-
-/// Returns the schema of a verb's argument.
-fn argument(verb: &str) -> Json {
-    let only = |schema: Json| {
-        let mut schema = named(schema);
-        schema["maxProperties"] = 1.into();
-        schema
-    };
-    match verb {
-        "enable" | "disable" | "reset" | "stop" | "home" => any_of([
-            json!({ "enum": [true] }),
-            String::schema(),
-            json!({ "type": "array", "items": { "type": "string" }, "minItems": 1 }),
-        ]),
-        "move" | "move_by" | "line" | "line_by" | "velocity" | "torque" => named(f64::schema()),
-        "sine" | "square" => only(RawWave::schema()),
-        "probe" => {
-            let mut probe = RawProbe::schema();
-            probe["oneOf"] = json!([{ "required": ["to"] }, { "required": ["by"] }]);
-            only(probe)
-        }
-        "table" => only(String::schema()),
-        "gear" => only(RawGear::schema()),
-        "mode" => named(String::schema()),
-        "dwell" => Ns::schema(),
-        "wait" | "while" | "if" => RawWhen::schema(),
-        "set" => Levels::schema(),
-        "override" => any_of([f64::schema(), named(f64::schema())]),
-        "let" | "add" => named(f64::schema()),
-        "message" | "alarm" => String::schema(),
-        _ => any_of([schema::integer(1, 1_000_000), json!({ "enum": [FOREVER] })]),
-    }
-}
-
-/// Returns the schema of a key that goes with a verb.
-fn companion(key: &str) -> Json {
-    match key {
-        "speed" => f64::schema(),
-        "ramp" => any_of([f64::schema(), Ns::schema()]),
-        "arrive" => ARRIVALS.schema(),
-        "timeout" => any_of([TIMEOUTS.schema(), json!({ "enum": [NONE] })]),
-        "until" => RawWhen::schema(),
-        _ => Vec::<RawStep>::schema(),
     }
 }

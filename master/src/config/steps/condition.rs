@@ -3,10 +3,11 @@
 use toml::Spanned;
 
 use super::ProgramChecker;
+use super::number::{check_range, unknown_variable};
 use crate::config::fields::KeyExt;
-use crate::config::problem::{Problems, Span, suggestion};
+use crate::config::problem::{Problems, suggestion};
 use crate::config::raw::{
-    Conditions, NamedValues, RawCondition, RawInput, RawSignal, RawSimulation, RawWhen,
+    Conditions, NamedValues, RawCondition, RawInput, RawSignal, RawSimulation, RawVariable, RawWhen,
 };
 use crate::config::signal::{self, SignalDirection};
 use crate::config::{
@@ -36,12 +37,15 @@ impl ProgramChecker<'_> {
     }
 
     /// Takes the names of `[variables]`.
-    pub(super) fn name_variables(&mut self, raw: NamedValues<f64>, p: &mut Problems<'_>) {
-        for (name, initial) in raw.0 {
-            if self.is_free(&name, p) {
+    pub(super) fn name_variables(&mut self, raw: NamedValues<RawVariable>, p: &mut Problems<'_>) {
+        for (name, variable) in raw.0 {
+            let RawVariable { initial, range } = variable.into_inner();
+            let free = self.is_free(&name, p);
+            if check_range(&name, initial, &range, p).is_some() && free {
                 self.variables.push(Variable {
                     name: name.into_inner(),
-                    initial: initial.into_inner(),
+                    initial,
+                    range: range.value(),
                 });
             }
         }
@@ -76,10 +80,7 @@ impl ProgramChecker<'_> {
         let found = self.variables.iter().position(|known| known.name == *word);
         if found.is_none() {
             let names = self.variables.iter().map(|known| known.name.as_str());
-            let hint = match self.variables.is_empty() {
-                true => format!("write `{word} = 0` under [variables]"),
-                false => suggestion(word, names, "variables"),
-            };
+            let hint = unknown_variable(word, names);
             p.add_hint(name.span(), format!("no variable is named `{word}`"), hint);
         }
         found.map(VariableRef)
@@ -87,7 +88,17 @@ impl ProgramChecker<'_> {
 
     /// Returns the device and the signal of a name of `[signals]`.
     fn signal(&self, raw: &RawSignal, p: &mut Problems<'_>) -> Option<RawSignal> {
-        if raw.device.is_some() {
+        if let Some(device) = &raw.device {
+            let named = |name: &str| name == device.get_ref();
+            if self.signals.iter().any(|known| named(&known.name))
+                || self.variables.iter().any(|known| named(&known.name))
+            {
+                let bound = raw.name.get_ref();
+                let message = format!("`{bound}` is not a bound of `{}`", device.get_ref());
+                let hint = suggestion(bound, ["above", "below"], "bounds");
+                p.add_hint(raw.name.span(), message, hint);
+                return None;
+            }
             return Some(raw.clone());
         }
         let (word, span) = (raw.name.get_ref(), raw.name.span());
@@ -134,6 +145,12 @@ impl ProgramChecker<'_> {
 
     /// Returns a condition of a step.
     pub(super) fn when(&mut self, raw: &RawWhen, p: &mut Problems<'_>) -> Option<When> {
+        let first = raw.0.iter().flat_map(|Conditions(each)| each).next();
+        if let Some(first) = first {
+            let name = first.signal.device.as_ref().unwrap_or(&first.signal.name);
+            let place = (format!("{}?", self.number), None);
+            self.places.borrow_mut().insert(place, name.span());
+        }
         let mut alternatives = Vec::with_capacity(raw.0.len());
         for Conditions(each) in &raw.0 {
             let tests: Vec<_> = each.iter().filter_map(|raw| self.test(raw, p)).collect();
@@ -169,10 +186,14 @@ impl ProgramChecker<'_> {
         if let (Subject::Axis(_, value), Some(equal)) = (of, &raw.equal) {
             let n = *equal.get_ref();
             if value.is_yes_or_no() && n != 0.0 && n != 1.0 {
-                p.add(
-                    equal.span(),
-                    format!("`{}` is true or false", name.get_ref()),
-                );
+                let axis = raw
+                    .signal
+                    .device
+                    .as_ref()
+                    .map_or("x", |axis| axis.get_ref());
+                let message = format!("`{}` is true or false", name.get_ref());
+                let hint = format!("write `{axis}.{} = true`", name.get_ref());
+                p.add_hint(equal.span(), message, hint);
                 return None;
             }
             if !value.is_yes_or_no() {
@@ -187,22 +208,6 @@ impl ProgramChecker<'_> {
         }
         let bounds = bounds(raw, p)?;
         Some(Test { of, bounds })
-    }
-
-    /// Reports a wait without limit that nothing can end.
-    pub(super) fn check_can_end(
-        &self,
-        when: &When,
-        span: &Span,
-        p: &mut Problems<'_>,
-    ) -> Option<()> {
-        let fixed = |test: &Test| matches!(test.of, Subject::Variable(_));
-        if when.0.iter().all(|tests| tests.iter().any(fixed)) {
-            let message = "nothing can end this wait: variables do not change while a step waits";
-            p.add_hint(span.clone(), message, "test variables with `if` or `while`");
-            return None;
-        }
-        Some(())
     }
 
     /// Returns the inputs that the simulated bus switches.
@@ -267,7 +272,10 @@ fn bounds(raw: &RawCondition, p: &mut Problems<'_>) -> Option<Bounds> {
     {
         let (above_n, below_n) = (above.get_ref(), below.get_ref());
         let message = format!("no value is above {above_n} and below {below_n}");
-        p.add(above.span(), message);
+        let hint = format!(
+            "swap them, or write a list: `[{{ … above = {above_n} }}, {{ … below = {below_n} }}]`"
+        );
+        p.add_hint(above.span(), message, hint);
         return None;
     }
     let [equal, above, below] =

@@ -54,7 +54,7 @@ impl ProgramChecker<'_> {
         let master = self.axis(to, p)?.0;
         if axis == master {
             let message = format!("`{}` cannot follow itself", name.get_ref());
-            p.add(to.span(), message);
+            p.add_hint(to.span(), message, "name another axis in `to`");
             return None;
         }
         if let Some(ratio) = raw.ratio.as_ref().filter(|ratio| *ratio.get_ref() == 0.0) {

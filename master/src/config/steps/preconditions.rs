@@ -7,8 +7,8 @@
 use ecaxis_axis::Mode;
 use ecaxis_ecat::index::{AxisIndex, IndexVec};
 
-use super::ProgramChecker;
 use super::target::TargetKind;
+use super::{ProgramChecker, enables};
 use crate::config::problem::{Problems, Span};
 use crate::config::{Action, AxisSetup, Step};
 
@@ -17,16 +17,6 @@ const MOST_VISITS: u32 = 200_000;
 
 /// The tolerance for comparing range ends with sums of the file's numbers.
 const ROUNDING: f64 = 1e-9;
-
-/// Returns `true` if the program itself enables axes.
-pub(crate) fn enables(steps: &[Step]) -> bool {
-    steps.iter().any(|step| match &step.action {
-        Action::Enable { .. } => true,
-        action => action
-            .inner()
-            .any(|step| enables(std::slice::from_ref(step))),
-    })
-}
 
 /// The state of an axis between two steps.
 #[derive(Debug, Clone, PartialEq)]
@@ -168,6 +158,9 @@ impl ProgramState<'_, '_, '_, '_> {
                 self.perhaps_often(steps);
             }
             Action::While { steps, .. } => self.perhaps_often(steps),
+            Action::Call { steps, .. } => self.all(steps),
+            // No axis is in two branches, so their order does not matter.
+            Action::Parallel { branches } => branches.iter().for_each(|steps| self.all(steps)),
             Action::If {
                 steps, otherwise, ..
             } => {
@@ -278,7 +271,7 @@ impl ProgramState<'_, '_, '_, '_> {
                     let endless = self.limits(axis).is_none();
                     self.each(&[axis], |state| {
                         state.stops();
-                        let turns = endless && velocity != 0.0;
+                        let turns = endless && (velocity != 0.0 || step.varies(axis));
                         state.turns_since = turns.then(|| number.clone());
                     });
                 }
@@ -352,6 +345,7 @@ impl ProgramState<'_, '_, '_, '_> {
             } else {
                 Some(target)
             };
+            let to = to.filter(|_| !step.varies(axis));
             if let (Some([low, high]), Some(to), Some(from), true) =
                 (self.limits(axis), to, from, relative)
             {
@@ -545,8 +539,18 @@ impl State {
 }
 
 impl ProgramChecker<'_> {
+    /// Returns the place of a step's condition.
+    pub(super) fn place_of(&self, step: &Step) -> Span {
+        let places = self.places.borrow();
+        let of = |key: String| places.get(&(key, None)).cloned();
+        let condition = of(format!("{}?", step.number));
+        condition
+            .or_else(|| of(step.number.clone()))
+            .unwrap_or_default()
+    }
+
     /// Returns the place of the axis's name in a step, otherwise of the step.
-    fn place(&self, number: &str, axis: AxisIndex) -> Span {
+    pub(super) fn place(&self, number: &str, axis: AxisIndex) -> Span {
         let places = self.places.borrow();
         let of = |axis| places.get(&(number.to_owned(), axis)).cloned();
         of(Some(axis)).or_else(|| of(None)).unwrap_or_default()

@@ -4,31 +4,35 @@ use ecaxis_ecat::index::AxisIndex;
 use toml::Spanned;
 
 use super::ProgramChecker;
-use crate::config::AxisSetup;
 use crate::config::axis::too_long;
-use crate::config::fields::Key;
 use crate::config::problem::{Problems, Span};
-use crate::config::raw::Named;
+use crate::config::raw::{Named, RawNumber};
+use crate::config::{AxisSetup, NumberPlace};
 use ecaxis_axis::Mode;
 
 impl ProgramChecker<'_> {
     pub(super) fn targets(
-        &self,
-        targets: Named<f64>,
+        &mut self,
+        targets: Named<RawNumber>,
         what: TargetKind,
         p: &mut Problems<'_>,
     ) -> Option<Vec<(AxisIndex, f64)>> {
         let count = targets.len();
         let mut resolved = Vec::with_capacity(count);
         for (name, value) in targets {
-            let Some((index, axis)) = self.axis(&name, p) else {
+            let Some((index, _)) = self.axis(&name, p) else {
                 continue;
             };
+            let number = self.number(&value, NumberPlace::Target(index), p);
+            let (Some(axis), Some(number)) = (self.axes[index].setup, number) else {
+                continue;
+            };
+            let end = |end| within(&Spanned::new(value.span(), end), what, axis, p);
             if !self.any_mode(index, |mode| what.possible(mode, axis)) {
                 let (message, hint) = what.impossible(name.get_ref(), axis);
                 p.add_hint(name.span(), message, hint);
-            } else if within(&value, what, axis, p) {
-                let value = value.into_inner();
+            } else if number.ends.into_iter().all(end) {
+                let value = number.value;
                 let torque = what == TargetKind::Torque;
                 resolved.push((
                     index,
@@ -66,22 +70,6 @@ impl ProgramChecker<'_> {
             p.add_hint(at, message, "a ramp may last an hour at most");
         }
     }
-}
-
-pub(super) fn fraction(value: &Key<f64>, what: &str, p: &mut Problems<'_>) -> Option<f64> {
-    let Some(value) = value else { return Some(1.0) };
-    let n = *value.get_ref();
-    if n > 0.0 && n <= 1.0 {
-        return Some(n);
-    }
-    let limit = if what == "speed" {
-        "velocity"
-    } else {
-        "acceleration"
-    };
-    let message = format!("`{what}` is {n}, but it is a fraction of the axis' {limit} limit");
-    p.add_hint(value.span(), message, "a number above 0.0 and up to 1.0");
-    None
 }
 
 /// The kind of a target.

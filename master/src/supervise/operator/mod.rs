@@ -18,6 +18,7 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 
 use crate::clock::Nanos;
 use crate::config::{GroupStopScope, Machine, OutputRef, StopGroup};
+use crate::link::sim::SimInput;
 use crate::rt::channel::Snapshot;
 
 mod activity;
@@ -197,6 +198,8 @@ pub enum Request {
         output: OutputRef,
         value: f64,
     },
+    /// Switches an input of the simulated bus.
+    SimInput(SimInput),
     /// Scales the speed of all motions of the machine (the first group) or of a group.
     Override {
         group: GroupIndex,
@@ -233,6 +236,7 @@ impl Request {
             Self::StopAll
             | Self::EmergencyStop
             | Self::SetOutput { .. }
+            | Self::SimInput(_)
             | Self::Override { .. }
             | Self::Hold { .. }
             | Self::Program(_) => None,
@@ -296,6 +300,11 @@ pub enum RequestEvent {
     },
     /// Another request has replaced this one.
     Replaced { request: u64, axis: AxisIndex },
+    /// An input of the simulated bus is switched, or the request was refused.
+    Input {
+        request: u64,
+        result: Result<(), String>,
+    },
     /// A request to the program is done or refused, or the started program has ended.
     Program {
         request: u64,
@@ -313,7 +322,7 @@ impl RequestEvent {
             | Self::LetGo { axis, .. }
             | Self::Failed { axis, .. }
             | Self::Replaced { axis, .. } => Some(*axis),
-            Self::Program { .. } => None,
+            Self::Program { .. } | Self::Input { .. } => None,
         }
     }
 
@@ -326,6 +335,7 @@ impl RequestEvent {
             | Self::LetGo { request, .. }
             | Self::Failed { request, .. }
             | Self::Replaced { request, .. }
+            | Self::Input { request, .. }
             | Self::Program { request, .. } => *request,
         }
     }
@@ -335,7 +345,10 @@ impl RequestEvent {
     pub fn is_failure(&self) -> bool {
         matches!(
             self,
-            Self::Refused { .. } | Self::Failed { .. } | Self::Program { result: Err(_), .. }
+            Self::Refused { .. }
+                | Self::Failed { .. }
+                | Self::Input { result: Err(_), .. }
+                | Self::Program { result: Err(_), .. }
         )
     }
 }
@@ -360,6 +373,10 @@ impl fmt::Display for RequestEvent {
             Self::LetGo { .. } => f.write_str("let go, brakes"),
             Self::Failed { what, why, .. } => write!(f, "{what}: {why}"),
             Self::Replaced { .. } => f.write_str("replaced by another request"),
+            Self::Input { result: Ok(()), .. } => f.write_str("input: switched"),
+            Self::Input {
+                result: Err(why), ..
+            } => write!(f, "refused: {why}"),
             Self::Program { result: Ok(()), .. } => f.write_str("program: done"),
             Self::Program {
                 result: Err(why), ..

@@ -260,6 +260,7 @@ impl RequestController {
             },
             // The loop that serves the operator takes these.
             Request::SetOutput { .. }
+            | Request::SimInput(_)
             | Request::Override { .. }
             | Request::Hold { .. }
             | Request::Program(_) => {}

@@ -10,6 +10,7 @@ use super::requests::{Commands, RequestContext, RequestController};
 use super::{Operator, Presence, ProgramRequest, ProgramStatus, Request, RequestEvent, View};
 use crate::clock;
 use crate::config::steps::enables;
+use crate::link::sim::SimInput;
 use crate::report::{Cause, Error};
 use crate::rt::channel::{RtCommand, Snapshot};
 use crate::rt::reaction_group::GroupStatus;
@@ -139,18 +140,6 @@ impl Supervisor {
         Ok(())
     }
 
-    /// Waits while the operator has paused the program.
-    pub(in crate::supervise) async fn await_program_step(&mut self) -> Result<(), Error> {
-        let waits = |supervisor: &mut Self| {
-            let attendance = supervisor.attendance.as_mut();
-            attendance.is_some_and(|a| a.program.paused && !std::mem::take(&mut a.step))
-        };
-        while waits(self) {
-            self.poll_and_query().await?;
-        }
-        Ok(())
-    }
-
     /// Calls the operator and carries out its requests. Fails if the operator ends the program.
     pub(in crate::supervise) async fn attend(&mut self, snapshot: &Snapshot) -> Result<(), Error> {
         let Some(mut attendance) = self.attendance.take() else {
@@ -167,6 +156,15 @@ impl Supervisor {
             return Err(Cause::Interrupted.into());
         }
         Ok(())
+    }
+
+    /// Switches an input of the simulated bus.
+    fn switch_input(&mut self, input: SimInput) -> Result<(), String> {
+        let Some(inputs) = &mut self.sim_inputs else {
+            return Err("the bus is real: only inputs of a simulated bus are switched".to_owned());
+        };
+        let full = "too many inputs wait for the next frame".to_owned();
+        inputs.push(input).map_err(|_| full)
     }
 
     fn take_requests(
@@ -194,13 +192,17 @@ impl Supervisor {
             controller.look(&scene, &mut commands);
         }
         let news: Vec<RequestEvent> = controller.news.drain(..).collect();
+        let program = ProgramStatus {
+            paused: attendance.program.running && (attendance.program.paused || self.is_paused()),
+            ..attendance.program
+        };
         let turn = attendance.operator.turn(&View {
             now: scene.now,
             machine: &machine,
             snapshot,
             hands: &controller.hands,
             news: &news,
-            program: &attendance.program,
+            program: &program,
         });
         let there = turn.presence == Presence::Here;
         if attendance.program.running {
@@ -211,7 +213,11 @@ impl Supervisor {
         for (index, request) in turn.requests.into_iter().enumerate() {
             attendance.requests += 1;
             let stops = request.stops() || matches!(request, Request::Hold { held: true, .. });
-            if stops || (there && index < MOST_REQUESTS) {
+            if let Request::SimInput(input) = request {
+                let result = self.switch_input(input);
+                let request = attendance.requests;
+                attendance.report(RequestEvent::Input { request, result });
+            } else if stops || (there && index < MOST_REQUESTS) {
                 attendance.take(request, &scene, &mut commands, out);
             } else {
                 attendance.refuse(request, "too many requests at once");
@@ -248,6 +254,19 @@ impl Supervisor {
 }
 
 impl Attendance {
+    pub(in crate::supervise) fn is_paused(&self) -> bool {
+        self.program.paused
+    }
+
+    pub(in crate::supervise) fn may_step(&self) -> bool {
+        self.step
+    }
+
+    /// Takes the permission for one step.
+    pub(in crate::supervise) fn take_step(&mut self) -> bool {
+        std::mem::take(&mut self.step)
+    }
+
     fn report(&mut self, event: RequestEvent) {
         self.controller.news.push_back(event);
     }
@@ -276,6 +295,8 @@ impl Attendance {
     ) {
         match request {
             Request::Program(request) => self.take_program(request, scene),
+            // `take_requests` has carried it out.
+            Request::SimInput(_) => {}
             Request::SetOutput { output, value } => out.push(RtCommand::Output { output, value }),
             Request::Override { group, factor } => {
                 out.push(RtCommand::Override { group, factor });

@@ -4,13 +4,13 @@ use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Command, Mode};
 use ecaxis_ecat::index::{AxisIndex, IndexVec};
 
-use super::{Settling, Supervisor, TargetKind};
+use super::{Settling, TargetKind, Turn};
 use crate::clock::Nanos;
 use crate::config::Step;
 use crate::report::{Cause, Error};
 use crate::rt::channel::Snapshot;
 
-impl Supervisor {
+impl Turn<'_, '_> {
     /// Starts all moves in the same cycle; each arrives on its own. `part`: fraction of the
     /// velocity and acceleration limits.
     pub(super) async fn move_each(

@@ -8,7 +8,7 @@ use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{Command, Edge, Probe, ProbeStatus, Source};
 use ecaxis_ecat::index::AxisIndex;
 
-use super::{Settling, Supervisor, TargetKind};
+use super::{Settling, TargetKind, Turn};
 use crate::clock::{self, Nanos};
 use crate::config::Step;
 use crate::report::{Cause, Error, ProbeCapture, Progress};
@@ -32,7 +32,7 @@ pub(super) struct ProbeMove {
     pub ramp: f64,
 }
 
-impl Supervisor {
+impl Turn<'_, '_> {
     pub(super) async fn probe(
         &mut self,
         step: &Step,

@@ -4,13 +4,14 @@ use ecaxis_axis::status::HomingStatus;
 use ecaxis_axis::{AxisStatus, Command, Mode};
 use ecaxis_ecat::index::AxisIndex;
 
-use super::{SETTLE_TIMEOUT, STANDSTILL_TIME, Supervisor};
+use super::super::Supervisor;
+use super::{SETTLE_TIMEOUT, STANDSTILL_TIME, Turn};
 use crate::clock::{self, Nanos};
 use crate::config::{Action, Step, Subject, When};
 use crate::report::{Cause, Error};
 use crate::rt::channel::Snapshot;
 
-impl Supervisor {
+impl Turn<'_, '_> {
     /// Waits until `holds` is true for every axis. Fails after the enable timeout or the longest
     /// stop.
     pub(super) async fn until(
@@ -125,21 +126,6 @@ impl Supervisor {
         Ok(when.holds(|subject| self.value(&snapshot, subject)))
     }
 
-    /// Returns the value of a subject. An unknown value satisfies no condition.
-    fn value(&self, snapshot: &Snapshot, subject: Subject) -> f64 {
-        let value = match subject {
-            Subject::Input(input) => snapshot.inputs.get(input.0).copied(),
-            Subject::Variable(variable) => self.variables.get(variable.0).copied(),
-            Subject::Axis(axis, value) => {
-                let (status, setup) = (snapshot.axes.get(axis), self.setup(axis));
-                status
-                    .zip(setup)
-                    .map(|(status, setup)| value.of(status, setup))
-            }
-        };
-        value.unwrap_or(f64::NAN)
-    }
-
     /// Waits until a condition holds.
     pub(super) async fn wait(
         &mut self,
@@ -173,5 +159,22 @@ impl Supervisor {
                 return Err(Error::from(cause).with_step(step));
             }
         }
+    }
+}
+
+impl Supervisor {
+    /// Returns the value of a subject. An unknown value satisfies no condition.
+    pub(super) fn value(&self, snapshot: &Snapshot, subject: Subject) -> f64 {
+        let value = match subject {
+            Subject::Input(input) => snapshot.inputs.get(input.0).copied(),
+            Subject::Variable(variable) => self.variables.get(variable.0).copied(),
+            Subject::Axis(axis, value) => {
+                let (status, setup) = (snapshot.axes.get(axis), self.setup(axis));
+                status
+                    .zip(setup)
+                    .map(|(status, setup)| value.of(status, setup))
+            }
+        };
+        value.unwrap_or(f64::NAN)
     }
 }
