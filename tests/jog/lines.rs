@@ -206,7 +206,7 @@ fn a_script_presses_inputs() {
         "{out}"
     );
     for (line, part) in [
-        ("press begin", "inputs of [signals]: `start`"),
+        ("press begin", "inputs of [signals]: `closed`"),
         ("press x.Statusword", "which the drive sets"),
         ("set start = 2", "not a value"),
         ("set start", "write `set"),

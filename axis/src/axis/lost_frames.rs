@@ -126,11 +126,11 @@ impl Axis {
         let limit = self.config.limits.acceleration;
         let trapezoid = match &self.plan {
             Plan::Move(trapezoid) => *trapezoid,
-            Plan::Jerk(source) => match source.order().goal {
+            Plan::Jerk(source) => match source.request().goal {
                 Goal::Position(target) => Trapezoid {
                     target,
-                    velocity: source.order().limits.velocity,
-                    acceleration: source.order().limits.acceleration,
+                    velocity: source.request().limits.velocity,
+                    acceleration: source.request().limits.acceleration,
                     braking: limit,
                 },
                 Goal::Velocity(_) => {

@@ -83,8 +83,8 @@ const TABLE_SLEW: f64 = 5.0;
 /// Number of halvings of the change that the limits do not permit.
 const HALVINGS: u32 = 6;
 
-/// Returns the next rate of tables that play in step, between `now` and `wanted`, which are at most
-/// 1. `permits`: true if one cycle at a rate keeps the limits of every table. RT: eight calls of
+/// Returns the next rate of tables that play in step, between `now` and `wanted`, neither above 1.
+/// `permits`: true if one cycle at a rate keeps the limits of every table. RT: eight calls of
 /// `permits` at most.
 #[must_use]
 pub fn table_rate(now: f64, wanted: f64, dt_s: f64, mut permits: impl FnMut(f64) -> bool) -> f64 {

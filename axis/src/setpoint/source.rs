@@ -25,7 +25,7 @@ impl Source {
     pub const fn target(&self) -> Option<f64> {
         match self {
             Self::Trapezoid(trapezoid) => Some(trapezoid.target),
-            Self::JerkLimited(source) => match source.order().goal {
+            Self::JerkLimited(source) => match source.request().goal {
                 Goal::Position(target) => Some(target),
                 Goal::Velocity(_) => None,
             },

@@ -261,7 +261,7 @@ impl Setpoint for PositionWave {
                 let mut ahead = self.wave;
                 let target = self.centre + ahead.advance(self.wanted * dt_s);
                 let order = MoveRequest::within(Goal::Position(target), self.limits);
-                let same = source.order().goal == order.goal;
+                let same = source.request().goal == order.goal;
                 // A hold delays a move, and the wave waits for its end.
                 if same || source.finished(motion) {
                     self.wave = ahead;
@@ -289,7 +289,7 @@ impl Setpoint for PositionWave {
             State::Sine => self.wave.finished() && motion.stands_at(self.centre),
             State::Square(source) => {
                 self.wave.finished()
-                    && source.order().goal == Goal::Position(self.centre)
+                    && source.request().goal == Goal::Position(self.centre)
                     && source.finished(motion)
             }
             State::Interrupted => motion.velocity == 0.0,

@@ -34,8 +34,8 @@ Examples:
   ecaxis run m.toml --no-enable             to Op, axes without power
   ecaxis run m.toml --json                  the result as JSON
 
-During the run, the lines `p` (pause), `s` (one step), `c` (continue) and, on the
-simulated bus, `press INPUT` and `release INPUT` control the program.
+During the run, the lines `p` (pause), `s` (one step), `c` (continue) and, on
+the simulated bus, `press INPUT` and `release INPUT` control the program.
 
 Ctrl-C, SIGTERM, or a terminal that closes: the axes decelerate within their
 limits, lose power, and the bus goes back to Init; the exit code is 130. Ctrl-Z

@@ -87,7 +87,7 @@ pub enum Action {
     /// Move to the table's first position, then play the table.
     Table {
         axis: AxisIndex,
-        /// The index into [`Machine::tables`].
+        /// The index into [`Machine::tables`](super::Machine::tables).
         table: usize,
         /// The fractions for the move to the first position, as in [`Action::Move`].
         speed: f64,

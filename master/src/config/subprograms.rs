@@ -150,8 +150,8 @@ fn read<'d>(subs: &Spanned<DeValue<'d>>, p: &mut Problems<'_>) -> Vec<Sub<'d>> {
 }
 
 /// Reports parameters that the subprogram does not have, and collects those used.
-fn check<'v>(
-    value: &'v Spanned<DeValue<'_>>,
+fn check(
+    value: &Spanned<DeValue<'_>>,
     sub: &str,
     parameters: &[Spanned<String>],
     used: &mut BTreeSet<String>,
@@ -229,10 +229,8 @@ impl<'d> Expansion<'d> {
             .get_ref()
             .as_str()
             .and_then(|name| self.copy(name, call.span(), step.get("with"), p));
-        let steps = Spanned::new(
-            call.span(),
-            DeValue::Array(steps.unwrap_or_else(DeArray::new)),
-        );
+        let none = || DeValue::Array(DeArray::new());
+        let steps = Spanned::new(call.span(), steps.map_or_else(none, DeValue::Array));
         step.insert(key, steps);
     }
 

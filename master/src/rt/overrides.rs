@@ -47,8 +47,12 @@ impl OverrideInput {
     fn factor(&self, inputs: &[f64], before: f64) -> f64 {
         let value = inputs.get(self.input.0).copied().unwrap_or(f64::NAN);
         let factor = (value - self.zero) / (self.full - self.zero);
-        // Not `clamp`: NaN must become 0.
-        let factor = factor.max(0.0).min(MAX_RATE);
+        // NaN becomes 0.
+        let factor = if factor > 0.0 {
+            factor.min(MAX_RATE)
+        } else {
+            0.0
+        };
         if (factor - before).abs() < STEP * 0.75 {
             return before;
         }

@@ -285,7 +285,7 @@ proptest! {
         watch.finish(&mut source)?;
         prop_assert!(watch.motion.position.abs() <= 50.0 + 1e-9, "{at:?} {:?} {source:?}", watch.motion);
         if !stop {
-            let Goal::Position(target) = source.order().goal else { unreachable!() };
+            let Goal::Position(target) = source.request().goal else { unreachable!() };
             prop_assert!(watch.motion.stands_at(target));
         }
     }
@@ -325,7 +325,7 @@ proptest! {
                 prop_assert!(watch.motion.position.abs() <= 50.0 + 1e-9, "{source:?}");
             }
         }
-        let Goal::Velocity(velocity) = source.order().goal else { unreachable!() };
+        let Goal::Velocity(velocity) = source.request().goal else { unreachable!() };
         if velocity.abs() > 0.1 {
             for _ in 0..1_100_000 {
                 watch.cycle(&mut source)?;
@@ -357,7 +357,7 @@ proptest! {
             }
         }
         watch.finish(&mut source)?;
-        let Goal::Velocity(velocity) = source.order().goal else { unreachable!() };
+        let Goal::Velocity(velocity) = source.request().goal else { unreachable!() };
         for _ in 0..10 {
             watch.cycle(&mut source)?;
             prop_assert_eq!(watch.motion.velocity, velocity);

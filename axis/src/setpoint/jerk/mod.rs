@@ -137,7 +137,7 @@ impl JerkLimited {
 
     /// Returns the request of this move.
     #[must_use]
-    pub const fn order(&self) -> &MoveRequest {
+    pub const fn request(&self) -> &MoveRequest {
         &self.nominal
     }
 
