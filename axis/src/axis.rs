@@ -65,6 +65,8 @@ const LONGEST_CYCLE_S: f64 = 0.1;
 
 /// The highest override of velocities.
 pub const MAX_RATE: f64 = 1.2;
+/// A lower override stands for 0: no move could be planned with it.
+pub const MIN_RATE: f64 = 1e-3;
 
 /// One axis: commands in, limited set-points out, supervision in between. Call it once per cycle.
 #[derive(Debug, Clone)]
@@ -203,10 +205,10 @@ impl Axis {
     /// Multiplies the velocity of moves and velocities by `rate`, from 0 to [`MAX_RATE`], within the
     /// limits of the axis. At 0 a motion decelerates with its own limits and waits on its way; a
     /// later rate continues it. Stops, homing, torques and set-points from outside do not change.
-    /// An invalid rate counts as 0. RT: O(1), plans at most once per cycle.
+    /// An invalid rate, or one below [`MIN_RATE`], counts as 0. RT: O(1), plans at most once per cycle.
     pub const fn set_rate(&mut self, rate: f64) {
         // Written so that NaN is rejected, too.
-        let valid = rate >= 0.0 && rate <= MAX_RATE;
+        let valid = rate >= MIN_RATE && rate <= MAX_RATE;
         self.rate = if valid { rate } else { 0.0 };
     }
 

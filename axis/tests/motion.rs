@@ -2,7 +2,7 @@
 
 use crate::common::{DT, Drive, LIMITS, Rig, scale};
 use ecaxis_axis::{
-    Axis, AxisConfig, Command, CommandError, Limits, Mode, Scale, State, VelocityUnit,
+    Axis, AxisConfig, Command, CommandError, Inputs, Limits, Mode, Scale, State, VelocityUnit,
 };
 
 const fn to(position: f64) -> Command {
@@ -233,9 +233,9 @@ fn cst_ramps_and_stops() {
     assert_eq!(rig.out.target_torque, -10);
 }
 
-/// Turns a motor by torque that accelerates `strength` times as much as its limits say, against
-/// friction in per mille. Returns the fastest and the last speed.
-fn turned(percent: f64, strength: f64, friction: f64) -> [f64; 2] {
+/// Returns an axis that has just been commanded a torque. Its motor accelerates `strength` times as
+/// much as its limits say.
+fn with_torque(percent: f64, strength: f64) -> Rig {
     let limits = Limits {
         position: None,
         // The drive of these tests reaches 250 mm/s² with its whole torque.
@@ -251,6 +251,23 @@ fn turned(percent: f64, strength: f64, friction: f64) -> [f64; 2] {
     rig.axis
         .command(Command::Torque { percent, ramp_s })
         .unwrap();
+    rig
+}
+
+/// An axis at the velocity limit, with 5 % of friction and 50 % of commanded torque.
+fn at_the_velocity_limit() -> Rig {
+    let mut rig = with_torque(50.0, 1.0);
+    for _ in 0..6000 {
+        rig.drive.load = -50.0 * rig.drive.velocity.signum();
+        rig.cycle();
+    }
+    rig
+}
+
+/// Turns a motor by torque that accelerates `strength` times as much as its limits say, against
+/// friction in per mille. Returns the fastest and the last speed.
+fn turned(percent: f64, strength: f64, friction: f64) -> [f64; 2] {
+    let mut rig = with_torque(percent, strength);
     let (mut fastest, mut last): (f64, f64) = (0.0, 0.0);
     for _ in 0..12_000 {
         rig.drive.load = -friction * rig.drive.velocity.signum();
@@ -279,6 +296,35 @@ fn cst_reduces_the_torque_at_the_velocity_limit() {
                 );
             }
         }
+    }
+}
+
+/// At the velocity limit, late answers and a stop begin from the torque that was sent: it goes to zero
+/// and never beyond.
+#[test]
+fn a_reduced_torque_ends_at_zero() {
+    for late in [true, false] {
+        let mut rig = at_the_velocity_limit();
+        let sent = rig.axis.step(&rig.drive.inputs(), DT).target_torque;
+        assert!((0..300).contains(&sent), "{sent} of 500");
+        if !late {
+            rig.axis.command(Command::Stop).unwrap();
+        }
+        let mut before = i32::from(sent);
+        for n in 0..300 {
+            let inputs = Inputs {
+                fresh: !late,
+                late: late && n > 0,
+                ..rig.drive.inputs()
+            };
+            let torque = i32::from(rig.axis.step(&inputs, DT).target_torque);
+            assert!(
+                (0..=before).contains(&torque),
+                "late {late}, cycle {n}: {before} {torque}"
+            );
+            before = torque;
+        }
+        assert_eq!(before, 0, "late {late}");
     }
 }
 

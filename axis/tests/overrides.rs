@@ -33,6 +33,27 @@ fn move_to(position: f64, speed: f64) -> Command {
     }
 }
 
+/// A product of small factors is a hold, not an override that is never planned.
+#[test]
+fn a_tiny_rate_holds() {
+    for jerk_limited in [true, false] {
+        let mut rig = rig(Mode::Csp, jerk_limited);
+        rig.axis.command(move_to(45.0, 1.0)).unwrap();
+        for _ in 0..100 {
+            rig.cycle();
+        }
+        rig.axis.set_rate(5.6e-17);
+        for _ in 0..2000 {
+            rig.cycle();
+        }
+        let status = rig.axis.status();
+        assert!(
+            status.target_velocity == 0.0 && status.target_position < 44.0,
+            "{status:?}"
+        );
+    }
+}
+
 proptest! {
     /// Moves in CSP with a rate that changes at any time: velocity, acceleration and, with jerk
     /// limits, jerk hold in every cycle. A hold stands, and the end is exact.

@@ -57,9 +57,14 @@ impl DerivedConstants {
 impl LoopState {
     /// Lets the loops continue from the last outputs.
     pub(super) fn take_over(&mut self) {
+        self.take_limited();
+        self.takes_over = true;
+    }
+
+    /// Makes the torque that was sent the commanded one.
+    pub(super) fn take_limited(&mut self) {
         self.torque = self.limited_torque();
         self.release_speed();
-        self.takes_over = true;
     }
 
     /// Returns the commanded torque within the velocity limit.
@@ -153,7 +158,11 @@ impl Axis {
         let torque = self.loop_state.torque;
         let wanted = torque.abs();
         if wanted == 0.0 {
-            self.loop_state.release_speed();
+            // A braking torque ends with the slope as well.
+            let most = self.config.torque_slope * dt_s;
+            let state = &mut self.loop_state;
+            state.holding = 0.0;
+            state.reduction -= state.reduction.clamp(-most, most);
             return;
         }
         let filter_s = match self.actual.velocity_is_measured() {

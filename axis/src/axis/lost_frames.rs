@@ -94,6 +94,7 @@ impl Axis {
                     target: 0.0,
                     slope: self.config.torque_slope,
                 };
+                self.loop_state.take_limited();
                 self.loop_state.torque = ramp.advance(self.loop_state.torque, dt_s);
             }
             ControlledQuantity::Drive => {}

@@ -171,8 +171,10 @@ impl Axis {
         if braking == Plan::DriveProfile {
             self.profile.halt();
         }
-        if !matches!(braking, Plan::Torque(_) | Plan::DriveProfile) {
-            self.engage();
+        match braking {
+            Plan::Torque(_) => self.loop_state.take_limited(),
+            Plan::DriveProfile => {}
+            _ => self.engage(),
         }
         self.plan = braking;
     }
@@ -322,7 +324,9 @@ impl Axis {
 
     pub(super) fn setpoint_at_rest(&self) -> bool {
         match self.plan {
-            Plan::Torque(_) => self.loop_state.torque == 0.0,
+            Plan::Torque(_) => {
+                self.loop_state.torque == 0.0 && self.loop_state.limited_torque() == 0.0
+            }
             Plan::DriveProfile => !self.home.running() && self.at_standstill(),
             _ => self.motion.velocity == 0.0,
         }

@@ -50,7 +50,7 @@ impl Axis {
             target_position: goal_position.unwrap_or(self.motion.position),
             target_velocity: goal_velocity.unwrap_or(self.motion.velocity),
             target_acceleration: self.motion.acceleration,
-            target_torque: self.loop_state.torque,
+            target_torque: self.loop_state.limited_torque(),
             following_error: self.supervision.following_error,
             max_following_error: self.supervision.max_following_error,
             final_error_counts: (arrived

@@ -13,6 +13,8 @@ use super::schema::{self, Schema};
 
 /// The maximum number of steps after all calls are expanded.
 pub(crate) const MOST_STEPS: usize = 10_000;
+/// The most subprograms that call each other in a row.
+const DEEPEST: usize = 8;
 
 /// The keys of a step that contain steps.
 const LISTS: [&str; 3] = ["step", "else", "parallel"];
@@ -259,6 +261,11 @@ impl<'d> Expansion<'d> {
             p.add_hint(at, message, hint);
             return None;
         }
+        if self.running.len() >= DEEPEST {
+            let message = format!("calls are nested more than {DEEPEST} deep");
+            p.add_hint(at, message, "call fewer subprograms from each other");
+            return None;
+        }
         let sub = &mut self.subs[index];
         sub.called = true;
         if sub.broken {
@@ -277,8 +284,12 @@ impl<'d> Expansion<'d> {
         };
         let known = || sub.parameters.iter().map(|known| known.get_ref().as_str());
         let before = p.count();
-        for key in given.keys() {
+        for (key, value) in given {
             let word = key.get_ref();
+            if matches!(value.get_ref(), DeValue::Array(_) | DeValue::Table(_)) {
+                let message = format!("`{word}` stands for a number, true or false, or a name");
+                p.add_hint(value.span(), message, "give it one value");
+            }
             if !known().any(|known| known == word.as_ref()) {
                 let message = format!("`{name}` has no parameter `{word}`");
                 let hint = match sub.parameters.is_empty() {
@@ -345,6 +356,10 @@ fn substitute<'d>(value: &mut Spanned<DeValue<'d>>, given: &DeTable<'d>, p: &mut
                         }
                     },
                 };
+                if replaced.contains_key(&key) {
+                    let message = format!("`{}` is there twice", key.get_ref());
+                    p.add_hint(key.span(), message, "give each parameter another name");
+                }
                 replaced.insert(key, value);
             }
             *table = replaced;

@@ -3,7 +3,7 @@
 //! The rate of an axis is the product of the machine's factor and its group's, at most [`MAX_RATE`].
 //! It is 0 while one of both is held. Stops do not use the rate.
 
-use ecaxis_axis::MAX_RATE;
+use ecaxis_axis::{MAX_RATE, MIN_RATE};
 use ecaxis_ecat::index::{GroupIndex, IndexVec};
 
 use super::config::Condition;
@@ -177,7 +177,8 @@ impl Overrides {
         if machine.held || own.held {
             return 0.0;
         }
-        (machine.factor * own.factor).min(MAX_RATE)
+        let rate = (machine.factor * own.factor).min(MAX_RATE);
+        if rate < MIN_RATE { 0.0 } else { rate }
     }
 }
 

@@ -473,9 +473,9 @@ impl Turn<'_, '_> {
 
     /// Waits until the cycle has taken every command.
     async fn taken(&mut self, start: Nanos) -> Result<(), Error> {
-        while self.poll_and_query().await?.commands_taken < self.commands_sent && !self.over(start)
-        {
-        }
+        // Other branches may send on.
+        let sent = self.commands_sent;
+        while self.poll_and_query().await?.commands_taken < sent && !self.over(start) {}
         Ok(())
     }
 
@@ -488,6 +488,8 @@ impl Turn<'_, '_> {
         mut look: impl FnMut(&Self, &Snapshot) -> Result<bool, Error>,
     ) -> Result<(), Error> {
         let needed = needed(&step.action);
+        // Other branches may send on.
+        let sent = self.commands_sent;
         loop {
             let snapshot = self.poll_and_query().await?;
             self.ensure_not_stopped(Some(step), &needed)?;
@@ -496,7 +498,7 @@ impl Turn<'_, '_> {
                 return Ok(());
             }
             // Until then the status belongs to the previous step.
-            if snapshot.commands_taken < self.commands_sent {
+            if snapshot.commands_taken < sent {
                 continue;
             }
             if let Some((axis, reason)) = self.take_refusal(&step.action.commanded()) {

@@ -169,7 +169,9 @@ impl Application {
     pub(super) fn hold(&mut self, slot: EntryHandle) {
         if let Self::Io(io) = self {
             io.mirrors.retain(|mirror| mirror.to != slot);
-            io.held.push(slot);
+            if !io.held.contains(&slot) {
+                io.held.push(slot);
+            }
         }
     }
 }

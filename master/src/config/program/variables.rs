@@ -77,13 +77,19 @@ impl Machine {
                 | Action::Velocity { targets, .. },
                 NumberPlace::Target(axis),
             ) => set_target(targets, axis, value),
-            (Action::Move { speed, .. } | Action::Line { speed, .. }, NumberPlace::Speed) => {
-                *speed = value;
-            }
+            (
+                Action::Move { speed, .. }
+                | Action::Line { speed, .. }
+                | Action::Probe { speed, .. }
+                | Action::Table { speed, .. },
+                NumberPlace::Speed,
+            ) => *speed = value,
             (
                 Action::Move { ramp, .. }
                 | Action::Line { ramp, .. }
-                | Action::Velocity { ramp, .. },
+                | Action::Velocity { ramp, .. }
+                | Action::Probe { ramp, .. }
+                | Action::Table { ramp, .. },
                 NumberPlace::Ramp,
             ) => *ramp = value,
             // The range is above 0; the cast saturates.

@@ -346,8 +346,8 @@ impl Attendance {
                     (self.program.paused, self.step) = (true, true);
                 }
                 ProgramRequest::Step => self.step = true,
-                ProgramRequest::Pause => self.program.paused = true,
-                ProgramRequest::Resume => self.program.paused = false,
+                ProgramRequest::Pause => (self.program.paused, self.step) = (true, false),
+                ProgramRequest::Resume => (self.program.paused, self.step) = (false, false),
                 ProgramRequest::Stop => self.end = true,
             }
         }

@@ -91,10 +91,12 @@ impl Supervisor {
         let paused = holds(&machine.program.pause).unwrap_or(false);
         let pressed = holds(&machine.program.step).unwrap_or(false);
         let before = self.buttons;
+        let stopped = paused || self.is_paused();
         self.buttons = Buttons {
             paused,
             released: !pressed,
-            step: before.step || (pressed && before.released),
+            // A press before the pause steps nothing.
+            step: stopped && (before.step || (pressed && before.released)),
         };
     }
 
