@@ -387,7 +387,7 @@ impl Follower {
                     Some(End::Done)
                 } else {
                     for _ in 0..steps {
-                        *motion = playback.advance(table, *motion, dt_s);
+                        *motion = playback.advance(table, *motion, dt_s, 1.0);
                     }
                     return (Some(SetPoint::Position(motion.position)), None);
                 }
