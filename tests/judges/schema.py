@@ -69,7 +69,8 @@ def main():
         document = tomllib.loads(path.read_text())
         wrong += [f"{path.name}: {error.json_path}: {error.message}" for error in validator.iter_errors(document)]
         for number, place in enumerate(list(places(document))):
-            if number % SAMPLE:
+            # In the steps of a subprogram, a parameter may stand for any value.
+            if number % SAMPLE or (place[0] == "sub" and "step" in place):
                 continue
             for value in [*VALUES, {"unknown_key": 1}]:
                 changed = with_value(document, place, value)
