@@ -133,7 +133,7 @@ fn diagram(out: &mut String, curve: &[(f64, f64)], unit: &str, (low, high): (f64
         let at = y(level);
         let _ = write!(
             out,
-            "<path d=\"M{LEFT} {at:.1}H{}\"/><text x=\"{}\" y=\"{:.1}\" text-anchor=\"end\">{level:.4}</text>",
+            "<path d=\"M{LEFT} {at:.1}H{}\"/><text x=\"{}\" y=\"{:.1}\" text-anchor=\"end\">{level}</text>",
             WIDTH - 10.0,
             LEFT - 6.0,
             at + 4.0
@@ -153,7 +153,7 @@ fn diagram(out: &mut String, curve: &[(f64, f64)], unit: &str, (low, high): (f64
                 let _ = write!(
                     out,
                     "<text x=\"{at:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{hz}</text>",
-                    HEIGHT - 14.0
+                    HEIGHT - 17.0
                 );
             }
         }
@@ -162,7 +162,7 @@ fn diagram(out: &mut String, curve: &[(f64, f64)], unit: &str, (low, high): (f64
     let _ = write!(
         out,
         "</g><text x=\"{LEFT}\" y=\"{:.1}\">{} over Hz</text>",
-        HEIGHT - 1.0,
+        HEIGHT - 4.0,
         escaped(unit)
     );
     let points: Vec<String> = curve
