@@ -190,7 +190,8 @@ fn mistakes_are_explained_and_move_nothing() {
         ("p --phase 90", "--phase 90: 0 to 80"),
         ("p --from 600", "frequencies from 600 to 200 Hz"),
         ("p --period 0.01ms", "a period of 0.00001 s"),
-        ("p --form prbs --amplitude 0.05", "the axis needs mode cst"),
+        ("p --form prbs", "the axis needs mode cst"),
+        ("p --period 200s --periods 100", "more than 4000000"),
         ("p --periods 1", "1 is not in 2..=100"),
         ("p --form square", "possible values"),
         (

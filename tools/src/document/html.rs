@@ -99,7 +99,7 @@ fn is_number(cell: &str) -> bool {
 }
 
 /// Escapes `&`, `<`, `>` and quotes, and removes characters that XML does not allow.
-pub(super) fn escape(text: &str) -> String {
+pub(crate) fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         match c {

@@ -15,6 +15,7 @@ mod svg;
 mod text;
 
 pub use chart::{Axis, Chart, Format, Marker, Series, Shape};
+pub(crate) use html::escape;
 
 /// A report.
 #[derive(Debug, Clone, Default)]

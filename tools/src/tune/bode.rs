@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 
 use super::margins::unwrapped;
 use super::response::Response;
+use crate::document::escape;
 
 /// A frequency response with its name and the unit of its gain.
 #[derive(Debug, Clone, PartialEq)]
@@ -110,12 +111,6 @@ const WIDTH: f64 = 860.0;
 const HEIGHT: f64 = 220.0;
 const LEFT: f64 = 60.0;
 
-fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;")
-        .replace('<', "&lt;")
-        .replace('>', "&gt;")
-}
-
 /// Draws one diagram with its grid.
 fn diagram(out: &mut String, curve: &[(f64, f64)], unit: &str, (low, high): (f64, f64), step: f64) {
     let (Some(first), Some(last)) = (curve.first(), curve.last()) else {
@@ -126,7 +121,7 @@ fn diagram(out: &mut String, curve: &[(f64, f64)], unit: &str, (low, high): (f64
     let _ = write!(
         out,
         "<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{0}\"><g class=\"grid\">",
-        escaped(unit)
+        escape(unit)
     );
     let mut level = low;
     while level <= high + 1e-9 {
@@ -163,7 +158,7 @@ fn diagram(out: &mut String, curve: &[(f64, f64)], unit: &str, (low, high): (f64
         out,
         "</g><text x=\"{LEFT}\" y=\"{:.1}\">{} over Hz</text>",
         HEIGHT - 4.0,
-        escaped(unit)
+        escape(unit)
     );
     let points: Vec<String> = curve
         .iter()
@@ -183,11 +178,11 @@ pub fn page(title: &str, text: &str, plots: &[Plot]) -> String {
          svg{{width:100%;display:block;margin-bottom:8px}}svg text{{font-size:11px;fill:#444}}\
          .grid path{{stroke:#ddd}}polyline{{fill:none;stroke:#0657a8;stroke-width:1.6}}\
          </style><h1>{0}</h1><pre>{1}</pre>",
-        escaped(title),
-        escaped(text)
+        escape(title),
+        escape(text)
     );
     for plot in plots {
-        let _ = write!(out, "<h2>{}</h2>", escaped(&plot.name));
+        let _ = write!(out, "<h2>{}</h2>", escape(&plot.name));
         let gain = plot.gain_db();
         diagram(
             &mut out,

@@ -9,7 +9,7 @@ use super::TuneError;
 pub enum Form {
     /// Sines at logarithmic distances. The best signal for each of them.
     Multisine,
-    /// Sines at all multiples of the lowest frequency, in phases that sweep once a period.
+    /// Sines at equal distances, in phases that sweep once a period.
     Chirp,
     /// A binary sequence of maximal length. Of torques only: its steps have no derivative.
     Prbs,
@@ -55,6 +55,8 @@ pub struct Excitation {
 const SHARE: f64 = 0.8;
 /// Lines at logarithmic distances.
 const LINES: usize = 48;
+/// The most sines: the plan takes samples × sines steps.
+const MAX_SINES: usize = 1000;
 /// The most samples of a period.
 const MAX_SAMPLES: usize = 1 << 18;
 
@@ -102,7 +104,7 @@ impl Excitation {
         let first = (low / base).ceil().max(1.0) as usize;
         let last = (high / base).floor() as usize;
         let lines = match form {
-            Form::Chirp => (first..=last).collect(),
+            Form::Chirp => sweep(first, last),
             Form::Multisine | Form::Prbs => logarithmic(first, last),
         };
         if lines.len() < 4 {
@@ -129,7 +131,7 @@ impl Excitation {
             plan.sum(bounds, amplitude);
         }
         if plan.lines.len() > 4 * LINES {
-            plan.lines = logarithmic(first, last);
+            plan.lines = some(&plan.lines);
         }
         Ok(plan)
     }
@@ -207,6 +209,31 @@ fn logarithmic(first: usize, last: usize) -> Vec<usize> {
     lines
 }
 
+/// Returns at most [`MAX_SINES`] numbers at equal distances.
+fn sweep(first: usize, last: usize) -> Vec<usize> {
+    let count = (last + 1).saturating_sub(first);
+    let step = count.div_ceil(MAX_SINES).max(1);
+    (first..=last).step_by(step).collect()
+}
+
+/// Returns those of the lines that are at about equal ratios.
+fn some(lines: &[usize]) -> Vec<usize> {
+    let (Some(first), Some(last)) = (lines.first(), lines.last()) else {
+        return Vec::new();
+    };
+    let wanted = logarithmic(*first, *last).into_iter();
+    let mut some: Vec<_> = wanted
+        .filter_map(|wanted| {
+            lines
+                .iter()
+                .copied()
+                .min_by_key(|line| line.abs_diff(wanted))
+        })
+        .collect();
+    some.dedup();
+    some
+}
+
 /// Returns a period of ±1, `clock` samples each, from the longest sequence that fits.
 fn prbs(count: usize, clock: usize) -> Vec<f64> {
     // Feedback taps of sequences of maximal length.
@@ -277,6 +304,18 @@ mod tests {
         let values = prbs(127 * 3, 3);
         assert_eq!(values.len(), 381);
         assert_eq!(values.iter().sum::<f64>().abs(), 3.0);
+    }
+
+    /// Long sweeps are planned in bounded time, and all evaluated lines are excited.
+    #[test]
+    fn a_long_chirp_has_a_bounded_number_of_sines() {
+        for (first, last) in [(1, 1), (3, 1200), (500, 52_000)] {
+            let lines = sweep(first, last);
+            assert!(lines.len() <= MAX_SINES && lines[0] == first);
+            let evaluated = some(&lines);
+            assert!(evaluated.len() <= LINES && !evaluated.is_empty());
+            assert!(evaluated.iter().all(|line| lines.contains(line)));
+        }
     }
 
     proptest! {

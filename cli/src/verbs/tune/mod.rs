@@ -103,11 +103,14 @@ pub(crate) struct Args {
 enum FormName {
     /// Sines at logarithmic distances
     Multisine,
-    /// All multiples of the lowest frequency, as a sweep
+    /// Sines at equal distances, as a sweep
     Chirp,
     /// A binary sequence of torques (mode cst without `loops.cst`)
     Prbs,
 }
+
+/// The most cycles of an excitation: their samples are kept in memory.
+const MAX_CYCLES: f64 = 4e6;
 
 impl Args {
     /// True if the subcommand may change a device.
@@ -292,6 +295,13 @@ fn plan(args: &Args, machine: &Machine, setup: &AxisSetup) -> Result<Excitation,
     let dt_s = machine.bus.cycle_ns as f64 * 1e-9;
     let high = args.to.unwrap_or(0.2 / dt_s);
     let period_s = args.period as f64 * 1e-9;
+    let cycles = period_s / dt_s * f64::from(args.periods + 2);
+    if cycles > MAX_CYCLES {
+        return refuse(
+            format!("the excitation would last {cycles:.0} cycles, more than {MAX_CYCLES:.0}"),
+            "use a shorter --period, or fewer --periods",
+        );
+    }
     Excitation::plan(
         (form, quantity),
         (args.from, high),
