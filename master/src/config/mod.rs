@@ -14,6 +14,7 @@
 //! | `optional.rs` | devices that may be absent |
 //! | `sdo.rs` | values of start-up SDOs as bytes |
 //! | `startup.rs` | which start-up SDOs are verified or skipped |
+//! | `axis_setup.rs` | what is known about an axis |
 //! | `axis.rs` | limits; units in `axis/scale.rs`, loops and homing in `axis/control.rs` |
 //! | `drive_units.rs` | the units that the drive itself reports |
 //! | `drive_limits.rs` | the limits that the drive itself allows |
@@ -27,12 +28,12 @@
 //! All mistakes are collected, so that one check reports every mistake of a file.
 
 use std::borrow::Cow;
-use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
 mod axis;
+mod axis_setup;
 mod check;
 mod copy;
 mod device;
@@ -66,6 +67,7 @@ mod units;
 
 pub use crate::text::nearest;
 pub(crate) use axis::is_maxon;
+pub use axis_setup::{AxisSetup, HomingSetup, TorqueSetup, TorqueUnit, UnitSource};
 pub use copy::{BitRange, CopySetup};
 pub(crate) use device::unused_axis;
 pub use drive_limits::LimitConflict;
@@ -311,112 +313,6 @@ pub enum MailboxSource {
     Esi,
     /// As SOEM, the IgH master and ethercrab do.
     Eeprom,
-}
-
-#[derive(Debug, Clone, PartialEq)]
-pub struct AxisSetup {
-    /// The name in the machine file.
-    pub name: String,
-    pub device: DeviceIndex,
-    /// The number of the axis in its drive, from 0.
-    pub number: u16,
-    /// The index in [`GatewaySetup::nodes`] of an axis behind a gateway.
-    pub node: Option<usize>,
-    pub config: ecaxis_axis::AxisConfig,
-    /// The user's name for the position unit, for example `mm`.
-    pub unit: String,
-    pub mode: esi::Mode,
-    pub velocity_unit_from: UnitSource,
-    pub acceleration_unit_from: UnitSource,
-    pub torque: TorqueSetup,
-    /// The direction in which a modulo axis moves.
-    pub way: ecaxis_axis::scale::ModuloDirection,
-    pub homing: Option<HomingSetup>,
-    /// The one-bit output that releases the axis's brake.
-    pub brake_output: Option<Signal>,
-}
-
-/// The homing of an axis.
-#[derive(Debug, Clone, PartialEq)]
-pub struct HomingSetup {
-    pub homing: ecaxis_axis::homing::Homing,
-    /// The homing settings as SDOs.
-    pub startup: Vec<esi::StartupSdo>,
-    /// The timeout of the whole search in ns.
-    pub timeout_ns: u64,
-}
-
-impl HomingSetup {
-    /// Adds the SDOs before SafeOp, after those of the ESI.
-    fn add_to(&self, startup: &mut Vec<esi::StartupSdo>) {
-        let at = startup
-            .iter()
-            .position(|sdo| sdo.transition == "SO")
-            .unwrap_or(startup.len());
-        startup.splice(at..at, self.startup.iter().cloned());
-    }
-}
-
-/// The unit of an axis's torques, and the motor data.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TorqueSetup {
-    pub unit: TorqueUnit,
-    /// The rated torque in Nm; `None` if only the drive knows it.
-    pub rated: Option<f64>,
-    pub rated_from: UnitSource,
-    /// The torque constant in Nm/A.
-    pub constant: Option<f64>,
-    pub constant_from: UnitSource,
-    /// The number of counts of 0x6076 per Nm.
-    pub counts_per_newton_metre: f64,
-    /// The percentage of rated torque per file unit. With an unknown rated torque: the percentage
-    /// of the limit.
-    percent_per_unit: f64,
-    /// `true` if the file sets a torque limit. Otherwise the limit is the rated torque.
-    limit_said: bool,
-}
-
-/// The key `torque_unit`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum TorqueUnit {
-    /// Percent of the motor's rated torque.
-    #[default]
-    Percent,
-    /// Nm at the motor, before any gear.
-    NewtonMetres,
-    Amperes,
-}
-
-impl TorqueUnit {
-    #[must_use]
-    pub const fn sign(self) -> &'static str {
-        match self {
-            Self::Percent => "%",
-            Self::NewtonMetres => "Nm",
-            Self::Amperes => "A",
-        }
-    }
-}
-
-impl fmt::Display for TorqueUnit {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.sign())
-    }
-}
-
-/// The source of a drive unit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum UnitSource {
-    /// A key of `[device.axis]`.
-    File,
-    /// A start-up SDO of the machine file.
-    Sdo,
-    /// The default in the ESI file.
-    Esi,
-    /// The drive itself.
-    Drive,
-    /// No source: the unit is assumed.
-    Nothing,
 }
 
 impl Machine {
