@@ -17,6 +17,7 @@
 //! | `control_law` | converts the set-point to the drive's targets |
 //! | `mode_switch` | switches between modes |
 //! | `home` | homing |
+//! | `lead` | the second half of a gantry |
 //! | `stop` | power, stops, brake, automatic fault reset |
 //! | `feedback` | values reported by the drive |
 //! | `supervision` | supervision of these values; final limits of the set-point |
@@ -38,6 +39,7 @@ mod control_law;
 mod feedback;
 mod home;
 mod io;
+mod lead;
 mod lost_frames;
 mod mode_switch;
 mod plan;
@@ -48,6 +50,7 @@ mod supervision;
 pub use command::Command;
 pub use config::{AxisConfig, ConfigError};
 pub use io::{Inputs, Outputs};
+pub use lead::Losses;
 
 use config::ControlledQuantity;
 use control_law::LoopState;
@@ -123,6 +126,8 @@ pub struct Axis {
     interrupted: bool,
     /// External set-point of this cycle.
     external_setpoint: Option<Motion>,
+    /// True if it is that of a leader.
+    led: bool,
     /// Torque feed-forward of this cycle from outside, percent of rated torque.
     torque_feedforward: f64,
     fault: Option<DriveFault>,
@@ -173,6 +178,7 @@ impl Axis {
             unfollowed_cycles: 0,
             interrupted: false,
             external_setpoint: None,
+            led: false,
             torque_feedforward: 0.0,
             fault: None,
             trip: None,
@@ -292,6 +298,7 @@ impl Axis {
         }
         self.settle_brake();
         self.external_setpoint = None;
+        self.led = false;
         self.previous_target = sent;
         self.update_settling_times(dt_s);
         let outputs = self.outputs();

@@ -36,7 +36,9 @@ pub mod supervision;
 mod touch_probe;
 pub mod units;
 
-pub use axis::{Axis, AxisConfig, Command, ConfigError, Inputs, MAX_RATE, MIN_RATE, Outputs};
+pub use axis::{
+    Axis, AxisConfig, Command, ConfigError, Inputs, Losses, MAX_RATE, MIN_RATE, Outputs,
+};
 pub use cia402::{Controlword, HaltOption, Mode, Modes, QuickStopOption, State, Statusword};
 pub use homing::{Homing, HomingError};
 pub use limits::{LimitError, Limits};

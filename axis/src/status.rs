@@ -191,6 +191,14 @@ pub enum HomingStatus {
     Failed(HomingError),
 }
 
+impl HomingStatus {
+    /// True if home was not found.
+    #[must_use]
+    pub const fn is_failed(&self) -> bool {
+        matches!(self, Self::Failed(_))
+    }
+}
+
 /// A fault reported by the drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DriveFault {
@@ -263,6 +271,28 @@ pub enum Trip {
         /// The limit.
         limit: f64,
     },
+    /// The halves of a gantry are too far apart, or would be at rest.
+    #[error(
+        "the skew of the gantry is {skew:.4} and would be {at_rest:.4} at rest: its limit is {limit:.4}"
+    )]
+    Skew {
+        /// Second minus first half, without the offset at which they were coupled.
+        skew: f64,
+        /// The same after a stop of the half that moves.
+        at_rest: f64,
+        /// The limit.
+        limit: f64,
+    },
+    /// The halves of a gantry moved apart during homing.
+    #[error(
+        "homing has moved the halves of the gantry apart by {skew:.4}: the limit is {limit:.4}"
+    )]
+    HomingSkew {
+        /// Way of the second half minus that of the first, since the start of homing.
+        skew: f64,
+        /// The limit.
+        limit: f64,
+    },
     /// The emergency stop was commanded.
     #[error("emergency stop")]
     EmergencyStop,
@@ -306,6 +336,15 @@ pub enum CommandError {
     /// The bus is not in Op.
     #[error("the bus is not in Op yet")]
     NotInOp,
+    /// The axis is the second half of a coupled gantry.
+    #[error("the axis is the second half of a gantry: command the first half")]
+    SecondHalf,
+    /// The axis is the first half of a gantry that is not coupled yet.
+    #[error("the gantry is not coupled: both halves must be enabled, at rest and square")]
+    NotCoupled,
+    /// A coupled gantry does not support the command.
+    #[error("the axis is part of a coupled gantry, which stays in CSP; decouple it first")]
+    Coupled,
     /// The axis follows a gear, stream or other source.
     #[error("the axis follows something else; stop it first")]
     Following,

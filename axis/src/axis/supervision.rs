@@ -327,7 +327,8 @@ impl Axis {
                     + (coasting.abs() + before.position.abs()) * POSITION_EPSILON;
                 // A motion taken over too near to the end of the range passes the end while
                 // braking.
-                let [low, high] = limits.position.map_or(UNBOUNDED_RANGE, |[low, high]| {
+                let range = limits.position.filter(|_| !self.led);
+                let [low, high] = range.map_or(UNBOUNDED_RANGE, |[low, high]| {
                     [
                         low.min(before.position).min(coasting + change - rounded),
                         high.max(before.position).max(coasting - change + rounded),
