@@ -308,6 +308,7 @@ fn programs_of_every_kind_allocate_nothing() {
     for file in [
         "together.toml",
         "probe.toml",
+        "gantry.toml",
         "profiles.toml",
         "loops.toml",
         "program.toml",

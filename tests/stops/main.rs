@@ -7,6 +7,7 @@ mod bus_faults;
 mod causes;
 mod exchange;
 mod failures;
+mod gantry;
 mod groups;
 mod limits;
 mod optional;

@@ -447,6 +447,9 @@ fn trip(trip: &Trip) -> &'static str {
         Trip::NotStopped { .. } => {
             "check the drive's quick stop (0x605A, 0x6085), its torque limit and the load; `stop_timeout` sets how long a stop may take"
         }
+        Trip::Skew { .. } | Trip::HomingSkew { .. } => {
+            "look for what holds one half of the gantry; decouple the halves to move them alone"
+        }
         Trip::ModeLost { .. } => "another tool changes the drive's mode: disconnect it",
     }
 }

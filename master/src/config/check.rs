@@ -10,6 +10,7 @@ use super::copy::{self, OutputWriter};
 use super::device::{self, CheckedDevice, EsiFiles};
 use super::duration::show;
 use super::fields::KeyExt;
+use super::gantry;
 use super::optional::OptionalPlaces;
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawBus, RawDevice, RawMachine};
@@ -57,6 +58,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
     if checked.iter().all(|device| position(device).is_some()) {
         checked.sort_by_key(position);
     }
+    let gantries = gantry::check(&raw.gantries, &mut checked, p);
     // Without a name, a device is invalid, and nothing refers to it.
     let named: Vec<_> = checked
         .iter()
@@ -91,6 +93,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         axes: &axes,
         folder,
         cycle_s,
+        gantries: &gantries,
     };
     let names = (raw.signals, raw.variables, raw.program, raw.sim);
     let program = steps::check(
@@ -131,6 +134,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
             axis.brake_output = Some(brake.output);
         }
     }
+    gantry::check_groups(&gantries, &axes, &program.stop, p);
     let devices: IndexVec<_, _> = devices.into();
     connections.check(&devices, p);
     optional.check(&devices, &program, p);
@@ -144,6 +148,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         bus: bus?,
         devices,
         axes: axes.into(),
+        gantries: gantries.iter().map(|gantry| gantry.config).collect(),
         steps: program.steps,
         inputs: program.inputs,
         outputs: program.outputs,

@@ -21,6 +21,7 @@
 //! | `sim.rs` | settings of the simulated bus: connections, clocks |
 //! | `travel.rs` | switches and ends along a simulated axis |
 //! | `units.rs` | names of position units |
+//! | `gantry.rs` | two axes that move as one |
 //! | `gateway.rs` | the CAN network behind a gateway, its nodes and their axes |
 //! | `steps.rs` | checks of the program; `[stop]` in `steps/stop.rs` |
 //! | `program.rs` | the program, and its steps as text |
@@ -44,6 +45,7 @@ mod drive_units;
 pub mod duration;
 #[macro_use]
 mod fields;
+mod gantry;
 mod gateway;
 mod locator;
 mod optional;
@@ -99,6 +101,7 @@ use crate::parameters::kept::KeptParameters;
 pub use crate::rt::config::{Bounds, Condition, ExchangeMode, GroupStopScope};
 use crate::rt::config::{GroupConfig, RtConfig};
 pub use crate::rt::controller::{AxisRef, InputRef, OutputRef};
+use crate::rt::gantry::GantryConfig;
 use crate::rt::image::{OpOnly, ProcessData};
 pub use crate::rt::overrides::{OverrideConfig, OverrideInput};
 pub use crate::rt::spin::Spin;
@@ -120,6 +123,7 @@ pub struct Machine {
     pub devices: IndexVec<DeviceIndex, DeviceConfig>,
     /// The axes, device by device.
     pub axes: IndexVec<AxisIndex, AxisSetup>,
+    pub gantries: Vec<GantryConfig>,
     pub steps: Vec<Step>,
     /// The signals that the steps read; `outputs` are those they set.
     pub inputs: Vec<Signal>,
@@ -400,6 +404,7 @@ impl Machine {
             bus_lost: stop.bus_lost,
             emergency: stop.emergency.clone(),
             overrides: self.overrides.clone(),
+            gantries: self.gantries.clone(),
             copies: self.copies.iter().map(CopySetup::rt).collect(),
             repeats: device::repeats(&self.devices),
         }

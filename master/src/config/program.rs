@@ -42,6 +42,11 @@ pub enum Action {
     Home {
         axes: Vec<AxisIndex>,
     },
+    /// Couple the halves of gantries, by their first halves, or decouple them.
+    Couple {
+        axes: Vec<AxisIndex>,
+        coupled: bool,
+    },
     /// Decelerate and hold position.
     Stop {
         axes: Vec<AxisIndex>,
@@ -200,6 +205,7 @@ impl Action {
             | Self::Disable { axes }
             | Self::Reset { axes }
             | Self::Home { axes }
+            | Self::Couple { axes, .. }
             | Self::Stop { axes } => axes.clone(),
             Self::Move { targets, .. }
             | Self::Line { targets, .. }

@@ -10,6 +10,7 @@ use toml::Spanned;
 mod condition;
 mod endings;
 mod follow;
+mod gantries;
 mod modes;
 mod number;
 mod overrides;
@@ -19,6 +20,7 @@ mod stop;
 mod target;
 
 use super::fields::{Key, KeyExt};
+use super::gantry::CheckedGantry;
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{
     Levels, NamedValues, RawAction, RawAxes, RawNumber, RawOverride, RawProgram, RawSimulation,
@@ -29,6 +31,7 @@ use super::{
     Action, AxisSetup, DeviceConfig, NamedSignal, NumberPlace, OverrideConfig, ProgramInputs,
     Signal, Step, StopSetup, SwitchedInput, TableFile, Variable, VariableUse,
 };
+use crate::rt::gantry::GantryConfig;
 use ecaxis_axis::Mode;
 use target::TargetKind;
 
@@ -71,6 +74,7 @@ pub(crate) struct Resolved<'c> {
     /// The base of relative file names.
     pub folder: &'c Path,
     pub cycle_s: f64,
+    pub gantries: &'c [CheckedGantry],
 }
 
 /// The steps with their signals.
@@ -110,6 +114,7 @@ pub(crate) fn check(
         axes: known.axes,
         folder: known.folder,
         cycle_s: known.cycle_s,
+        gantries: known.gantries.iter().map(|gantry| gantry.config).collect(),
         tables: Vec::new(),
         inputs: Vec::new(),
         outputs: Vec::new(),
@@ -127,7 +132,8 @@ pub(crate) fn check(
     };
     checker.name_signals(signals, p);
     checker.name_variables(variables, p);
-    let steps = checker.all(steps, "", p);
+    let mut steps = checker.all(steps, "", p);
+    checker.join_halves(&mut steps, p);
     // After an invalid step, the state of the axes is unknown.
     if p.count() == before {
         checker.check_endings(&steps, &BTreeSet::new(), p);
@@ -163,6 +169,7 @@ struct ProgramChecker<'c> {
     axes: &'c IndexVec<AxisIndex, ResolvedAxis<'c>>,
     folder: &'c Path,
     cycle_s: f64,
+    gantries: Vec<GantryConfig>,
     tables: Vec<TableFile>,
     inputs: Vec<Signal>,
     outputs: Vec<Signal>,
@@ -247,6 +254,7 @@ impl ProgramChecker<'_> {
                 axes: self.axes(axes, p)?,
             },
             RawAction::Home(axes) => self.home(axes, &span, p)?,
+            RawAction::Couple { axes, coupled } => self.couple(axes, coupled, p)?,
             RawAction::Stop(axes) => Action::Stop {
                 axes: self.steady_axes(axes, p)?,
             },

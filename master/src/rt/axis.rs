@@ -3,6 +3,7 @@
 use ecaxis_axis::{Axis, AxisStatus, Command, CommandError, Inputs, Outputs};
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex};
 
+use super::gantry::Leader;
 use super::gateway::NodePlace;
 use super::image::{AxisBits, SignalBits};
 use super::overrides::Rates;
@@ -38,6 +39,8 @@ pub struct RtAxis {
     pub(super) acted: bool,
     /// The override of this cycle.
     pub(super) rates: Rates,
+    /// The first half of the gantry whose second half the axis is, while they are coupled.
+    pub(super) leader: Option<Leader>,
 }
 
 impl RtAxis {
@@ -60,6 +63,7 @@ impl RtAxis {
             ordered: false,
             acted: false,
             rates: Rates::WHOLE,
+            leader: None,
         }
     }
 

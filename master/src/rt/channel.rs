@@ -40,6 +40,11 @@ pub enum RtCommand {
         output: OutputRef,
         value: f64,
     },
+    /// Couples the halves of a gantry, or decouples them.
+    Couple {
+        gantry: usize,
+        coupled: bool,
+    },
     /// Sets the override of the machine (the first group) or of a group.
     Override {
         group: GroupIndex,

@@ -4,6 +4,7 @@ use ecaxis_axis::StopMethod;
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 
 use super::controller::InputRef;
+use super::gantry::GantryConfig;
 use super::image::ProcessData;
 use super::overrides::OverrideConfig;
 use super::spin::Spin;
@@ -29,6 +30,7 @@ pub struct RtConfig {
     /// The conditions for an emergency stop; one is enough.
     pub emergency: Vec<Condition>,
     pub overrides: OverrideConfig,
+    pub gantries: Vec<GantryConfig>,
     /// Inputs that are copied to outputs in every cycle.
     pub copies: Vec<ProcessDataCopy>,
     /// Outputs that repeat other outputs of their device.

@@ -6,6 +6,7 @@ use ecaxis_ecat::index::{AxisIndex, GroupIndex, IndexVec};
 use super::axis::RtAxis;
 use super::bus_monitor::StopCause;
 use super::cycle::Signals;
+use super::gantry::{self, Gantry};
 use super::reaction_group::{ReactionGroup, check_permitted};
 
 /// A reference to an axis of a machine.
@@ -49,6 +50,7 @@ pub struct CycleContext<'a> {
     pub(super) fresh: bool,
     pub(super) guarded: bool,
     pub(super) axes: &'a mut IndexVec<AxisIndex, RtAxis>,
+    pub(super) gantries: &'a mut [Gantry],
     pub(super) groups: &'a mut IndexVec<GroupIndex, ReactionGroup>,
     pub(super) inputs: &'a [f64],
     pub(super) signals: &'a Signals,
@@ -111,12 +113,11 @@ impl CycleContext<'_> {
     /// # Errors
     /// The reason for the rejection. A rejected command changes nothing.
     pub fn command(&mut self, axis: AxisRef, command: Command) -> Result<(), CommandError> {
-        let slot = &mut self.axes[axis.0];
-        check_permitted(self.groups, slot.group, command)?;
+        check_permitted(self.groups, self.axes[axis.0].group, command)?;
         if !self.guarded && command == Command::Enable {
             return Err(CommandError::NotInOp);
         }
-        slot.command(command)
+        gantry::command(self.axes, self.gantries, axis.0, command)
     }
 
     /// Sets the axis' set-point position for this cycle. Call it in every cycle; otherwise the axis
@@ -131,6 +132,7 @@ impl CycleContext<'_> {
         if self.stopped(axis).is_some() {
             return Err(CommandError::GroupStopped);
         }
+        gantry::check_motion(self.gantries, axis.0)?;
         self.axes[axis.0].axis.set_point(position)
     }
 

@@ -13,6 +13,7 @@ use super::controller::{self, Controller};
 use super::event_log::LogEntryKind;
 use super::exchange::{CycleResult, DeviceAnswer, Exchange, SubDeviceDiagnostics, Window};
 use super::flight_recorder::{self, FlightRecorder};
+use super::gantry::Gantry;
 use super::gateway::{Gateway, NodeState};
 use super::heartbeat;
 use super::image::SignalBits;
@@ -53,6 +54,7 @@ pub struct Engine {
     exchange: Exchange,
     axes: IndexVec<AxisIndex, RtAxis>,
     gateways: Box<[Gateway]>,
+    gantries: Box<[Gantry]>,
     /// The first group is the machine's: all axes without a group.
     groups: IndexVec<GroupIndex, ReactionGroup>,
     overrides: Overrides,
@@ -166,6 +168,7 @@ impl Engine {
             port: parts.port,
             axes: parts.axes,
             gateways: parts.gateways,
+            gantries: config.gantries.iter().copied().map(Gantry::new).collect(),
             groups: config
                 .groups
                 .iter()
@@ -392,6 +395,7 @@ impl Engine {
             fresh: self.answer.inputs_fresh,
             guarded: self.guarding,
             axes: &mut self.axes,
+            gantries: &mut self.gantries,
             groups: &mut self.groups,
             inputs: &self.inputs,
             signals: &self.signals,
@@ -429,6 +433,9 @@ impl Engine {
         snapshot.al_status = self.answer.al_status;
         for (to, slot) in snapshot.axes.iter_mut().zip(&self.axes) {
             *to = slot.axis.status();
+        }
+        for gantry in &self.gantries {
+            gantry.publish(&mut snapshot.axes);
         }
         for (to, slot) in snapshot.generators.iter_mut().zip(&self.axes) {
             *to = slot.generator.state();

@@ -8,7 +8,10 @@
 //! limit in every cycle, as it is and as it will be when the faster half has stopped.
 
 use ecaxis_axis::setpoint::{Goal, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint};
-use ecaxis_axis::{Axis, AxisStatus, Command, CommandError, HomingStatus, Mode, StopMethod, Trip};
+use ecaxis_axis::{
+    Axis, AxisConfig, AxisStatus, Command, CommandError, HomingError, HomingStatus, Mode,
+    StopMethod, Trip,
+};
 use ecaxis_ecat::index::{AxisIndex, IndexVec};
 
 use super::axis::RtAxis;
@@ -43,7 +46,10 @@ enum Coupling {
     /// Couples when both halves are ready and at rest.
     Pending,
     /// The drives search home. `skew` is the difference of the ways so far.
-    Homing { halves: [HomingHalf; 2], skew: f64 },
+    Homing {
+        halves: [HomingHalf; 2],
+        skew: f64,
+    },
     /// The offset is reduced to 0, or stops on the way.
     Squaring(JerkLimited),
     Coupled,
@@ -82,8 +88,9 @@ pub struct Gantry {
 /// The part of the limits with which a gantry is squared.
 const SQUARING: f64 = 0.1;
 
-/// Rounding of a difference of positions.
-const ROUNDING: f64 = 1e-9;
+/// The part of the limit that the skew at rest may reach before both halves stop. The rest is for
+/// drives that overshoot the end of a stop.
+const AT_REST: f64 = 0.9;
 
 impl Gantry {
     #[must_use]
@@ -112,8 +119,9 @@ impl Gantry {
     ) -> Result<(), CommandError> {
         let held = |slot: &RtAxis| {
             let status = slot.axis.status();
-            let moves = status.moving || matches!(status.homing, HomingStatus::Running);
-            moves.then_some(CommandError::StillMoving {
+            let stands = status.target_velocity == 0.0 && !status.moving;
+            let homes = matches!(status.homing, HomingStatus::Running);
+            (!stands || homes).then_some(CommandError::StillMoving {
                 velocity: status.target_velocity,
             })
         };
@@ -339,8 +347,9 @@ impl Gantry {
         let limit = self.config.max_skew;
         let skew = b.position - a.position - self.square;
         let parting = b.velocity - a.velocity;
-        let at_rest = skew + stopping_way(&first.axis, parting, dt_s);
-        if skew.abs().max(at_rest.abs()) <= limit * (1.0 + ROUNDING) {
+        let at_rest = skew + stopping_way(first.axis.config(), parting, dt_s);
+        let parts = at_rest.abs() > limit * AT_REST && at_rest.abs() > skew.abs();
+        if skew.abs() <= limit && !parts {
             return;
         }
         let cause = if a.following_error.abs() > b.following_error.abs() {
@@ -379,12 +388,19 @@ impl Gantry {
             _ => true,
         };
         status.ready &= !busy && second.ready;
-        status.moving |= second.moving || matches!(self.coupling, Coupling::Squaring(_));
-        status.in_target &= !status.moving && second.in_target;
+        status.moving |= matches!(self.coupling, Coupling::Squaring(_));
+        // A second half is not in a target of its own while the gantry has a velocity.
+        status.in_target &= !status.moving;
+        status.in_target &= status.target_velocity != 0.0 || second.in_target;
         status.at_rest &= second.at_rest;
         status.homed &= second.homed;
+        // The other half is aborted as a consequence.
+        let cause = |homing: &HomingStatus| {
+            homing.is_failed() && *homing != HomingStatus::Failed(HomingError::Aborted)
+        };
         let both = [status.homing, second.homing];
-        status.homing = match both.into_iter().find(|homing| homing.is_failed()) {
+        let failed = both.into_iter().find(cause);
+        status.homing = match failed.or(both.into_iter().find(HomingStatus::is_failed)) {
             Some(failed) => failed,
             None if status.homing == HomingStatus::Attained && busy && status.enabled => {
                 HomingStatus::Running
@@ -406,7 +422,8 @@ pub(super) fn command(
     {
         return gantry.command(halves, axis, command);
     }
-    axes.get_mut(axis).map_or(Ok(()), |slot| slot.command(command))
+    axes.get_mut(axis)
+        .map_or(Ok(()), |slot| slot.command(command))
 }
 
 /// Returns whether a half of a gantry may start a motion of its own. RT: O(gantries).
@@ -461,10 +478,28 @@ fn stop_squaring(plan: &mut JerkLimited, offset: Motion, limits: MotionLimits) {
     }
 }
 
+/// Returns the highest velocity from which one half stops before the skew reaches its limit, if the
+/// other half is blocked.
+#[must_use]
+pub fn safe_velocity(config: &AxisConfig, max_skew: f64, dt_s: f64) -> f64 {
+    let (mut low, mut high) = (0.0, config.limits.velocity);
+    if stopping_way(config, high, dt_s) <= max_skew * AT_REST {
+        return high;
+    }
+    for _ in 0..60 {
+        let middle = f64::midpoint(low, high);
+        if stopping_way(config, middle, dt_s) <= max_skew * AT_REST {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    low
+}
+
 /// Returns the way by which a relative velocity still changes the skew: until its feedback has an
 /// effect, and until a stop within the limits has ended.
-fn stopping_way(axis: &Axis, velocity: f64, dt_s: f64) -> f64 {
-    let config = axis.config();
+fn stopping_way(config: &AxisConfig, velocity: f64, dt_s: f64) -> f64 {
     let MotionLimits {
         acceleration, jerk, ..
     } = config.limits.motion();
@@ -476,7 +511,7 @@ fn stopping_way(axis: &Axis, velocity: f64, dt_s: f64) -> f64 {
     } else {
         2.0 * (speed / jerk).sqrt()
     };
-    velocity * (time / 2.0 + config.dead_time_s + dt_s)
+    velocity * (time / 2.0 + config.dead_time_s + 2.0 * dt_s)
 }
 
 /// Returns the way of a half since the last report. The drive sets its position at home: a change
@@ -495,7 +530,3 @@ fn homing_way(half: &mut HomingHalf, status: &AxisStatus, axis: &Axis, dt_s: f64
     };
     if way.abs() <= possible { way } else { 0.0 }
 }
-
-#[cfg(test)]
-#[path = "gantry_tests.rs"]
-mod tests;

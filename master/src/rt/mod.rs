@@ -15,6 +15,7 @@
 //! - [`flight_recorder`]: the state of the last cycles;
 //! - [`samples`]: a row of values for every cycle, for other threads and processes;
 //! - [`heartbeat`]: detects a dead supervisor thread;
+//! - [`gantry`]: two axes that move as one;
 //! - [`channel`]: the queues to and from the other threads;
 //! - [`controller`]: user code in the cycle;
 //! - [`cycle`]: one cycle, from wake-up to publishing;
@@ -40,6 +41,7 @@ pub mod cycle;
 pub mod event_log;
 pub mod exchange;
 pub mod flight_recorder;
+pub mod gantry;
 pub mod gateway;
 pub mod heartbeat;
 pub mod image;

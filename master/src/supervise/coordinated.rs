@@ -228,10 +228,9 @@ impl Turn<'_, '_> {
                 return Ok(false);
             }
             let Some(axis) = late else { return Ok(true) };
-            let status = &snapshot.axes[axis];
-            let target = status.target_position;
+            let target = snapshot.axes[axis].target_position;
             if settling.time_limit_reached() {
-                return Err(this.not_reached(step, axis, TargetKind::Position, target, status));
+                return Err(this.not_reached(step, axis, TargetKind::Position, target, snapshot));
             }
             Ok(false)
         })

@@ -403,6 +403,18 @@ impl Turn<'_, '_> {
                 self.send_all(&commands.collect::<Vec<_>>()).await;
                 self.taken(start).await
             }
+            Action::Couple { axes, coupled } => {
+                let gantries = self.machine.gantries.iter().enumerate();
+                let named = gantries.filter(|(_, gantry)| axes.contains(&gantry.axes[0]));
+                let commands = named.map(|(gantry, _)| RtCommand::Couple {
+                    gantry,
+                    coupled: *coupled,
+                });
+                let commands: Vec<_> = commands.collect();
+                self.send_all(&commands).await;
+                let done = |s: &Snapshot, axis: AxisIndex| s.axes[axis].ready || !coupled;
+                self.until(step, start, done, axes).await
+            }
             // The report of the step has the text.
             Action::Message { .. } => Ok(()),
             Action::Alarm { text } => {

@@ -191,6 +191,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
             bus_lost: StopMethod::QuickStop,
             emergency: Vec::new(),
             overrides: config::OverrideConfig::default(),
+            gantries: Vec::new(),
             copies: Vec::new(),
             repeats: Vec::new(),
         },

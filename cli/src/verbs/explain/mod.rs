@@ -11,6 +11,7 @@ use ecaxis_master::config::{
 };
 use ecaxis_master::link::SocketKind;
 use ecaxis_master::rt::exchange::MAX_POLL_DATAGRAM;
+use ecaxis_master::rt::gantry::safe_velocity;
 use ecaxis_master::rt::image::{self, Access, ImagePlan};
 use ecaxis_master::rt::spin::Spin;
 use ecaxis_master::text::pluralize;
@@ -72,6 +73,7 @@ fn explain(machine: &Machine, only: Option<DeviceIndex>) -> Document {
         device(machine, index, &mut out);
     }
     wire(machine, &mut out);
+    gantries(machine, &mut out);
     copies(machine, &mut out);
     stop::stop(machine, &mut out);
     signals(machine, &mut out);
@@ -400,6 +402,27 @@ fn commands(plan: &ImagePlan) -> String {
         }
     }
     text
+}
+
+fn gantries(machine: &Machine, out: &mut Document) {
+    if machine.gantries.is_empty() {
+        return;
+    }
+    let dt_s = machine.bus.cycle_ns as f64 * 1e-9;
+    let mut table = Table::new("first|second|skew|while homing|a blocked half is safe up to");
+    for gantry in &machine.gantries {
+        let [first, second] = gantry.axes.map(|axis| &machine.axes[axis]);
+        let safe = safe_velocity(&first.config, gantry.max_skew, dt_s);
+        let unit = &first.unit;
+        table.row(cells![
+            first.name,
+            second.name,
+            format!("{} {unit}", gantry.max_skew),
+            format!("{} {unit}", gantry.max_homing_skew),
+            format!("{safe:.1} {unit}/s")
+        ]);
+    }
+    out.section("gantries", table);
 }
 
 fn copies(machine: &Machine, out: &mut Document) {

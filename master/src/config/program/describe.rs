@@ -37,6 +37,15 @@ impl Machine {
             Action::Disable { axes } => format!("disable {}", self.names(axes)),
             Action::Reset { axes } => format!("reset the faults of {}", self.names(axes)),
             Action::Home { axes } => format!("find home with {}", self.names(axes)),
+            Action::Couple { axes, coupled } => {
+                let verb = if *coupled { "couple" } else { "decouple" };
+                let pairs = self.gantries.iter().filter(|g| axes.contains(&g.axes[0]));
+                let pairs = pairs.map(|gantry| {
+                    let [first, second] = gantry.axes.map(|axis| self.names(&[axis]));
+                    format!("{first} and {second}")
+                });
+                format!("{verb} {}", pairs.collect::<Vec<_>>().join(", "))
+            }
             Action::Stop { axes } => format!("stop {}", self.names(axes)),
             Action::Move {
                 relative,

@@ -35,6 +35,8 @@ table! { "the machine file",
         bus: RawBus = "[bus]\ncycle = \"1ms\"",
         /// A SubDevice: position, ESI file, mode, process data, start-up SDOs
         devices: Vec<RawDevice> as "device" = "[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"",
+        /// Two axes that move as one
+        gantries: Vec<RawGantry> as "gantry",
         /// Inputs of one device that become outputs of another
         copies: Vec<RawCopy> as "copy",
         /// How the machine stops
@@ -409,6 +411,17 @@ table! { "[device.sim]",
         state_change: Key<Ns> [0..=60 * S],
         /// Switches and ends along a simulated axis (table; default no switches or ends)
         track: Option<RawTrack>,
+    }
+}
+
+table! { "[[gantry]]",
+    table RawGantry {
+        /// First and second half; the program names the first (two names)
+        axes: Option<Names> = "[\"x1\", \"x2\"]",
+        /// Largest difference of their positions (unit)
+        max_skew: Key<f64> = "0.5",
+        /// Largest difference of their ways during homing (unit; default `max_skew`)
+        max_homing_skew: Key<f64>,
     }
 }
 

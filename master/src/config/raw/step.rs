@@ -37,6 +37,10 @@ pub(crate) enum RawAction {
     Reset(RawAxes),
     Stop(RawAxes),
     Home(RawAxes),
+    Couple {
+        axes: RawAxes,
+        coupled: bool,
+    },
     Move {
         relative: bool,
         targets: Named<RawNumber>,
@@ -162,12 +166,14 @@ table! { "a probe",
 /// The verbs, each with an example and the keys that go with it. The key of a step that is a verb
 /// defines the action.
 #[rustfmt::skip] // one row per verb
-const VERBS: [(&str, &str, &[&str]); 30] = [
+const VERBS: [(&str, &str, &[&str]); 32] = [
     ("enable", "enable = [\"x\"]", &[]),
     ("disable", "disable = true", &[]),
     ("reset", "reset = [\"x\"]", &[]),
     ("stop", "stop = [\"x\"]", &[]),
     ("home", "home = [\"x\"]", &[]),
+    ("couple", "couple = [\"x1\"]", &[]),
+    ("decouple", "decouple = [\"x1\"]", &[]),
     ("move", "move = { x = 50.0 }", &["speed", "ramp", "arrive"]),
     ("move_by", "move_by = { x = -5.0 }", &["speed", "ramp", "arrive"]),
     ("probe", "probe = { x = { to = 50.0, input = 1 } }", &["speed", "ramp"]),
@@ -307,6 +313,10 @@ impl<'d> Step<'_, 'd> {
             "reset" => RawAction::Reset(axes(value, verb, p)?),
             "stop" => RawAction::Stop(axes(value, verb, p)?),
             "home" => RawAction::Home(axes(value, verb, p)?),
+            "couple" | "decouple" => RawAction::Couple {
+                axes: axes(value, verb, p)?,
+                coupled: verb == "couple",
+            },
             "move" | "move_by" => {
                 let arrive = self.table.get("arrive");
                 let together = arrive.and_then(|v| ARRIVALS.read(v, "arrive", p));

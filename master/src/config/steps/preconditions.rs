@@ -291,6 +291,7 @@ impl ProgramState<'_, '_, '_, '_> {
             | Action::Dwell { .. }
             | Action::Wait { .. }
             | Action::Set { .. }
+            | Action::Couple { .. }
             | Action::Override(_)
             | Action::Assign { .. }
             | Action::Message { .. }

@@ -7,6 +7,7 @@ use super::{Engine, Nanos};
 use crate::rt::axis::RtAxis;
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::exchange::DeviceAnswer;
+use crate::rt::gantry;
 use crate::rt::gateway::Gateway;
 use crate::rt::setpoint_generator;
 
@@ -64,6 +65,7 @@ impl Engine {
     /// same cycle.
     pub(super) fn act(&mut self) {
         self.stop_missing_axes();
+        self.update_gantries();
         self.set_rates();
         // Gears form no loops, so every pass steps at least one axis.
         for _ in 0..self.axes.len() {
@@ -75,7 +77,9 @@ impl Engine {
                 if slot.acted {
                     continue;
                 }
-                let followed = slot.generator.master().and_then(|(m, _)| self.axes.get(m));
+                let followed = slot.generator.master().map(|(master, _)| master);
+                let followed = followed.or(slot.leader.map(|leader| leader.axis));
+                let followed = followed.and_then(|master| self.axes.get(master));
                 if followed.is_some_and(|master| !master.acted) {
                     waiting = true;
                 } else {
@@ -95,12 +99,28 @@ impl Engine {
         }
     }
 
+    /// Advances every gantry. Their second halves follow in this cycle.
+    fn update_gantries(&mut self) {
+        let cycle_ns = self.config.cycle_ns;
+        for gantry in &mut self.gantries {
+            if let Some(halves) = gantry::halves(&mut self.axes, gantry.axes()) {
+                let dt_s = halves[0].dt_s(cycle_ns);
+                gantry.update(halves, dt_s);
+            }
+        }
+    }
+
     /// Steps one axis. A cause that must stop its group is stored in the group.
     fn step_axis(&mut self, index: AxisIndex) {
         let master = self.axes.get(index).and_then(|slot| {
             let (master, actual) = slot.generator.master()?;
             let status = self.axes.get(master)?.axis.status();
             setpoint_generator::master_motion(&status, actual)
+        });
+        let leader = self.axes.get(index).and_then(|slot| {
+            let leader = slot.leader?;
+            let first = self.axes.get(leader.axis)?.axis.status();
+            Some(leader.set_point(&first))
         });
         let Some(slot) = self.axes.get_mut(index) else {
             return;
@@ -113,6 +133,9 @@ impl Engine {
         let lost = slot
             .generator
             .advance(&mut slot.axis, &self.tables, master, slot.rates, dt_s);
+        if let Some(motion) = leader {
+            slot.axis.follow(motion);
+        }
         let outputs = slot.axis.act();
         slot.write(self.exchange.outputs_mut(), &outputs);
         let status = slot.axis.status();

@@ -9,6 +9,7 @@ use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::{COMMANDS_PER_CYCLE, Event, RtCommand};
 use crate::rt::exchange::SubDeviceDiagnostics;
 use crate::rt::flight_recorder::Trigger;
+use crate::rt::gantry;
 use crate::rt::gateway::Gateway;
 use crate::rt::reaction_group::{ActiveStop, ReactionGroup, check_permitted};
 use crate::rt::setpoint_generator::{self, GeneratorRequest};
@@ -31,11 +32,14 @@ impl Engine {
     fn take(&mut self, command: RtCommand) {
         match command {
             RtCommand::Axis { axis, command } => {
-                let Some(slot) = self.axes.get_mut(axis) else {
+                let Some(slot) = self.axes.get(axis) else {
                     return;
                 };
                 let admitted = check_permitted(&mut self.groups, slot.group, command);
-                if let Err(reason) = admitted.and_then(|()| slot.command(command)) {
+                let taken = admitted.and_then(|()| {
+                    gantry::command(&mut self.axes, &mut self.gantries, axis, command)
+                });
+                if let Err(reason) = taken {
                     // A stopping machine rejects motion. The sender receives the stop event
                     // instead.
                     if self.stopping().is_some() {
@@ -55,6 +59,7 @@ impl Engine {
                     signal.set(self.exchange.outputs_mut(), value);
                 }
             }
+            RtCommand::Couple { gantry, coupled } => self.couple(gantry, coupled),
             RtCommand::Override { group, factor } => self.overrides.set_factor(group, factor),
             RtCommand::Hold { group, held } => self.overrides.set_hold(group, held),
             RtCommand::StartBusMonitor => {
@@ -75,6 +80,24 @@ impl Engine {
                 }
             }
             RtCommand::Halt => self.halted = true,
+        }
+    }
+
+    fn couple(&mut self, gantry: usize, coupled: bool) {
+        let Some(gantry) = self.gantries.get_mut(gantry) else {
+            return;
+        };
+        let axes = gantry.axes();
+        let Some([first, second]) = gantry::halves(&mut self.axes, axes) else {
+            return;
+        };
+        if let Err(reason) = gantry.couple([first, second], coupled) {
+            let (cycle, axis) = (self.stats.counters.cycles, axes[0]);
+            self.report(Event::Refused {
+                cycle,
+                axis,
+                reason,
+            });
         }
     }
 
@@ -266,6 +289,10 @@ impl Engine {
             let stopped = |group: &ReactionGroup| group.stop().is_some();
             if self.groups.get(slot.group).is_some_and(stopped) {
                 slot.generator.refuse(CommandError::GroupStopped);
+                return;
+            }
+            if let Err(reason) = gantry::check_motion(&self.gantries, axis) {
+                slot.generator.refuse(reason);
                 return;
             }
             let status = slot.axis.status();

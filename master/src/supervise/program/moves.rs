@@ -109,7 +109,7 @@ impl Turn<'_, '_> {
                 return Ok(false);
             }
             if settling.time_limit_reached() {
-                return Err(this.not_reached(step, axis, aim, target, status(axis)));
+                return Err(this.not_reached(step, axis, aim, target, snapshot));
             }
             Ok(false)
         })
@@ -123,8 +123,10 @@ impl Turn<'_, '_> {
         axis: AxisIndex,
         aim: TargetKind,
         target: f64,
-        last: &AxisStatus,
+        snapshot: &Snapshot,
     ) -> Error {
+        let axis = self.later_half(axis, snapshot);
+        let last = &snapshot.axes[axis];
         let (target, actual, unit) = self.to_display_unit(axis, aim, target, last);
         Cause::NotReached {
             target,
@@ -133,6 +135,18 @@ impl Turn<'_, '_> {
         }
         .with_device(self.device_of(axis))
         .with_step(step)
+    }
+
+    /// Returns the half of the axis' gantry that is farther from its set-point.
+    fn later_half(&self, axis: AxisIndex, snapshot: &Snapshot) -> AxisIndex {
+        let error = |axis: AxisIndex| {
+            let status = &snapshot.axes[axis];
+            (status.target_position - status.position).abs()
+        };
+        let other = self.machine.other_half(axis);
+        other
+            .filter(|&other| error(other) > error(axis))
+            .unwrap_or(axis)
     }
 
     /// Converts a target and the reported value to the file's unit; positions of a modulo axis lie

@@ -86,7 +86,7 @@ impl Turn<'_, '_> {
                     return Err(this.not_probed(step, axis, target, &search));
                 }
             } else if settling.time_limit_reached() {
-                return Err(this.not_reached(step, axis, TargetKind::Position, target, status));
+                return Err(this.not_reached(step, axis, TargetKind::Position, target, snapshot));
             }
             Ok(false)
         })

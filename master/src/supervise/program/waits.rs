@@ -1,5 +1,6 @@
 //! Steps that wait for a condition: states, homing, inputs.
 
+use ecaxis_axis::HomingError;
 use ecaxis_axis::status::HomingStatus;
 use ecaxis_axis::{AxisStatus, Command, Mode};
 use ecaxis_ecat::index::AxisIndex;
@@ -99,6 +100,12 @@ impl Turn<'_, '_> {
                 let status = &snapshot.axes[axis];
                 homed &= match status.homing {
                     HomingStatus::Failed(error) => {
+                        // The first half shows the failure of the second.
+                        let other = this.machine.other_half(axis).filter(|&other| {
+                            let homing = snapshot.axes[other].homing;
+                            homing == status.homing && error != HomingError::Aborted
+                        });
+                        let axis = other.unwrap_or(axis);
                         return Err(Cause::NotHomed {
                             method: this.homing_method(axis),
                             error,

@@ -61,7 +61,7 @@ fn argument(verb: &str) -> Json {
         schema
     };
     match verb {
-        "enable" | "disable" | "reset" | "stop" | "home" => any_of([
+        "enable" | "disable" | "reset" | "stop" | "home" | "couple" | "decouple" => any_of([
             json!({ "enum": [true] }),
             String::schema(),
             json!({ "type": "array", "items": { "type": "string" }, "minItems": 1 }),
