@@ -118,6 +118,24 @@ fn estimates_are_within_5_percent_in_each_mode() {
     }
 }
 
+/// A load on an elastic shaft: its frequencies, and the inertia of both masses.
+#[test]
+fn the_resonance_of_two_masses_is_estimated_within_5_percent() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = machine(folder.path(), "");
+    let text = std::fs::read_to_string(&file).expect("the file");
+    let load =
+        "[device.sim]\nmotor = { inertia = 3e-5, load_inertia = 2.5e-5, antiresonance = 22.0 }\n";
+    std::fs::write(&file, text + load).expect("written");
+    let line = "t --sim --virtual --json --travel 60 --from 1 --to 60 --period 16s --amplitude 1";
+    let report = tune(&file, line).exits(0).json();
+    let found = &report["estimates"];
+    within(&found["motor"]["inertia"], 5.5e-5, 0.05, "inertia");
+    within(&found["antiresonance_hz"], 22.0, 0.05, "antiresonance");
+    let resonance = 22.0 * (5.5_f64 / 3.0).sqrt();
+    within(&found["resonance_hz"], resonance, 0.05, "resonance");
+}
+
 /// A proposed loop runs the axis that it was measured on.
 #[test]
 fn an_axis_moves_with_the_proposed_gains() {

@@ -3,7 +3,8 @@
 
 Simulated axes with known motors are tuned in CSP, CSV and CST. From the samples alone, SciPy fits inertia, friction and
 dead time to the time signals; NumPy computes the frequency response. Estimates of `tune` must be within 5 % of the motor
-and of these, responses equal, and the margins of its gains those of the open loop computed here. Run in an environment
+and of these, responses equal, and the margins of its gains those of the open loop computed here. An axis with a load on an elastic
+shaft has the frequencies of two masses in closed form, and SciPy finds them in the samples. Run in an environment
 with `requirements.txt` installed: `python tests/judges/tune.py`.
 """
 
@@ -29,8 +30,11 @@ AXES = {
     "t": ("cst", "velocity = 100.0, torque = 300.0", "--travel 60 --from 1 --to 100 --period 8s"),
 }
 
+# A load on an elastic shaft: kg·m² of motor and load, Hz with the motor held.
+MASSES = (3e-5, 2.5e-5, 22.0)
 
-def machine(folder):
+
+def machine(folder, motor=""):
     text = '[bus]\nnic = "sim"\ncycle = "1ms"\n'
     for position, (name, (mode, limits, _)) in enumerate(AXES.items()):
         text += f"""
@@ -45,6 +49,8 @@ encoder = 2000
 rated_torque = {RATED}
 torque_constant = {TORQUE_CONSTANT}
 limits = {{ {limits}, acceleration = 500.0 }}
+[device.sim]
+{motor}
 """
     path = folder / "m.toml"
     path.write_text(text)
@@ -155,6 +161,45 @@ def judge(report, program, file, name, folder):
         report.check(f"{mode}: margins as asked", phase > 47 and rise > 5.5, f"{phase}°, {rise} dB")
 
 
+def judge_resonance(report, program, folder):
+    motor, load, antiresonance = MASSES
+    resonance = antiresonance * np.sqrt(1 + load / motor)
+    keys = f"motor = {{ inertia = {motor}, load_inertia = {load}, antiresonance = {antiresonance} }}"
+    file, path = machine(folder, keys), folder / "elastic.csv"
+    line = [program, "tune", file, "t", "--sim", "--virtual", "--json", "--amplitude", "1", "--samples", path]
+    ran = subprocess.run([*map(str, line), *"--travel 60 --from 1 --to 60 --period 16s".split()], capture_output=True, text=True)
+    report.check("elastic: tuned", ran.returncode == 0, "" if ran.returncode == 0 else ran.stderr[-300:])
+    if ran.returncode:
+        return
+    said = json.loads(ran.stdout)
+    own = said["estimates"]
+    samples, period = read(path)
+    bins = np.round(np.array([line["hz"] for line in said["responses"][0]["lines"]]) * period * DT).astype(int)
+    hz = bins / (period * DT)
+    position, torque = (spectrum(samples[key], period, bins) for key in ("position", "torque"))
+    s = 2j * np.pi * hz
+
+    def error(x):
+        inertia, viscous, dip, peak, damping, delay, gain = x
+        swing = lambda f: (s / (2 * np.pi * f)) ** 2 + 2 * damping * s / (2 * np.pi * f) + 1
+        model = swing(dip) / swing(peak) / (inertia * s**2 + viscous * s) * np.exp(-s * delay * 1e-3)
+        model *= np.exp(gain)
+        difference = np.log(np.abs(model)) - np.log(np.abs(position / torque))
+        # The friction is not in the model: it bends the lowest lines.
+        return difference[hz > 5]
+
+    start = (0.3, 0.1, 0.8 * own["antiresonance_hz"], 1.2 * own["resonance_hz"], 0.05, 1.0, 0.0)
+    _, _, dip, peak, *_ = least_squares(error, start, loss="soft_l1").x
+    for name, value, exact, fitted in (
+        ("antiresonance", own["antiresonance_hz"], antiresonance, dip),
+        ("resonance", own["resonance_hz"], resonance, peak),
+    ):
+        report.check(f"elastic: {name} is that of two masses", abs(value / exact - 1) < 0.05, f"{value} for {exact}")
+        report.check(f"elastic: {name} is that of SciPy", abs(value / fitted - 1) < 0.05, f"{value} for {fitted}")
+    exact = (motor + load) * 2 * np.pi / RATED * 100
+    report.check("elastic: inertia is that of both masses", abs(own["inertia"] / exact - 1) < 0.05, f"{own['inertia']} for {exact}")
+
+
 def main():
     program, report = rig.binary(), Report()
     with tempfile.TemporaryDirectory() as folder:
@@ -163,6 +208,7 @@ def main():
         file = machine(folder)
         for name in AXES:
             judge(report, program, file, name, folder)
+        judge_resonance(report, program, folder)
     return report.finish()
 
 

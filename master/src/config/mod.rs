@@ -19,6 +19,7 @@
 //! | `drive_units.rs` | the units that the drive itself reports |
 //! | `drive_limits.rs` | the limits that the drive itself allows |
 //! | `sim.rs` | settings of the simulated bus: connections, clocks |
+//! | `sim_motor.rs` | the motor of a simulated axis |
 //! | `travel.rs` | switches and ends along a simulated axis |
 //! | `units.rs` | names of position units |
 //! | `gantry.rs` | two axes that move as one |
@@ -57,6 +58,7 @@ mod sdo;
 mod signal;
 pub mod sim;
 mod sim_input;
+mod sim_motor;
 mod startup;
 pub mod state_timeouts;
 pub(crate) mod steps;

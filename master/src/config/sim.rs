@@ -7,6 +7,7 @@ use ecaxis_sim::{Medium, PortRequest, Topology, TopologyError};
 use super::fields::KeyExt;
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawDevice, RawSim};
+use super::sim_motor::{self, MotorSetup};
 use super::travel::{self, TrackSetup};
 use super::{AxisSetup, DeviceConfig, Locator};
 
@@ -33,6 +34,8 @@ pub struct SimSetup {
     pub gateway: Option<GatewayOptions>,
     /// The switches and ends along a drive's axis.
     pub track: TrackSetup,
+    /// The motor of a drive's axis.
+    pub motor: MotorSetup,
 }
 
 /// The maximum drift. Crystals are far better.
@@ -79,6 +82,10 @@ pub(crate) fn check(
             .unwrap_or(0),
         state_change_ns: raw.state_change.value(),
         gateway: None,
+        motor: raw
+            .motor
+            .map(|raw| sim_motor::check(&raw, axis.is_ok(), p))
+            .unwrap_or_default(),
         track: raw
             .track
             .and_then(|raw| travel::check(&raw, axis, p))

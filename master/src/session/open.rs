@@ -315,6 +315,7 @@ fn sim_device(
             plants[0].initial_position = device.sim.track.start;
             plants[0].track = device.sim.track.track;
         }
+        device.sim.motor.apply(&mut plants[number]);
     }
     options.plant = plants.remove(0);
     options.further_plants = plants;

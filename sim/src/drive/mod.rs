@@ -45,7 +45,7 @@ mod travel;
 
 pub(crate) use fault::{DeviceError, Emergency};
 pub use io::input;
-pub use plant::PlantParams;
+pub use plant::{ElasticLoad, PlantParams};
 pub use state::State;
 pub use travel::Track;
 

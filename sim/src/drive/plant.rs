@@ -11,6 +11,29 @@ pub(super) const CURRENT_STEP: f64 = 40e-6;
 /// The largest position in counts. Beyond it, an f64 cannot represent every integer.
 const FARTHEST: f64 = 9_007_199_254_740_992.0;
 
+/// A load on an elastic shaft: a second mass, so that the axis has a resonance.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ElasticLoad {
+    /// The inertia of the load, in kg·m².
+    pub inertia: f64,
+    /// The frequency with which the load swings while the motor is held, in Hz; at most
+    /// [`ElasticLoad::MAX_HZ`].
+    pub antiresonance_hz: f64,
+    /// The damping ratio of this swing.
+    pub damping: f64,
+}
+
+impl ElasticLoad {
+    /// The step of the current loop resolves no higher frequency.
+    pub const MAX_HZ: f64 = 1000.0;
+
+    /// Returns the frequency with which motor and load swing against each other, in Hz.
+    #[must_use]
+    pub fn resonance_hz(&self, motor_inertia: f64) -> f64 {
+        self.antiresonance_hz * (1.0 + self.inertia / motor_inertia).sqrt()
+    }
+}
+
 /// Motor, load and supply, in SI units. The default is a 70 W brushless motor of 45 mm with a load
 /// of about the rotor's inertia.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -19,8 +42,10 @@ pub struct PlantParams {
     pub counts_per_turn: u32,
     /// The value of 0x6064 at power-on, in counts.
     pub initial_position: i32,
-    /// The inertia of rotor and load, in kg·m².
+    /// The inertia of the rotor and of a rigid load, in kg·m².
     pub inertia: f64,
+    /// A load on an elastic shaft.
+    pub elastic: Option<ElasticLoad>,
     /// Viscous friction, in N·m·s/rad.
     pub viscous_friction: f64,
     /// Coulomb friction, static and sliding, in N·m.
@@ -56,6 +81,7 @@ impl Default for PlantParams {
             counts_per_turn: 2000,
             initial_position: 0,
             inertia: 3.6e-5,
+            elastic: None,
             viscous_friction: 2e-5,
             coulomb_friction: 4e-3,
             load_torque: 0.0,
@@ -84,6 +110,41 @@ impl PlantParams {
     }
 }
 
+/// The state of an elastic load.
+#[derive(Debug, Clone, Copy)]
+struct Elastic {
+    /// Stiffness of the shaft in N·m/rad, and its damping in N·m·s/rad.
+    stiffness: f64,
+    damping: f64,
+    /// The change of the load's speed per N·m in a current-loop step.
+    velocity_per_torque: f64,
+    /// The twist of the shaft in rad, and the speed of the load in rad/s.
+    twist: f64,
+    velocity: f64,
+}
+
+impl Elastic {
+    fn new(load: &ElasticLoad) -> Self {
+        let omega = TAU * load.antiresonance_hz.clamp(0.1, ElasticLoad::MAX_HZ);
+        let inertia = load.inertia.max(1e-9);
+        Self {
+            stiffness: omega * omega * inertia,
+            damping: 2.0 * load.damping.clamp(0.0, 1.0) * omega * inertia,
+            velocity_per_torque: CURRENT_STEP / inertia,
+            twist: 0.0,
+            velocity: 0.0,
+        }
+    }
+
+    /// Advances the load by one current-loop step. Returns the torque of the shaft on the motor.
+    fn turn(&mut self, motor: f64) -> f64 {
+        self.twist += (motor - self.velocity) * CURRENT_STEP;
+        let torque = self.stiffness * self.twist + self.damping * (motor - self.velocity);
+        self.velocity += torque * self.velocity_per_torque;
+        torque
+    }
+}
+
 #[derive(Debug, Clone)]
 pub(super) struct Plant {
     /// The encoder position in counts, with fraction.
@@ -99,6 +160,7 @@ pub(super) struct Plant {
     pub(super) coulomb: f64,
     pub(super) torque_constant: f64,
     counts_per_rad: f64,
+    elastic: Option<Elastic>,
     // Per current-loop step: decay factors of current and speed, and the gains per volt and per
     // N·m.
     pub(super) current_decay: f64,
@@ -139,6 +201,7 @@ impl Plant {
             coulomb: p.coulomb_friction,
             torque_constant: p.torque_constant,
             counts_per_rad: p.counts_per_rad(),
+            elastic: p.elastic.as_ref().map(Elastic::new),
             current_decay,
             current_per_volt,
             velocity_decay,
@@ -198,9 +261,16 @@ impl Plant {
         self.blocked = blocked;
     }
 
+    /// True if a batch of drives can calculate the motor: it turns, with a rigid load.
+    pub(super) fn is_simple(&self) -> bool {
+        !self.blocked && self.elastic.is_none()
+    }
+
     /// True if the shaft stands and stays at rest without current.
     pub(super) fn at_rest(&self) -> bool {
-        self.velocity == 0.0 && (self.blocked || self.load_torque.abs() <= self.coulomb)
+        // A load swings on.
+        let rigid = self.elastic.is_none() || self.blocked;
+        rigid && self.velocity == 0.0 && (self.blocked || self.load_torque.abs() <= self.coulomb)
     }
 
     /// Runs one current-loop step at this voltage.
@@ -229,7 +299,10 @@ impl Plant {
             self.velocity = 0.0;
             return;
         }
-        let torque = self.torque_constant * current - self.load_torque;
+        let mut torque = self.torque_constant * current - self.load_torque;
+        if let Some(load) = &mut self.elastic {
+            torque -= load.turn(self.velocity);
+        }
         let before = self.velocity;
         let free = before * self.velocity_decay + torque * self.velocity_per_torque;
         // Friction reduces the speed to zero; it never drives the shaft.

@@ -10,6 +10,7 @@ use super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Writte
 use super::gateway::{RawCan, RawNode};
 use super::problem::{Problems, Span};
 use super::schema::{self, Schema, any_of};
+use super::sim_motor::RawMotor;
 use super::subprograms::RawSub;
 use super::travel::RawTrack;
 use super::{ExchangeMode, GroupStopScope, MailboxSource, SocketKind, Spin, UnknownDeviceRule};
@@ -411,6 +412,8 @@ table! { "[device.sim]",
         state_change: Key<Ns> [0..=60 * S],
         /// Switches and ends along a simulated axis (table; default no switches or ends)
         track: Option<RawTrack>,
+        /// Motor and load of a simulated axis (table; default a motor of 70 W)
+        motor: Option<RawMotor>,
     }
 }
 

@@ -169,8 +169,8 @@ impl Controller {
     /// As [`Controller::turn`] for each drive. A batch is faster than one drive after the other.
     pub(super) fn turn_together<const N: usize>(mut together: [(&mut Self, &mut Plant); N]) {
         let wanted = together.each_ref().map(|(controller, plant)| {
-            let driven = !plant.blocked;
-            controller.wanted.filter(|_| driven)
+            let simple = plant.is_simple();
+            controller.wanted.filter(|_| simple)
         });
         if wanted.iter().all(Option::is_some) {
             batch::drive(&mut together, wanted.map(Option::unwrap_or_default));
