@@ -3,6 +3,7 @@
 
 use ecaxis_axis::status::HomingStatus;
 use ecaxis_axis::{AxisStatus, Command, HomingError, Mode};
+use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_master::config::Machine;
 use ecaxis_master::session::Options;
 use ecaxis_test_support::recordings::process_images;
@@ -338,4 +339,26 @@ fn an_impossible_homing_is_rejected_with_the_file() {
             .to_string();
         assert!(error.contains(expected), "{axis}: {error}");
     }
+}
+
+/// Homing, modes and probes add their objects to the process data of a file without `pdo` keys.
+#[test]
+fn a_file_without_pdo_keys_homes_probes_and_switches_modes() {
+    let text = "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n\
+        [[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"\nposition = 0\nmode = \"csp\"\n\
+        [device.axis]\nencoder = 2000\nlimits = { velocity = 20.0, acceleration = 500.0, position = [-50.0, 50.0] }\n\
+        homing = { method = 37 }\n[device.sim]\ntrack = { probe2 = [3.0, 4.0] }\n\
+        [[step]]\nhome = true\n[[step]]\nprobe = { x = { by = 10.0, input = 2 } }\n\
+        [[step]]\nrepeat = 2\nstep = [{ mode = { x = \"pp\" } }, { move = { x = 5.0 } }, { mode = { x = \"csp\" } }, { move = { x = 0.0 } }]\n\
+        [[step]]\nmode = { x = \"cst\" }\n[[step]]\ntorque = { x = 1.0 }\n";
+    let machine = machine(text);
+    let layout = &machine.devices[DeviceIndex(0)].selection.layout;
+    let added = [0x6060, 0x60b8, 0x6071, 0x6081, 0x6083, 0x6084];
+    assert!(
+        added
+            .iter()
+            .all(|index| layout.rx_field(*index, 0).is_some())
+    );
+    let summary = run_well(machine, virtual_time());
+    assert_eq!(summary.program_runs, 1);
 }

@@ -26,6 +26,7 @@ mod mailboxes;
 mod oddities;
 mod overrides;
 mod phase;
+mod position_outputs;
 mod probe;
 mod program;
 mod repeats;

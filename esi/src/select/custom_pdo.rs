@@ -65,6 +65,37 @@ impl PdoSelector<'_> {
         Ok(self.alongside(pdo, &mandatory))
     }
 
+    /// Returns the PDOs with further entries, which go to the first PDOs that have room for them.
+    pub(super) fn with_more_entries(
+        &self,
+        mut pdos: Vec<Pdo>,
+        more: &[EntryRef],
+    ) -> Result<Vec<Pdo>, SelectError> {
+        let configurable = self.coe().is_some_and(|coe| coe.pdo_config);
+        for wanted in more {
+            let entry = self.entry(*wanted)?;
+            let mut open = pdos.iter_mut().filter(|pdo| !pdo.fixed && configurable);
+            let Some(pdo) = open.find(|pdo| self.has_room(pdo)) else {
+                return Err(SelectError::NotConfigurable {
+                    list: self.label(),
+                    device: self.device.name.clone(),
+                });
+            };
+            pdo.entries.push(entry);
+        }
+        Ok(pdos)
+    }
+
+    /// True if the mapping object of a PDO has a subindex for a further entry.
+    fn has_room(&self, pdo: &Pdo) -> bool {
+        let next = u8::try_from(pdo.entries.len() + 1).unwrap_or(u8::MAX);
+        let room = self.max_entries(pdo.index);
+        let described = self.dictionary.item(pdo.index, 1).is_some();
+        room.is_none_or(|most| usize::from(next) <= most)
+            && (!described || self.dictionary.item(pdo.index, next).is_some())
+            && next < u8::MAX
+    }
+
     /// Returns the device's own PDOs that together match the user's list, for fixed PDOs.
     fn composed(&self, available: &[Pdo], default: &[Pdo], list: &[EntryRef]) -> Option<Vec<Pdo>> {
         let mut set: Vec<Pdo> = default.iter().filter(|p| p.mandatory).cloned().collect();

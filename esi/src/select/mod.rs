@@ -73,6 +73,10 @@ pub struct SelectOptions<'a> {
     pub rx: Option<&'a [EntryRef]>,
     /// User-defined contents of the input PDO.
     pub tx: Option<&'a [EntryRef]>,
+    /// Objects added to the output PDOs, which keep their own.
+    pub more_rx: &'a [EntryRef],
+    /// Objects added to the input PDOs, which keep their own.
+    pub more_tx: &'a [EntryRef],
     /// Modules slot by slot (type, name or identity; `-` for none). Slots without an element in
     /// this list follow mode and default.
     pub modules: &'a [&'a str],
@@ -209,8 +213,13 @@ pub fn select(
         assignment,
         axes,
     };
-    let rx = chooser(Direction::Rx).choose(choice.mode, choice.rx, &mut notes)?;
-    let tx = chooser(Direction::Tx).choose(choice.mode, choice.tx, &mut notes)?;
+    let select = |direction, own, more, notes: &mut Vec<String>| {
+        let selector = chooser(direction);
+        let pdos = selector.choose(choice.mode, own, notes)?;
+        selector.with_more_entries(pdos, more)
+    };
+    let rx = select(Direction::Rx, choice.rx, choice.more_rx, &mut notes)?;
+    let tx = select(Direction::Tx, choice.tx, choice.more_tx, &mut notes)?;
     let mut layout = Layout::new(device, &rx, &tx)?;
     if choice.mode.is_some() {
         watch_outputs(device, &mut layout, &mut notes);

@@ -96,6 +96,17 @@ fn quick_stop(sdos: &[RawSdo], selection: Option<&esi::Selection>) -> Option<Qui
         .then(|| QuickStopOption(i16::from_le_bytes(bytes)))
 }
 
+/// The targets that a mode needs in the process data, and the reported values.
+pub(super) const MODE_OBJECTS: [(Mode, &[u16], &[u16]); 5] = [
+    (Mode::Csp, &[0x607a], &[]),
+    (Mode::Csv, &[0x60ff], &[]),
+    // A switch to CST starts from the actual torque.
+    (Mode::Cst, &[0x6071], &[0x6077]),
+    // A move's speed is a fraction of the axis limit, so the drive needs the profile objects.
+    (Mode::Pp, &[0x607a, 0x6081, 0x6083, 0x6084], &[]),
+    (Mode::Pv, &[0x60ff, 0x6083, 0x6084], &[]),
+];
+
 /// Returns the modes to which the axis can switch. 0x6060, 0x6061 and the mode's targets must be in
 /// the process data.
 fn modes(own: Mode, selection: Option<&esi::Selection>) -> Modes {
@@ -106,19 +117,14 @@ fn modes(own: Mode, selection: Option<&esi::Selection>) -> Modes {
     if layout.rx_field(0x6060, 0).is_none() || layout.tx_field(0x6061, 0).is_none() {
         return modes;
     }
-    let targets: [(Mode, &[u16]); 5] = [
-        (Mode::Csp, &[0x607a]),
-        (Mode::Csv, &[0x60ff]),
-        (Mode::Cst, &[0x6071]),
-        // A move's speed is a fraction of the axis limit, so the drive needs the profile objects.
-        (Mode::Pp, &[0x607a, 0x6081, 0x6083, 0x6084]),
-        (Mode::Pv, &[0x60ff, 0x6083, 0x6084]),
-    ];
-    // A switch to CST starts from the actual torque.
-    let torque = layout.tx_field(0x6077, 0).is_some();
-    for (mode, targets) in targets {
-        let mapped = |index: &u16| layout.rx_field(*index, 0).is_some();
-        if targets.iter().all(mapped) && (mode != Mode::Cst || torque) {
+    for (mode, targets, reported) in MODE_OBJECTS {
+        let sent = targets
+            .iter()
+            .all(|index| layout.rx_field(*index, 0).is_some());
+        let seen = reported
+            .iter()
+            .all(|index| layout.tx_field(*index, 0).is_some());
+        if sent && seen {
             modes = modes.with(mode);
         }
     }

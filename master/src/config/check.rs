@@ -11,7 +11,9 @@ use super::device::{self, CheckedDevice, EsiFiles};
 use super::duration::show;
 use super::fields::KeyExt;
 use super::gantry;
+use super::needed;
 use super::optional::OptionalPlaces;
+use super::position_output;
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawBus, RawDevice, RawMachine};
 use super::sim;
@@ -47,8 +49,9 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         .collect();
     let connections = sim::Places::of(&raw.devices);
     let optional = OptionalPlaces::of(&raw.devices);
+    let needs = needed::of_steps(&raw.steps);
     for (raw, at) in raw.devices.into_iter().zip(places) {
-        checked.push(device::check(raw, at, &mut files, &all, p));
+        checked.push(device::check(raw, at, &mut files, (&all, &needs), p));
     }
     // Steps use the machine's device indices, so the order is determined first.
     let position = |checked: &CheckedDevice| match checked.device.as_ref()?.at {
@@ -115,7 +118,13 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         let what = format!("the brake output of `{axis}` in line {line}");
         OutputWriter::new(&brake.output, what)
     });
-    let writers: Vec<_> = steps.chain(opened).collect();
+    let mut writers: Vec<_> = steps.chain(opened).collect();
+    let position_outputs =
+        position_output::check(&raw.position_outputs, known, &axes, &program, &writers, p);
+    writers.extend(position_outputs.iter().map(|setup| {
+        let what = format!("switched by the position_output in line {}", setup.line);
+        OutputWriter::new(&setup.output, what)
+    }));
     let copies = copy::check(&raw.copies, known, &writers, p);
     let mut devices = Vec::new();
     let mut axes = Vec::new();
@@ -157,6 +166,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         program: program.buttons,
         switched: program.switched,
         copies,
+        position_outputs,
         stop: program.stop,
         overrides: program.overrides,
         tables: program.tables,

@@ -90,6 +90,15 @@ impl OutputWriter {
             what,
         }
     }
+
+    /// Returns what writes the output already.
+    pub fn conflict(&self, output: &Signal) -> Option<&str> {
+        let bits = bits_of(&output.field);
+        let same = self.device == output.device
+            && self.bits.start < bits.end
+            && bits.start < self.bits.end;
+        same.then_some(self.what.as_str())
+    }
 }
 
 /// Returns the valid copies. `writers`: the outputs that steps and brakes write.

@@ -8,6 +8,7 @@ use ecaxis_esi::{Field, Layout};
 use toml::Spanned;
 
 use super::fields::{Key, KeyExt};
+use super::needed::{self, Needs};
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawDevice, RawEntry};
 use super::{DeviceConfig, Locator, MailboxSource, Startup, gateway, sdo, sim};
@@ -32,7 +33,7 @@ pub(crate) fn check(
     mut raw: RawDevice,
     at: Option<Locator>,
     files: &mut EsiFiles<'_>,
-    names: &[String],
+    (names, needs): (&[String], &Needs),
     p: &mut Problems<'_>,
 ) -> CheckedDevice {
     let name = raw.name.as_ref().map(|name| name.get_ref().clone());
@@ -49,6 +50,7 @@ pub(crate) fn check(
                 raw: &raw,
                 mode,
                 axes: &numbers,
+                needs,
                 cycle_ns: *cycle_ns,
                 cycle: cycle.clone(),
             };
@@ -289,6 +291,7 @@ struct DeviceQuery<'r> {
     raw: &'r RawDevice,
     mode: Option<esi::Mode>,
     axes: &'r [u16],
+    needs: &'r Needs,
     cycle_ns: u64,
     cycle: Span,
 }
@@ -322,15 +325,26 @@ impl DeviceQuery<'_> {
             axes: self.axes,
             rx: rx.as_deref(),
             tx: tx.as_deref(),
+            more_rx: &[],
+            more_tx: &[],
             modules: &modules,
             assignment: self.raw.assignment.as_ref().map(|a| a.get_ref().as_str()),
             dc_mode: self.raw.dc.as_ref().map(|d| d.get_ref().as_str()),
             cycle_ns: self.cycle_ns,
             sdo: &[],
         };
-        let first = esi::select(file, device, &choice)
+        let mut first = esi::select(file, device, &choice)
             .map_err(|e| self.report(&e, p))
             .ok()?;
+        let added = needed::missing(self.raw, self.axes, self.needs, &first.layout);
+        let mut note: Option<&String> = None;
+        if let Some(added) = &added {
+            // A device whose PDOs cannot carry them stays as it is; the check names what is missing.
+            if let Some((selection, more)) = added.select(file, device, choice) {
+                (first, choice, note) = (selection, more, Some(&added.note));
+            }
+        }
+        first.notes.extend(note.cloned());
         if self.raw.sdo.is_empty() {
             return Some(first);
         }
@@ -355,9 +369,11 @@ impl DeviceQuery<'_> {
             return None;
         }
         choice.sdo = &sdos;
-        esi::select(file, device, &choice)
+        let mut selection = esi::select(file, device, &choice)
             .map_err(|e| self.report(&e, p))
-            .ok()
+            .ok()?;
+        selection.notes.extend(note.cloned());
+        Some(selection)
     }
 
     fn report(&self, e: &esi::SelectError, p: &mut Problems<'_>) {

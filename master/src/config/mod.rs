@@ -8,9 +8,11 @@
 //! | `raw/` | the file as written: its tables |
 //! | `schema.rs` | the tables as a JSON schema, for editors |
 //! | `check.rs` | raw → [`Machine`]: bus, names, positions |
+//! | `position_output.rs` | outputs that follow the position of an axis |
 //! | `copy.rs` | inputs that are copied to outputs |
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
 //! | `locator.rs` | how a device is located on the bus |
+//! | `needed.rs` | objects that the file needs in the process data |
 //! | `optional.rs` | devices that may be absent |
 //! | `sdo.rs` | values of start-up SDOs as bytes |
 //! | `startup.rs` | which start-up SDOs are verified or skipped |
@@ -49,7 +51,9 @@ mod fields;
 mod gantry;
 mod gateway;
 mod locator;
+mod needed;
 mod optional;
+mod position_output;
 mod problem;
 mod program;
 mod raw;
@@ -78,6 +82,7 @@ pub use drive_limits::LimitConflict;
 pub use drive_units::{AdoptedUnits, UnitProblem};
 pub use gateway::{GatewaySetup, NodeSetup};
 pub use locator::{Locator, SegmentHead};
+pub use position_output::PositionOutputSetup;
 pub use problem::{ConfigError, Problem};
 pub use program::{
     Action, AxisValue, NamedSignal, NumberPlace, ProgramInputs, Step, StopGroup, StopSetup,
@@ -139,6 +144,7 @@ pub struct Machine {
     /// What the simulated bus does with its inputs.
     pub switched: Vec<SwitchedInput>,
     pub copies: Vec<CopySetup>,
+    pub position_outputs: Vec<PositionOutputSetup>,
     pub stop: StopSetup,
     pub overrides: OverrideConfig,
     /// The set-point tables that the steps play.

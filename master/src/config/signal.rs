@@ -426,6 +426,16 @@ impl Machine {
                 device: false,
             });
         }
+        let mut positions = self.position_outputs.iter();
+        if let Some(setup) = positions.find(|setup| setup.output == signal) {
+            return Err(NameError::of_signal(
+                format!(
+                    "`{}` is switched by the position_output in line {}",
+                    signal.name, setup.line
+                ),
+                "an output has one writer",
+            ));
+        }
         let bits = bits_of(&signal.field);
         let mut copies = self.copies.iter();
         if let Some(copy) = copies.find(|copy| copy.to.overlaps(signal.device, &bits)) {

@@ -19,6 +19,7 @@ use super::heartbeat;
 use super::image::SignalBits;
 use super::overrides::Overrides;
 use super::phase::Phase;
+use super::position_output::PositionOutput;
 use super::reaction_group::{GroupStatus, ReactionGroup};
 use super::samples::{CycleSample, SampleWriter, flags};
 use super::setpoint_generator::GeneratorState;
@@ -42,6 +43,7 @@ use crate::link::{Link, MAX_FRAME};
 pub struct Signals {
     pub inputs: Vec<SignalBits>,
     pub outputs: Vec<SignalBits>,
+    pub positions: Vec<PositionOutput>,
 }
 
 /// The state of the cycle.

@@ -16,6 +16,7 @@
 //! - [`samples`]: a row of values for every cycle, for other threads and processes;
 //! - [`heartbeat`]: detects a dead supervisor thread;
 //! - [`gantry`]: two axes that move as one;
+//! - [`position_output`]: outputs that follow the position of an axis;
 //! - [`channel`]: the queues to and from the other threads;
 //! - [`controller`]: user code in the cycle;
 //! - [`cycle`]: one cycle, from wake-up to publishing;
@@ -47,6 +48,7 @@ pub mod heartbeat;
 pub mod image;
 pub mod overrides;
 pub mod phase;
+pub mod position_output;
 pub mod reaction_group;
 pub mod samples;
 pub mod setpoint_generator;

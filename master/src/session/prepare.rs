@@ -32,6 +32,7 @@ use crate::rt::exchange::{Exchange, ExchangeDevice};
 use crate::rt::gateway::{Gateway, GatewayConfig, NodePlace};
 use crate::rt::image::{self, AxisBits, BitField, DeviceRegion, ImagePlan, NotMapped, SignalBits};
 use crate::rt::phase::Phase;
+use crate::rt::position_output::PositionOutput;
 use crate::supervise::{Buttons, MissedTargets, ReportedLimits, RingWatch, Supervisor};
 
 /// A segment in SafeOp with everything that the cycle needs.
@@ -335,6 +336,20 @@ fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
     let signals = Signals {
         inputs: all(&machine.inputs, false)?,
         outputs: all(&machine.outputs, true)?,
+        positions: machine
+            .position_outputs
+            .iter()
+            .map(|setup| {
+                let bits = all(std::slice::from_ref(&setup.output), true)?;
+                Ok(bits.into_iter().map(|output| PositionOutput {
+                    output,
+                    trigger: setup.trigger.clone(),
+                }))
+            })
+            .collect::<Result<Vec<_>, Error>>()?
+            .into_iter()
+            .flatten()
+            .collect(),
     };
     for (slot, setup) in slots.iter_mut().zip(&machine.axes) {
         slot.brake = all(setup.brake_output.as_slice(), true)?.pop();

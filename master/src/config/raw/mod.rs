@@ -38,6 +38,8 @@ table! { "the machine file",
         devices: Vec<RawDevice> as "device" = "[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"",
         /// Two axes that move as one
         gantries: Vec<RawGantry> as "gantry",
+        /// Outputs that are on at positions of an axis
+        position_outputs: Vec<RawPositionOutput> as "position_output",
         /// Inputs of one device that become outputs of another
         copies: Vec<RawCopy> as "copy",
         /// How the machine stops
@@ -425,6 +427,24 @@ table! { "[[gantry]]",
         max_skew: Key<f64> = "0.5",
         /// Largest difference of their ways during homing (unit; default `max_skew`)
         max_homing_skew: Key<f64>,
+    }
+}
+
+table! { "[[position_output]]",
+    table RawPositionOutput {
+        /// Output of one bit (signal)
+        output: Key<String> = "\"io.Output 1\"",
+        /// Axis that switches it (name)
+        axis: Key<String> = "\"x\"",
+        /// Ranges of positions in which it is on (list of [from, to], unit)
+        ranges: Key<Vec<[f64; 2]>> = "[[10.0, 20.0]]",
+        /// The ranges repeat after this way (unit; default never)
+        period: Key<f64>,
+        /// Time by which the output switches before the axis is there (time, up to 1 s; default 0)
+        lead: Key<Ns> [0..=S],
+        /// If true, the reported position counts instead of the set-point (`true`, `false`; default
+        /// `false`)
+        actual: Key<bool>,
     }
 }
 

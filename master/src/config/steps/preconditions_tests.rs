@@ -22,6 +22,8 @@ name = "y"
 esi = "esi/EPOS4.xml"
 position = 1
 mode = "csp"
+pdo.rx = ["0x6040", "0x607A", "0x60B1", "0x60B2"]
+pdo.tx = ["0x6041", "0x6064", "0x606C", "0x6077", "0x6061"]
 [device.axis]
 encoder = 2000
 limits = { position = [-50.0, 50.0], velocity = 50.0, acceleration = 500.0 }

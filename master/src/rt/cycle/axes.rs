@@ -90,12 +90,26 @@ impl Engine {
                 break;
             }
         }
+        self.set_position_outputs();
         for group in self.groups.indices() {
             if let Some(cause) = self.groups.get_mut(group).and_then(|g| g.found.take()) {
                 // If an axis cannot be stopped, the machine must not continue without its group.
                 let own = !matches!(cause, StopCause::Powered { .. });
                 self.stop(own.then_some(group), cause);
             }
+        }
+    }
+
+    /// Writes the outputs that follow positions. They are off while the group of the axis stops.
+    fn set_position_outputs(&mut self) {
+        for at in &self.signals.positions {
+            let on = self.axes.get(at.trigger.axis).is_some_and(|slot| {
+                let group = self.groups.get(slot.group);
+                let stops = group.is_none_or(|group| group.stop().is_some());
+                !stops && at.trigger.is_on(&slot.axis.status())
+            });
+            at.output
+                .set(self.exchange.outputs_mut(), f64::from(u8::from(on)));
         }
     }
 
