@@ -345,6 +345,9 @@ pub enum CommandError {
     /// A coupled gantry does not support the command.
     #[error("the axis is part of a coupled gantry, which stays in CSP; decouple it first")]
     Coupled,
+    /// The axis follows no other axis.
+    #[error("the axis follows no other axis")]
+    NotFollowing,
     /// The axis follows a gear, stream or other source.
     #[error("the axis follows something else; stop it first")]
     Following,

@@ -302,13 +302,14 @@ fn mailbox_transfers_cause_no_allocation_in_the_cycle() {
     assert_eq!(counted, 0, "allocations during {done} transfers");
 }
 
-/// Covers mode switches, homing, profiles, lines, gears, tables, waves, inputs and outputs.
+/// Covers mode switches, homing, profiles, lines, gears, tables, waves, gantries, cams, inputs and outputs.
 #[test]
 fn programs_of_every_kind_allocate_nothing() {
     for file in [
         "together.toml",
         "probe.toml",
         "gantry.toml",
+        "labeller.toml",
         "profiles.toml",
         "loops.toml",
         "program.toml",

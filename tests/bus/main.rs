@@ -6,6 +6,7 @@
 mod axes;
 mod bring_up;
 mod cabling;
+mod cams;
 mod clock_wrap;
 mod clocks;
 mod controller;

@@ -115,6 +115,16 @@ impl Gear {
         self.offset
     }
 
+    /// Shifts the follower by `distance` against its master. The follower is engaged again when it
+    /// has caught up. Ignores a distance that leads to no valid offset. RT: O(1).
+    pub fn shift(&mut self, distance: f64) {
+        if position("gear offset", self.offset + distance).is_ok() {
+            self.offset += distance;
+            self.ideal += distance;
+            self.engaged = false;
+        }
+    }
+
     /// Returns how many times the engaged follower could not follow.
     #[must_use]
     pub const fn lag_cycles(&self) -> u32 {

@@ -11,7 +11,7 @@
 //! | [`PositionWave`] | sine and square waves for commissioning |
 //! | [`Stream`] | through points that arrive during the motion |
 //! | [`Playback`] | through the points of a [`Table`] |
-//! | [`Gear`] | follows another axis |
+//! | [`Gear`] | follows another axis, by a ratio or a [`Cam`] |
 //!
 //! [`Source`] is any of the sources that need only the motion. [`Ramp`] is for a single value:
 //! velocity in CSV, torque in CST.
@@ -38,6 +38,7 @@
 //! # Ok::<(), ecaxis_axis::setpoint::SetpointError>(())
 //! ```
 
+mod cam;
 mod error;
 mod gear;
 mod hold;
@@ -53,6 +54,7 @@ mod test_support;
 mod trapezoid;
 mod wave;
 
+pub use cam::{Cam, CamError, CamLaw, CamPoint};
 pub use error::SetpointError;
 pub use gear::{Gear, GearConfig, GearInMode};
 pub use hold::Hold;

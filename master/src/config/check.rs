@@ -6,6 +6,7 @@ use std::path::Path;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use toml::Spanned;
 
+use super::cam;
 use super::copy::{self, OutputWriter};
 use super::device::{self, CheckedDevice, EsiFiles};
 use super::duration::show;
@@ -88,6 +89,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
             setup: axis.setup.as_ref(),
         })
         .collect();
+    let cams = cam::check(&raw.cams, folder, p);
     let known = &devices;
     let cycle_s = bus.as_ref().map_or(1e-3, |b| b.cycle_ns as f64 * 1e-9);
     let repeat = raw.repeat.value().unwrap_or(1);
@@ -97,6 +99,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         folder,
         cycle_s,
         gantries: &gantries,
+        cams: &cams,
     };
     let names = (raw.signals, raw.variables, raw.program, raw.sim);
     let program = steps::check(
@@ -158,6 +161,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         devices,
         axes: axes.into(),
         gantries: gantries.iter().map(|gantry| gantry.config).collect(),
+        cams,
         steps: program.steps,
         inputs: program.inputs,
         outputs: program.outputs,

@@ -9,6 +9,7 @@
 //! | `schema.rs` | the tables as a JSON schema, for editors |
 //! | `check.rs` | raw → [`Machine`]: bus, names, positions |
 //! | `position_output.rs` | outputs that follow the position of an axis |
+//! | `cam.rs` | cams |
 //! | `copy.rs` | inputs that are copied to outputs |
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
 //! | `locator.rs` | how a device is located on the bus |
@@ -38,6 +39,7 @@ use std::time::Duration;
 
 mod axis;
 mod axis_setup;
+mod cam;
 mod check;
 mod copy;
 mod device;
@@ -76,6 +78,7 @@ mod units;
 pub use crate::text::nearest;
 pub(crate) use axis::is_maxon;
 pub use axis_setup::{AxisSetup, HomingSetup, TorqueSetup, TorqueUnit, UnitSource};
+pub use cam::NamedCam;
 pub use copy::{BitRange, CopySetup};
 pub(crate) use device::unused_axis;
 pub use drive_limits::LimitConflict;
@@ -131,6 +134,8 @@ pub struct Machine {
     /// The axes, device by device.
     pub axes: IndexVec<AxisIndex, AxisSetup>,
     pub gantries: Vec<GantryConfig>,
+    /// The cams, by index in [`Action::Gear`].
+    pub cams: Vec<NamedCam>,
     pub steps: Vec<Step>,
     /// The signals that the steps read; `outputs` are those they set.
     pub inputs: Vec<Signal>,
@@ -413,6 +418,7 @@ impl Machine {
             emergency: stop.emergency.clone(),
             overrides: self.overrides.clone(),
             gantries: self.gantries.clone(),
+            cams: self.cams.iter().map(|named| named.cam.clone()).collect(),
             copies: self.copies.iter().map(CopySetup::rt).collect(),
             repeats: device::repeats(&self.devices),
         }

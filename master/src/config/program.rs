@@ -109,6 +109,13 @@ pub enum Action {
         /// The follower's position at master position 0. `None`: the present relation stays.
         offset: Option<f64>,
         smoothing_ns: u64,
+        /// The index into [`Machine::cams`](super::Machine::cams). `ratio` is then the way on the cam
+        /// per way of the master.
+        cam: Option<usize>,
+    },
+    /// Shift followers against their masters.
+    Phase {
+        targets: Vec<(AxisIndex, f64)>,
     },
     /// Reach the velocities and keep moving.
     Velocity {
@@ -210,6 +217,7 @@ impl Action {
             Self::Move { targets, .. }
             | Self::Line { targets, .. }
             | Self::Velocity { targets, .. }
+            | Self::Phase { targets }
             | Self::Torque { targets, .. } => targets.iter().map(|&(axis, _)| axis).collect(),
             Self::Mode { targets } => targets.iter().map(|&(axis, _)| axis).collect(),
             Self::Wave { axis, .. }

@@ -28,8 +28,8 @@ use super::raw::{
 };
 use super::subprograms::MOST_STEPS;
 use super::{
-    Action, AxisSetup, DeviceConfig, NamedSignal, NumberPlace, OverrideConfig, ProgramInputs,
-    Signal, Step, StopSetup, SwitchedInput, TableFile, Variable, VariableUse,
+    Action, AxisSetup, DeviceConfig, NamedCam, NamedSignal, NumberPlace, OverrideConfig,
+    ProgramInputs, Signal, Step, StopSetup, SwitchedInput, TableFile, Variable, VariableUse,
 };
 use crate::rt::gantry::GantryConfig;
 use ecaxis_axis::Mode;
@@ -75,6 +75,7 @@ pub(crate) struct Resolved<'c> {
     pub folder: &'c Path,
     pub cycle_s: f64,
     pub gantries: &'c [CheckedGantry],
+    pub cams: &'c [NamedCam],
 }
 
 /// The steps with their signals.
@@ -115,6 +116,7 @@ pub(crate) fn check(
         folder: known.folder,
         cycle_s: known.cycle_s,
         gantries: known.gantries.iter().map(|gantry| gantry.config).collect(),
+        cams: known.cams,
         tables: Vec::new(),
         inputs: Vec::new(),
         outputs: Vec::new(),
@@ -170,6 +172,7 @@ struct ProgramChecker<'c> {
     folder: &'c Path,
     cycle_s: f64,
     gantries: Vec<GantryConfig>,
+    cams: &'c [NamedCam],
     tables: Vec<TableFile>,
     inputs: Vec<Signal>,
     outputs: Vec<Signal>,
@@ -309,6 +312,9 @@ impl ProgramChecker<'_> {
                 self.table(&axis, &file, [speed?, ramp?], p)?
             }
             RawAction::Gear(axis, gear) => self.gear(&axis, &gear, p)?,
+            RawAction::Phase(targets) => Action::Phase {
+                targets: self.targets(targets, TargetKind::Way, p)?,
+            },
             RawAction::Velocity(targets) => {
                 let at = ramp.place();
                 let ramp = self.fraction(&ramp, NumberPlace::Ramp, p);

@@ -40,6 +40,11 @@ pub enum RtCommand {
         output: OutputRef,
         value: f64,
     },
+    /// Shifts a follower against its master.
+    Shift {
+        axis: AxisIndex,
+        distance: f64,
+    },
     /// Couples the halves of a gantry, or decouples them.
     Couple {
         gantry: usize,

@@ -1,6 +1,7 @@
 //! The settings of the cycle, as plain data.
 
 use ecaxis_axis::StopMethod;
+use ecaxis_axis::setpoint::Cam;
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 
 use super::controller::InputRef;
@@ -31,6 +32,7 @@ pub struct RtConfig {
     pub emergency: Vec<Condition>,
     pub overrides: OverrideConfig,
     pub gantries: Vec<GantryConfig>,
+    pub cams: Vec<Cam>,
     /// Inputs that are copied to outputs in every cycle.
     pub copies: Vec<ProcessDataCopy>,
     /// Outputs that repeat other outputs of their device.

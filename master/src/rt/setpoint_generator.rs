@@ -7,7 +7,8 @@
 
 use ecaxis_axis::group::LinePath;
 use ecaxis_axis::setpoint::{
-    Gear, GearConfig, JerkLimited, Motion, Playback, PositionWave, Setpoint, SetpointError, Table,
+    Cam, Gear, GearConfig, JerkLimited, Motion, Playback, PositionWave, Setpoint, SetpointError,
+    Table,
 };
 use ecaxis_axis::{Axis, AxisStatus, CommandError, HomingStatus};
 use ecaxis_ecat::index::AxisIndex;
@@ -32,8 +33,26 @@ pub enum GeneratorRequest {
         master: AxisIndex,
         /// True for the master's reported position, false for its set-point.
         actual: bool,
+        /// The cam between both.
+        cam: Option<CamRef>,
         config: GearConfig,
     },
+}
+
+/// A cam and the way on it per way of the master.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CamRef {
+    /// Index into the machine's cams.
+    pub cam: usize,
+    pub scale: f64,
+}
+
+impl CamRef {
+    /// Returns the motion that the follower's gear follows. RT.
+    pub(super) fn through(cam: Option<Self>, cams: &[Cam], master: Motion) -> Motion {
+        let known = cam.and_then(|at| Some((cams.get(at.cam)?, at.scale)));
+        known.map_or(master, |(cam, scale)| cam.motion(master, scale))
+    }
 }
 
 /// The source that an axis follows.
@@ -49,6 +68,7 @@ enum Source {
     Gear {
         master: AxisIndex,
         actual: bool,
+        cam: Option<CamRef>,
         gear: Gear,
     },
 }
@@ -176,11 +196,13 @@ impl SetpointGenerator {
             GeneratorRequest::Gear {
                 master: index,
                 actual,
+                cam,
                 config,
             } => Gear::new(config, master.unwrap_or_default(), commanded(axis)).map(|gear| {
                 Source::Gear {
                     master: index,
                     actual,
+                    cam,
                     gear,
                 }
             }),
@@ -247,6 +269,24 @@ impl SetpointGenerator {
             Some(Source::Gear { master, actual, .. }) => Some((master, actual)),
             _ => None,
         }
+    }
+
+    /// Returns the cam between the followed axis and this one.
+    pub(super) fn cam(&self) -> Option<CamRef> {
+        match self.source {
+            Some(Source::Gear { cam, .. }) => cam,
+            _ => None,
+        }
+    }
+
+    /// Shifts a follower against its master. Returns false if the axis follows none. RT: O(1).
+    pub(super) fn shift(&mut self, distance: f64) -> bool {
+        let Some(Source::Gear { gear, .. }) = &mut self.source else {
+            return false;
+        };
+        gear.shift(distance);
+        (self.state, self.slipping_s) = (GeneratorState::Running, 0.0);
+        true
     }
 
     /// Returns where the source left the axis, if it is still there. The axis computes its velocity

@@ -142,6 +142,7 @@ fn a_gear_follows_within_the_same_cycle_and_ends_with_a_command() {
     let start = GeneratorRequest::Gear {
         master: AxisIndex(0),
         actual: false,
+        cam: None,
         config: GearConfig {
             ratio: -0.5,
             engage: GearInMode::Here,

@@ -13,7 +13,7 @@ use crate::clock::{self, Nanos};
 use crate::config::Step;
 use crate::report::Error;
 use crate::rt::channel::RtCommand;
-use crate::rt::setpoint_generator::{GeneratorRequest, GeneratorState, commanded};
+use crate::rt::setpoint_generator::{CamRef, GeneratorRequest, GeneratorState, commanded};
 
 /// The timeout in ns for a follower to catch up.
 const ENGAGE_TIMEOUT: Nanos = 30_000_000_000;
@@ -123,12 +123,13 @@ impl Turn<'_, '_> {
         step: &Step,
         start: Nanos,
         [axis, master]: [AxisIndex; 2],
-        actual: bool,
+        (actual, cam): (bool, Option<CamRef>),
         config: GearConfig,
     ) -> Result<(), Error> {
         let generator = GeneratorRequest::Gear {
             master,
             actual,
+            cam,
             config,
         };
         self.follow(step, start, &[(axis, generator)], GeneratorState::Engaged)
@@ -198,13 +199,43 @@ impl Turn<'_, '_> {
         let commands = generators
             .iter()
             .map(|&(axis, start)| RtCommand::Generate { axis, start });
-        self.send_all(&commands.collect::<Vec<_>>()).await;
+        let commands: Vec<_> = commands.collect();
+        let axes: Vec<_> = generators.iter().map(|&(axis, _)| axis).collect();
+        self.send_and_follow(step, start, &commands, &axes, until)
+            .await
+    }
+
+    /// Shifts followers against their masters. Waits until they are engaged again.
+    pub(super) async fn shift(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        targets: &[(AxisIndex, f64)],
+    ) -> Result<(), Error> {
+        let commands = targets
+            .iter()
+            .map(|&(axis, distance)| RtCommand::Shift { axis, distance });
+        let commands: Vec<_> = commands.collect();
+        let axes: Vec<_> = targets.iter().map(|&(axis, _)| axis).collect();
+        self.send_and_follow(step, start, &commands, &axes, GeneratorState::Engaged)
+            .await
+    }
+
+    async fn send_and_follow(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        commands: &[RtCommand],
+        axes: &[AxisIndex],
+        until: GeneratorState,
+    ) -> Result<(), Error> {
+        self.send_all(commands).await;
         let begun = clock::now();
         let mut settling = Settling::default();
         self.wait_until(step, start, |this, snapshot| {
             let mut done = true;
             let mut late = None;
-            for &(axis, _) in generators {
+            for &axis in axes {
                 match snapshot.generators[axis] {
                     GeneratorState::Failed(error) => return Err(this.refusal(step, axis, &error)),
                     // Another command has taken over the axis.
@@ -218,10 +249,7 @@ impl Turn<'_, '_> {
             if !done {
                 let waited = clock::now().saturating_sub(begun);
                 if until == GeneratorState::Engaged && waited > ENGAGE_TIMEOUT {
-                    let axis = generators
-                        .first()
-                        .map(|&(axis, _)| axis)
-                        .unwrap_or_default();
+                    let axis = axes.first().copied().unwrap_or_default();
                     return Err(this.refusal(step, axis, &"it does not catch up"));
                 }
                 settling = Settling::default();

@@ -27,6 +27,7 @@ use crate::clock::{self, Nanos};
 use crate::config::{Action, AxisSetup, LARGEST, Step, VariableRef};
 use crate::report::{Cause, Error, Progress, StepRef};
 use crate::rt::channel::{RtCommand, Snapshot};
+use crate::rt::setpoint_generator::CamRef;
 
 mod enable;
 mod moves;
@@ -352,17 +353,20 @@ impl Turn<'_, '_> {
                 ratio,
                 offset,
                 smoothing_ns,
+                cam,
             } => {
+                let cam = cam.map(|cam| CamRef { cam, scale: *ratio });
                 let config = GearConfig {
-                    ratio: *ratio,
+                    ratio: if cam.is_some() { 1.0 } else { *ratio },
                     engage: offset.map_or(GearInMode::Here, |offset| GearInMode::At { offset }),
                     smoothing_s: *smoothing_ns as f64 * 1e-9,
                     limits: self.limits(*axis).motion(),
                     range: self.limits(*axis).position,
                 };
-                self.gear(step, start, [*axis, *master], *actual, config)
+                self.gear(step, start, [*axis, *master], (*actual, cam), config)
                     .await
             }
+            Action::Phase { targets } => self.shift(step, start, targets).await,
             Action::Velocity { targets, ramp } => {
                 self.move_and_wait(step, start, TargetKind::Velocity, targets, |velocity| {
                     Command::Velocity {

@@ -192,6 +192,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
             emergency: Vec::new(),
             overrides: config::OverrideConfig::default(),
             gantries: Vec::new(),
+            cams: Vec::new(),
             copies: Vec::new(),
             repeats: Vec::new(),
         },

@@ -115,9 +115,10 @@ impl Machine {
                 master,
                 actual,
                 ratio,
+                cam,
                 ..
             } => format!(
-                "gear {} to {}{} with a ratio of {ratio}",
+                "gear {} to {}{} with a ratio of {ratio}{}",
                 self.names(&[*axis]),
                 if *actual {
                     "the reported position of "
@@ -125,7 +126,10 @@ impl Machine {
                     ""
                 },
                 self.names(&[*master]),
+                cam.and_then(|cam| self.cams.get(cam))
+                    .map_or_else(String::new, |cam| format!(", by the cam {}", cam.name)),
             ),
+            Action::Phase { targets } => format!("shift {}", self.targets(targets, "by", "")),
             Action::Velocity { targets, ramp } => format!(
                 "turn {} at {} % of the acceleration limit",
                 self.targets(targets, "→", "/s"),

@@ -4,6 +4,7 @@ use toml::Spanned;
 use toml::de::DeValue;
 
 use ecaxis_axis::StopMethod;
+use ecaxis_axis::setpoint::CamLaw;
 use ecaxis_esi::Address;
 
 use super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Written, unquoted};
@@ -38,6 +39,8 @@ table! { "the machine file",
         devices: Vec<RawDevice> as "device" = "[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"",
         /// Two axes that move as one
         gantries: Vec<RawGantry> as "gantry",
+        /// Cams that steps `gear` name
+        cams: Vec<RawCam> as "cam",
         /// Outputs that are on at positions of an axis
         position_outputs: Vec<RawPositionOutput> as "position_output",
         /// Inputs of one device that become outputs of another
@@ -447,6 +450,24 @@ table! { "[[position_output]]",
         actual: Key<bool>,
     }
 }
+
+table! { "[[cam]]",
+    table RawCam {
+        /// Name for steps (text)
+        name: Key<String> = "\"seal\"",
+        /// Points (list of [master, follower] or [master, follower, slope], unit; default this or
+        /// `file`)
+        points: Key<Vec<Vec<f64>>>,
+        /// CSV file with the same columns (path)
+        file: Key<String>,
+        /// Polynomial between points (`"poly5"`, `"poly7"`; default `"poly5"`)
+        law: Key<CamLaw> [CAM_LAWS],
+        /// If true, the cam repeats beyond its ends (`true`, `false`; default `false`)
+        repeat: Key<bool>,
+    }
+}
+
+const CAM_LAWS: [(&str, CamLaw); 2] = [("poly5", CamLaw::Poly5), ("poly7", CamLaw::Poly7)];
 
 table! { "[[copy]]",
     table RawCopy {

@@ -61,6 +61,7 @@ pub(crate) enum RawAction {
         file: Spanned<String>,
     },
     Gear(Spanned<String>, RawGear),
+    Phase(Named<RawNumber>),
     Velocity(Named<RawNumber>),
     Torque {
         targets: Named<RawNumber>,
@@ -142,6 +143,9 @@ table! { "a gear",
         actual: Key<bool>,
         /// Distance to the followed axis (unit; default where the axis is)
         offset: Key<f64>,
+        /// Cam between both axes; `ratio` is then the way on the cam per way of the followed axis (name;
+        /// default none)
+        cam: Key<String>,
         /// Time constant of the followed motion (time; default 0, `"10ms"` with `actual`)
         smoothing: Key<Ns>,
     }
@@ -166,7 +170,7 @@ table! { "a probe",
 /// The verbs, each with an example and the keys that go with it. The key of a step that is a verb
 /// defines the action.
 #[rustfmt::skip] // one row per verb
-const VERBS: [(&str, &str, &[&str]); 32] = [
+const VERBS: [(&str, &str, &[&str]); 33] = [
     ("enable", "enable = [\"x\"]", &[]),
     ("disable", "disable = true", &[]),
     ("reset", "reset = [\"x\"]", &[]),
@@ -183,6 +187,7 @@ const VERBS: [(&str, &str, &[&str]); 32] = [
     ("square", "square = { x = { amplitude = 1.0, frequency = 0.5, periods = 5 } }", &[]),
     ("table", "table = { x = \"points.csv\" }", &["speed", "ramp"]),
     ("gear", "gear = { y = { to = \"x\", ratio = 2.0 } }", &[]),
+    ("phase", "phase = { y = 5.0 }", &[]),
     ("velocity", "velocity = { v = 100.0 }", &["ramp"]),
     ("torque", "torque = { t = 10.0 }", &["ramp"]),
     ("mode", "mode = { x = \"csv\" }", &[]),
@@ -348,6 +353,7 @@ impl<'d> Step<'_, 'd> {
                 let (axis, gear) = self.only(value, p)?;
                 RawAction::Gear(axis, gear)
             }
+            "phase" => RawAction::Phase(self.named(value, p)?),
             "velocity" => RawAction::Velocity(self.named(value, p)?),
             "torque" => RawAction::Torque {
                 ramp: self.table.read("ramp", p),

@@ -9,9 +9,9 @@ use toml::Spanned;
 use super::ProgramChecker;
 use super::target::TargetKind;
 use crate::config::fields::KeyExt;
-use crate::config::problem::Problems;
+use crate::config::problem::{Problems, suggestion};
 use crate::config::raw::{RawGear, RawWave};
-use crate::config::{Action, AxisSetup, TableFile};
+use crate::config::{Action, AxisSetup, NamedCam, TableFile};
 use crate::file;
 use crate::file::unreadable;
 use crate::signature::SignedKind;
@@ -61,6 +61,23 @@ impl ProgramChecker<'_> {
             p.add(ratio.span(), "with a `ratio` of 0 nothing is followed");
             return None;
         }
+        let cam = match &raw.cam {
+            None => None,
+            Some(name) => {
+                let known = |cam: &NamedCam| cam.name == *name.get_ref();
+                let Some(index) = self.cams.iter().position(known) else {
+                    let message = format!("no cam is named `{}`", name.get_ref());
+                    let names = self.cams.iter().map(|cam| cam.name.as_str());
+                    let hint = match self.cams.is_empty() {
+                        true => "add a [[cam]] with this `name`".to_owned(),
+                        false => suggestion(name.get_ref(), names, "cams"),
+                    };
+                    p.add_hint(name.span(), message, hint);
+                    return None;
+                };
+                Some(index)
+            }
+        };
         let actual = raw.actual.value().unwrap_or(false);
         // Actual positions are whole counts, so they need smoothing.
         let smoothing_ns = if actual { SMOOTHING_NS } else { 0 };
@@ -70,6 +87,7 @@ impl ProgramChecker<'_> {
             actual,
             ratio: raw.ratio.value().unwrap_or(1.0),
             offset: raw.offset.value(),
+            cam,
             smoothing_ns: raw.smoothing.value().unwrap_or(smoothing_ns),
         })
     }

@@ -292,6 +292,7 @@ impl ProgramState<'_, '_, '_, '_> {
             | Action::Wait { .. }
             | Action::Set { .. }
             | Action::Couple { .. }
+            | Action::Phase { .. }
             | Action::Override(_)
             | Action::Assign { .. }
             | Action::Message { .. }

@@ -9,7 +9,7 @@ use crate::rt::bus_monitor::StopCause;
 use crate::rt::exchange::DeviceAnswer;
 use crate::rt::gantry;
 use crate::rt::gateway::Gateway;
-use crate::rt::setpoint_generator;
+use crate::rt::setpoint_generator::{self, CamRef};
 
 impl Engine {
     /// Reads the status words of the gateways, stops the groups of lost nodes, and writes the
@@ -129,7 +129,12 @@ impl Engine {
         let master = self.axes.get(index).and_then(|slot| {
             let (master, actual) = slot.generator.master()?;
             let status = self.axes.get(master)?.axis.status();
-            setpoint_generator::master_motion(&status, actual)
+            let motion = setpoint_generator::master_motion(&status, actual)?;
+            Some(CamRef::through(
+                slot.generator.cam(),
+                &self.config.cams,
+                motion,
+            ))
         });
         let leader = self.axes.get(index).and_then(|slot| {
             let leader = slot.leader?;

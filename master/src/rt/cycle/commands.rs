@@ -12,7 +12,7 @@ use crate::rt::flight_recorder::Trigger;
 use crate::rt::gantry;
 use crate::rt::gateway::Gateway;
 use crate::rt::reaction_group::{ActiveStop, ReactionGroup, check_permitted};
-use crate::rt::setpoint_generator::{self, GeneratorRequest};
+use crate::rt::setpoint_generator::{self, CamRef, GeneratorRequest};
 
 impl Engine {
     /// Takes all queued commands, so that commands of one batch take effect in the same cycle.
@@ -59,6 +59,7 @@ impl Engine {
                     signal.set(self.exchange.outputs_mut(), value);
                 }
             }
+            RtCommand::Shift { axis, distance } => self.shift(axis, distance),
             RtCommand::Couple { gantry, coupled } => self.couple(gantry, coupled),
             RtCommand::Override { group, factor } => self.overrides.set_factor(group, factor),
             RtCommand::Hold { group, held } => self.overrides.set_hold(group, held),
@@ -80,6 +81,21 @@ impl Engine {
                 }
             }
             RtCommand::Halt => self.halted = true,
+        }
+    }
+
+    fn shift(&mut self, axis: AxisIndex, distance: f64) {
+        let Some(slot) = self.axes.get_mut(axis) else {
+            return;
+        };
+        if !slot.generator.shift(distance) {
+            let cycle = self.stats.counters.cycles;
+            let reason = CommandError::NotFollowing;
+            self.report(Event::Refused {
+                cycle,
+                axis,
+                reason,
+            });
         }
     }
 
@@ -277,10 +293,16 @@ impl Engine {
             return;
         }
         let master = match start {
-            GeneratorRequest::Gear { master, actual, .. } => self
+            GeneratorRequest::Gear {
+                master,
+                actual,
+                cam,
+                ..
+            } => self
                 .axes
                 .get(master)
-                .and_then(|slot| setpoint_generator::master_motion(&slot.axis.status(), actual)),
+                .and_then(|slot| setpoint_generator::master_motion(&slot.axis.status(), actual))
+                .map(|motion| CamRef::through(cam, &self.config.cams, motion)),
             _ => None,
         };
         let ring =

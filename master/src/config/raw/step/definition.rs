@@ -42,7 +42,7 @@ impl RawStep {
             "type": "object",
             "properties": Map::from_iter(verbs.into_iter().chain(companions)),
             "additionalProperties": false,
-            "oneOf": VERBS.map(|(verb, ..)| json!({ "required": [verb] })),
+            "oneOf": VERBS.map(|(verb, ..)| json!({ "required": [verb] })).to_vec(),
             "dependencies": Map::from_iter(COMPANIONS.iter().map(with)),
         })
     }
@@ -66,7 +66,7 @@ fn argument(verb: &str) -> Json {
             String::schema(),
             json!({ "type": "array", "items": { "type": "string" }, "minItems": 1 }),
         ]),
-        "move" | "move_by" | "line" | "line_by" | "velocity" | "torque" => {
+        "move" | "move_by" | "line" | "line_by" | "phase" | "velocity" | "torque" => {
             named(RawNumber::<f64>::schema())
         }
         "sine" | "square" => only(RawWave::schema()),
