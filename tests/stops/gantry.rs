@@ -176,6 +176,9 @@ fn a_blocked_half_never_skews_the_gantry_beyond_its_limit() {
             "[[step]]\nstop",
             "[[step]]\ndwell = \"100ms\"\n[[step]]\nstop",
         );
+        let verb = ["move = { x1 = 15.0", "line = { x1 = 15.0"]
+            [usize::try_from(seed % 2).expect("0 or 1")];
+        let text = text.replace("move = { x1 = 15.0", verb);
         let (outcome, _) = run(machine(&text), options);
         let what = format!(
             "seed {seed}: half {half} blocked at {at} ms, {} units/s",

@@ -1,6 +1,6 @@
 //! One axis in the cycle, between its process data and its set-point generator.
 
-use ecaxis_axis::{Axis, AxisStatus, Command, CommandError, Inputs, Outputs};
+use ecaxis_axis::{Axis, AxisStatus, Command, CommandError, Inputs, Outputs, StopMethod};
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex};
 
 use super::gantry::Leader;
@@ -76,6 +76,12 @@ impl RtAxis {
     /// again.
     pub(super) fn disarm(&mut self) {
         (self.armed, self.ordered) = (false, false);
+    }
+
+    /// Stops the axis and ends its generator, whose next set-point would be refused.
+    pub(super) fn stop_by(&mut self, method: StopMethod) {
+        self.axis.stop_by(method);
+        self.generator.end();
     }
 
     pub(super) fn command(&mut self, command: Command) -> Result<(), CommandError> {

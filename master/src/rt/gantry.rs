@@ -372,8 +372,8 @@ impl Gantry {
                 method,
             );
         }
-        first.axis.stop_by(method);
-        second.axis.stop_by(method);
+        first.stop_by(method);
+        second.stop_by(method);
     }
 
     /// Shows the state of the gantry in the status of its first half. RT: O(1).
@@ -462,9 +462,9 @@ fn stop_alike([first, second]: [&mut RtAxis; 2], [a, b]: &[AxisStatus; 2]) {
             continue;
         }
         if let Some(stop) = other.stop {
-            half.axis.stop_by(stop.method);
+            half.stop_by(stop.method);
         } else if !other.enabled && !own.at_rest {
-            half.axis.stop_by(StopMethod::QuickStop);
+            half.stop_by(StopMethod::QuickStop);
         }
     }
 }
