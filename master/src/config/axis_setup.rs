@@ -14,7 +14,7 @@ pub struct AxisSetup {
     pub device: DeviceIndex,
     /// The number of the axis in its drive, from 0.
     pub number: u16,
-    /// The index in [`GatewaySetup::nodes`] of an axis behind a gateway.
+    /// The index in [`GatewaySetup::nodes`](super::GatewaySetup::nodes) of an axis behind a gateway.
     pub node: Option<usize>,
     pub config: ecaxis_axis::AxisConfig,
     /// The user's name for the position unit, for example `mm`.
