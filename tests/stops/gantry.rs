@@ -209,6 +209,44 @@ fn a_blocked_half_never_skews_the_gantry_beyond_its_limit() {
     println!("largest skew: {:.1} % of its limit", worst * 100.0);
 }
 
+/// Hold at random, then an emergency stop: both halves get the same set-points and the same stop.
+#[test]
+fn holds_and_emergency_stops_do_not_part_the_halves() {
+    for seed in seeds() {
+        let mut random = Random(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
+        let emergency = 1500 + random.below(1500);
+        let mut inputs = String::new();
+        let mut at = 650;
+        while at < emergency {
+            let held = random.below(2) == 0;
+            inputs += &format!("{{ at = \"{at}ms\", set = {{ held = {held} }} }},\n");
+            at += 30 + random.below(300);
+        }
+        inputs += &format!("{{ at = \"{emergency}ms\", set = {{ emergency = true }} }},\n");
+        let head = format!(
+            "[signals]\nheld = \"io.Input 1\"\nemergency = \"io.Input 2\"\n[override]\nhold = {{ held = true }}\n\
+             [stop]\nemergency = {{ emergency = true }}\n[sim]\ninputs = [\n{inputs}]\n"
+        );
+        let io = "[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 2\n";
+        let steps = MOVES.replace(
+            "[[step]]\nmove = { x1 = 0.0",
+            "[[step]]\nline = { x1 = 90.0 }\nspeed = 0.2\n[[step]]\nmove = { x1 = 0.0",
+        );
+        let text = gantry(&USUAL, ["", ""], &format!("{io}{steps}"));
+        let folder = tempfile::tempdir().expect("a folder");
+        let (options, path) = recorded(faults(""), folder.path());
+        let (error, _) = run_badly(machine(&format!("{head}{text}")), options);
+        assert_contains(&error, &["emergency"]);
+        let seen = halves(&path);
+        same_targets(&seen);
+        for (cycle, [a, b]) in seen.iter().enumerate() {
+            assert_eq!(a.controlword, b.controlword, "seed {seed}, cycle {cycle}");
+            let skew = a.actual.abs_diff(b.actual);
+            assert!(skew <= 4, "seed {seed}, cycle {cycle}: {skew} counts");
+        }
+    }
+}
+
 /// The other half stops by quick stop, as the drive with the fault does.
 #[test]
 fn a_fault_of_one_half_stops_the_other_one_alike() {
