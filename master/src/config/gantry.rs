@@ -9,7 +9,7 @@ use super::problem::{Problems, Span, suggestion};
 use super::raw::RawGantry;
 use super::{AxisSetup, Machine, StopSetup};
 use crate::rt::gantry::GantryConfig;
-use ecaxis_axis::{Mode, Modes};
+use ecaxis_axis::Mode;
 
 /// A gantry and its place in the file.
 pub(crate) struct CheckedGantry {
@@ -116,16 +116,10 @@ fn join(
     let [a, b] = names.map(|name| name.get_ref());
     for (half, name) in [(&*first, names[0]), (&*second, names[1])] {
         let config = &half.config;
-        let only_csp = config.mode == Mode::Csp
-            && [Mode::Csv, Mode::Cst, Mode::Pp, Mode::Pv]
-                .iter()
-                .all(|&mode| !other_mode(config.modes, mode));
-        if !only_csp {
-            let message = format!("`{}` is not an axis in CSP alone", name.get_ref());
+        if config.mode != Mode::Csp {
+            let message = format!("`{}` is not in CSP", name.get_ref());
             let hint = "write `mode = \"csp\"`: both halves of a gantry follow positions";
             p.add_hint(name.span(), message, hint);
-        }
-        if !only_csp {
             return;
         }
         if half.node.is_some() {
@@ -161,10 +155,6 @@ fn join(
         let hint = "give both halves of the gantry the same `limits.position`";
         p.add_hint(names[1].span(), message, hint);
     }
-}
-
-fn other_mode(modes: Modes, mode: Mode) -> bool {
-    modes.contains(mode)
 }
 
 /// Returns false if the ranges have no position in common.
