@@ -155,6 +155,8 @@ enum Change {
         topics: Vec<Topic>,
         interval: Duration,
         words: Vec<usize>,
+        /// The first sample to send.
+        next: u64,
     },
     Unsubscribe(Vec<Topic>),
 }
@@ -289,6 +291,8 @@ impl Connection {
             topics,
             interval: Duration::from_millis(interval_ms),
             words,
+            // The first cycle after the answer belongs to the client.
+            next: self.client.hub.samples.written(),
         });
         Ok(())
     }
@@ -331,14 +335,14 @@ async fn publish(
                             Topic::Events => {}
                         }
                     },
-                    Some(Change::Subscribe { topics: begun, interval, words }) => {
+                    Some(Change::Subscribe { topics: begun, interval, words, next }) => {
                         for topic in begun {
                             topics.insert(topic as u8);
                             match topic {
                                 Topic::State => states = Some(timer(interval)),
                                 Topic::Samples => samples = Some(SampleSubscription {
                                     words: words.clone(),
-                                    next: hub.samples.written(),
+                                    next,
                                     timer: timer(interval),
                                 }),
                                 Topic::Events => {}
