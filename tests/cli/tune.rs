@@ -136,6 +136,25 @@ fn the_resonance_of_two_masses_is_estimated_within_5_percent() {
     within(&found["resonance_hz"], resonance, 0.05, "resonance");
 }
 
+#[test]
+fn a_load_that_the_simulation_cannot_resolve_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for keys in [
+        "inertia = 1e-9, load_inertia = 10.0, antiresonance = 1000.0",
+        "load_inertia = 1.0, antiresonance = 10.0, damping = 1.0",
+    ] {
+        let file = machine(folder.path(), "");
+        let text = std::fs::read_to_string(&file).expect("the file");
+        let text = text + &format!("[device.sim]\nmotor = {{ {keys} }}\n");
+        std::fs::write(&file, text).expect("written");
+        let refused = program::run(["check", &file]).exits(2);
+        assert_contains(
+            &refused.err,
+            &["motor and load swing with", "`load_inertia`"],
+        );
+    }
+}
+
 /// A proposed loop runs the axis that it was measured on.
 #[test]
 fn an_axis_moves_with_the_proposed_gains() {

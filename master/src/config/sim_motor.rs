@@ -45,6 +45,9 @@ impl MotorSetup {
     }
 }
 
+/// The highest frequency of two masses that the steps of the simulated current loop resolve.
+const MAX_RESONANCE_HZ: f64 = 2000.0;
+
 const INERTIA: [f64; 2] = [1e-9, 10.0];
 
 /// Checks the settings of a device, which has an axis or not.
@@ -80,6 +83,18 @@ pub(crate) fn check(raw: &RawMotor, has_axis: bool, p: &mut Problems<'_>) -> Mot
             antiresonance_hz,
             damping: damping.unwrap_or(0.02),
         });
+    if let (Some(load), Some(at)) = (elastic, &raw.antiresonance) {
+        let inertia = motor.inertia.unwrap_or(PlantParams::default().inertia);
+        let resonance = load.resonance_hz(inertia);
+        let damping = load.damping * resonance / load.antiresonance_hz;
+        if resonance > MAX_RESONANCE_HZ || damping > 1.0 {
+            let message = format!(
+                "motor and load swing with {resonance:.0} Hz, damped by {damping:.2}: the simulation has up to {MAX_RESONANCE_HZ} Hz and 1"
+            );
+            let hint = "write a smaller `load_inertia`, `antiresonance` or `damping`";
+            p.add_hint(at.span(), message, hint);
+        }
+    }
     MotorSetup { elastic, ..motor }
 }
 
