@@ -171,7 +171,7 @@ pub struct Client {
     pub stream: UnixStream,
     reader: BufReader<UnixStream>,
     next: u64,
-    /// Events that came between answers.
+    /// Events and other answers that came before an answer.
     pub events: Vec<Value>,
 }
 
@@ -212,10 +212,15 @@ impl Client {
         serde_json::from_str(&line).expect("JSON")
     }
 
+    /// Returns the answer to a request. Answers come in any order.
     pub fn answer(&mut self, id: u64) -> Value {
+        let is_answer = |line: &Value| line["id"] == json!(id);
+        if let Some(at) = self.events.iter().position(is_answer) {
+            return self.events.remove(at);
+        }
         loop {
             let line = self.line();
-            if line["id"] == json!(id) {
+            if is_answer(&line) {
                 return line;
             }
             self.events.push(line);
