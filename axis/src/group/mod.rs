@@ -3,11 +3,12 @@
 //! | module | contents |
 //! |---|---|
 //! | `line` | [`Line`]: a straight line through the positions of all axes, with one profile |
+//! | `path` | [`PathPlan`]: lines and arcs with blended corners, planned as a whole |
 //! | `together` | [`arrive_together`]: separate moves that take the same time |
 //!
 //! This module owns no axis. A line gives each axis its own set-point source ([`LinePath`]). All
 //! sources compute bit-identical results, so the axes stay synchronous without communication in the
-//! cycle. Nothing allocates.
+//! cycle. Nothing allocates, except the plan of a path before the motion.
 //!
 //! ```
 //! use ecaxis_axis::group::arrive_together;
@@ -25,7 +26,9 @@
 //! ```
 
 mod line;
+mod path;
 mod together;
 
 pub use line::{Line, LineAxis, LineError, LinePath};
+pub use path::{PathError, PathLimits, PathPlan, PathSegment};
 pub use together::arrive_together;

@@ -56,6 +56,7 @@ mod wave;
 
 pub use cam::{Cam, CamError, CamLaw, CamPoint};
 pub use error::SetpointError;
+pub(crate) use error::position as check_position;
 pub use gear::{Gear, GearConfig, GearInMode};
 pub use hold::Hold;
 pub use jerk::{Goal, JerkLimited, MoveRequest};
@@ -64,7 +65,7 @@ pub use rate::table_rate;
 pub use source::Source;
 pub use spline::{Interpolation, Knot};
 pub use stream::{Stream, StreamConfig, StreamState};
-pub use table::{Playback, Table, TableError, TableProblem};
+pub use table::{Playback, Table, TableError, TablePoint, TableProblem};
 pub use trapezoid::Trapezoid;
 pub(crate) use trapezoid::braking_velocity;
 pub use wave::{PositionWave, Shape, Wave};

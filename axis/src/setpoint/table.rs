@@ -78,12 +78,17 @@ pub struct Table {
     first_line: usize,
 }
 
-#[derive(Clone, Copy)]
-struct Row {
-    line: usize,
-    time: f64,
-    position: f64,
-    velocity: Option<f64>,
+/// A row of a table.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TablePoint {
+    /// The line in the text, from 1.
+    pub line: usize,
+    /// The time in seconds.
+    pub time: f64,
+    /// The position, user units.
+    pub position: f64,
+    /// The velocity, user units per second. All rows have one, or none.
+    pub velocity: Option<f64>,
 }
 
 impl Table {
@@ -92,15 +97,35 @@ impl Table {
     /// begins with a word are ignored. Without velocities, a cubic derives them from the
     /// neighbouring rows, with zero at both ends.
     pub fn parse(text: &str, interpolation: Interpolation) -> Result<Self, TableError> {
-        let rows = rows(text)?;
-        let [first, .., _] = rows.as_slice() else {
+        Self::of_rows(&rows(text)?, text.lines().count().max(1), interpolation)
+    }
+
+    /// Creates a table of cubics through points. Without velocities as in [`Table::parse`].
+    ///
+    /// # Errors
+    /// Fails if a value is impossible, or the times do not increase.
+    pub fn new(points: impl IntoIterator<Item = TablePoint>) -> Result<Self, TableError> {
+        let mut rows = Vec::new();
+        for point in points {
+            add(&mut rows, point)?;
+        }
+        let last = rows.last().map_or(1, |row| row.line);
+        Self::of_rows(&rows, last, Interpolation::Cubic)
+    }
+
+    fn of_rows(
+        rows: &[TablePoint],
+        last_line: usize,
+        interpolation: Interpolation,
+    ) -> Result<Self, TableError> {
+        let [first, .., _] = rows else {
             return Err(TableError {
-                line: text.lines().count().max(1),
+                line: last_line,
                 problem: TableProblem::Rows { most: MOST_ROWS },
             });
         };
         let first_line = first.line;
-        let velocities = velocities(&rows);
+        let velocities = velocities(rows);
         let knots = rows.iter().zip(velocities).map(|(row, velocity)| Knot {
             position: row.position,
             velocity,
@@ -122,6 +147,20 @@ impl Table {
             lines: rows.iter().skip(1).map(|row| row.line).collect(),
             first_line,
         })
+    }
+
+    /// Creates a table of cubics through points at constant distances in time.
+    pub(crate) fn of_knots(knots: &[Knot], distance_s: f64) -> Self {
+        let pieces = knots.windows(2).filter_map(|pair| match *pair {
+            [from, to] => Some(Piece::new(from, to, distance_s)),
+            _ => None,
+        });
+        Self {
+            interpolation: Interpolation::Cubic,
+            pieces: pieces.collect(),
+            lines: (2..=knots.len()).collect(),
+            first_line: 1,
+        }
     }
 
     /// Returns the first and the last position.
@@ -196,8 +235,8 @@ impl Table {
     }
 }
 
-fn rows(text: &str) -> Result<Vec<Row>, TableError> {
-    let mut rows: Vec<Row> = Vec::new();
+fn rows(text: &str) -> Result<Vec<TablePoint>, TableError> {
+    let mut rows: Vec<TablePoint> = Vec::new();
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);
     let mut heading = true;
     for (index, text) in text.lines().enumerate() {
@@ -214,26 +253,40 @@ fn rows(text: &str) -> Result<Vec<Row>, TableError> {
             continue;
         }
         let row = row(line, &fields).map_err(wrong)?;
-        if let Some(before) = rows.last() {
-            if row.time <= before.time {
-                return Err(wrong(TableProblem::NotLater {
-                    time: row.time,
-                    before: before.time,
-                }));
-            }
-            if row.velocity.is_some() != before.velocity.is_some() {
-                return Err(wrong(TableProblem::Columns {
-                    found: fields.len(),
-                    expected: "as many as in the row before",
-                }));
-            }
-        }
-        if rows.len() >= MOST_ROWS {
-            return Err(wrong(TableProblem::Rows { most: MOST_ROWS }));
-        }
-        rows.push(row);
+        add(&mut rows, row)?;
     }
     Ok(rows)
+}
+
+/// Adds a row after the last one.
+fn add(rows: &mut Vec<TablePoint>, row: TablePoint) -> Result<(), TableError> {
+    let wrong = |problem| TableError {
+        line: row.line,
+        problem,
+    };
+    let motion = |problem: SetpointError| wrong(problem.into());
+    position("time", row.time).map_err(motion)?;
+    position("position", row.position).map_err(motion)?;
+    position("velocity", row.velocity.unwrap_or_default()).map_err(motion)?;
+    if let Some(before) = rows.last() {
+        if row.time <= before.time {
+            return Err(wrong(TableProblem::NotLater {
+                time: row.time,
+                before: before.time,
+            }));
+        }
+        if row.velocity.is_some() != before.velocity.is_some() {
+            return Err(wrong(TableProblem::Columns {
+                found: 2 + usize::from(row.velocity.is_some()),
+                expected: "as many as in the row before",
+            }));
+        }
+    }
+    if rows.len() >= MOST_ROWS {
+        return Err(wrong(TableProblem::Rows { most: MOST_ROWS }));
+    }
+    rows.push(row);
+    Ok(())
 }
 
 /// Splits at commas and semicolons, with optional blanks; without commas and semicolons, at blanks.
@@ -254,7 +307,7 @@ fn number(field: &str) -> Option<f64> {
     field.parse().ok()
 }
 
-fn row(line: usize, fields: &[&str]) -> Result<Row, TableProblem> {
+fn row(line: usize, fields: &[&str]) -> Result<TablePoint, TableProblem> {
     let value = |field: &str| {
         number(field).ok_or_else(|| TableProblem::NotANumber {
             field: field.chars().take(QUOTED).collect(),
@@ -270,10 +323,7 @@ fn row(line: usize, fields: &[&str]) -> Result<Row, TableProblem> {
             });
         }
     };
-    position("time", time)?;
-    position("position", at)?;
-    position("velocity", velocity.unwrap_or_default())?;
-    Ok(Row {
+    Ok(TablePoint {
         line,
         time,
         position: at,
@@ -282,7 +332,7 @@ fn row(line: usize, fields: &[&str]) -> Result<Row, TableProblem> {
 }
 
 /// Returns the given velocities, or those of the parabola through each row and its neighbours.
-fn velocities(rows: &[Row]) -> Vec<f64> {
+fn velocities(rows: &[TablePoint]) -> Vec<f64> {
     let neighbours = rows.windows(3).map(|rows| match *rows {
         [a, b, c] => {
             let (before, after) = (b.time - a.time, c.time - b.time);
