@@ -310,6 +310,7 @@ fn programs_of_every_kind_allocate_nothing() {
         "probe.toml",
         "gantry.toml",
         "labeller.toml",
+        "outline.toml",
         "profiles.toml",
         "loops.toml",
         "program.toml",

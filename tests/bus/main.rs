@@ -26,6 +26,7 @@ mod mailbox_sizes;
 mod mailboxes;
 mod oddities;
 mod overrides;
+mod paths;
 mod phase;
 mod position_outputs;
 mod probe;

@@ -21,7 +21,8 @@ struct Kind {
     name: &'static str,
     steps: &'static str,
     jerk_limited: bool,
-    line: bool,
+    /// The corners of the lines that the axes stay on, within a tolerance in turns.
+    lines: (&'static [[f64; 3]], f64),
     end: [f64; 3],
 }
 
@@ -30,12 +31,12 @@ const fn kind(name: &'static str, steps: &'static str, jerk_limited: bool, end: 
         name,
         steps,
         jerk_limited,
-        line: false,
+        lines: (&[], 0.0),
         end,
     }
 }
 
-const KINDS: [Kind; 8] = [
+const KINDS: [Kind; 9] = [
     kind(
         "move",
         "[[step]]\nmove = { x = 10.0, y = -7.0, z = 3.0 }\n[[step]]\nmove = { x = 1.0, y = 2.0 }\nspeed = 0.6\n",
@@ -43,7 +44,7 @@ const KINDS: [Kind; 8] = [
         [1.0, 2.0, 3.0],
     ),
     Kind {
-        line: true,
+        lines: (&[[0.0; 3], [12.0, 12.0, -6.0], [2.0, 2.0, -1.0]], 0.0),
         ..kind(
             "line",
             "[[step]]\nline = { x = 12.0, y = 12.0, z = -6.0 }\nspeed = 0.7\n[[step]]\nline = { x = 2.0, y = 2.0, z = -1.0 }\n",
@@ -63,6 +64,25 @@ const KINDS: [Kind; 8] = [
         false,
         [0.0, 0.0, 0.0],
     ),
+    Kind {
+        lines: (
+            &[
+                [0.0; 3],
+                [4.0, 4.0, 0.0],
+                [8.0, 0.0, 2.0],
+                [8.0, -3.0, 0.0],
+                [1.0, 2.0, 3.0],
+            ],
+            0.25,
+        ),
+        ..kind(
+            "path",
+            "[[path]]\nname = \"p\"\naxes = [\"x\", \"y\", \"z\"]\ntolerance = 0.25\n\
+             points = [[0.0, 0.0, 0.0], [4.0, 4.0, 0.0], [8.0, 0.0, 2.0], [8.0, -3.0, 0.0], [1.0, 2.0, 3.0]]\n[[step]]\npath = \"p\"\n",
+            false,
+            [1.0, 2.0, 3.0],
+        )
+    },
     kind(
         "sine",
         "[[step]]\nsine = { x = { amplitude = 0.9, frequency = 3.2, periods = 6 } }\n",
@@ -200,6 +220,19 @@ fn keeps_limits(targets: &[i64], jerk_limited: bool, what: &str) {
     }
 }
 
+/// Returns the distance of a point from lines through corners.
+fn distance(at: [f64; 3], corners: &[[f64; 3]]) -> f64 {
+    let dot = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let minus = |a: [f64; 3], b: [f64; 3]| [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+    let lines = corners.windows(2).map(|ends| {
+        let (way, out) = (minus(ends[1], ends[0]), minus(at, ends[0]));
+        let along = (dot(way, out) / dot(way, way)).clamp(0.0, 1.0);
+        let off = minus(out, way.map(|way| way * along));
+        dot(off, off).sqrt()
+    });
+    lines.fold(f64::INFINITY, f64::min)
+}
+
 /// The axes stand for this many cycles between two motions.
 fn longest_rest(targets: &[i64]) -> usize {
     let moves: Vec<_> = targets.windows(2).map(|w| w[0] != w[1]).collect();
@@ -226,11 +259,15 @@ fn random_overrides_keep_limits_paths_and_ends() {
                 keeps_limits(targets, kind.jerk_limited, &what);
             }
             rests += usize::from(targets.iter().any(|targets| longest_rest(targets) > 50));
-            if kind.line {
+            let (corners, tolerance) = kind.lines;
+            if !corners.is_empty() {
                 let [x, y, z] = &targets;
                 for ((x, y), z) in x.iter().zip(y).zip(z) {
-                    assert_eq!(x, y, "seed {seed}");
-                    assert!((x + 2 * z).abs() <= 1, "seed {seed}: {x} {z}");
+                    let at = [x, y, z].map(|counts| *counts as f64 / COUNTS);
+                    let off = distance(at, corners);
+                    // Each axis is rounded to counts.
+                    let most = tolerance + 1.0 / COUNTS;
+                    assert!(off <= most, "{} seed {seed}: {off}", kind.name);
                 }
             }
             for (axis, end) in summary.axes.iter().zip(kind.end) {

@@ -65,14 +65,14 @@ fn folder(path: &Path) -> &Path {
 pub(crate) struct Inputs(Vec<(PathBuf, &'static str)>);
 
 impl Inputs {
-    /// Returns the machine file, and the ESI files and set-point tables that it names.
+    /// Returns the machine file, the ESI files that it names, and the tables: the other files.
     pub fn from_machine(machine: &Machine) -> Self {
         let esi = machine.devices.iter().map(|device| &device.esi_path);
-        let tables = machine.tables.iter().map(|table| &table.path);
+        let others = machine.files.iter().map(|file| &file.path);
         Self::default()
             .with("the machine file", [&machine.path])
             .with("an ESI file of this machine", esi)
-            .with("a set-point table of this machine", tables)
+            .with("a set-point table of this machine", others)
     }
 
     pub fn with<P: Into<PathBuf>>(

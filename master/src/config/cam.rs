@@ -4,11 +4,10 @@ use std::path::Path;
 
 use ecaxis_axis::setpoint::{Cam, CamPoint};
 
+use super::csv;
 use super::fields::KeyExt;
 use super::problem::{Problems, Span};
 use super::raw::RawCam;
-use crate::file::{self, unreadable};
-use crate::signature::SignedKind;
 
 /// A cam and its name in the machine file.
 #[derive(Debug, Clone, PartialEq)]
@@ -17,8 +16,7 @@ pub struct NamedCam {
     pub cam: Cam,
 }
 
-/// The maximum length of a file in bytes.
-const MAX_BYTES: u64 = 16 << 20;
+const HINT: &str = "a row is the master's position, the follower's, and if you like the slope";
 
 /// Checks the cams.
 pub(crate) fn check(raw: &[RawCam], folder: &Path, p: &mut Problems<'_>) -> Vec<NamedCam> {
@@ -34,9 +32,8 @@ pub(crate) fn check(raw: &[RawCam], folder: &Path, p: &mut Problems<'_>) -> Vec<
             continue;
         };
         let points: Option<Vec<_>> = rows.iter().map(|row| point(row)).collect();
-        let hint = "a row is the master's position, the follower's, and if you like the slope";
         let Some(points) = points else {
-            p.add_hint(place, "a point has 2 or 3 numbers", hint);
+            p.add_hint(place, "a point has 2 or 3 numbers", HINT);
             continue;
         };
         let law = raw.law.value().unwrap_or_default();
@@ -45,7 +42,7 @@ pub(crate) fn check(raw: &[RawCam], folder: &Path, p: &mut Problems<'_>) -> Vec<
                 name: name.get_ref().clone(),
                 cam,
             }),
-            Err(error) => p.add_hint(place, error.to_string(), hint),
+            Err(error) => p.add_hint(place, error.to_string(), HINT),
         }
     }
     cams
@@ -74,39 +71,9 @@ fn rows(raw: &RawCam, folder: &Path, p: &mut Problems<'_>) -> Option<(Vec<Vec<f6
             return None;
         }
     };
-    let path = folder.join(file.get_ref());
-    let text = match file::read_text(&path, MAX_BYTES) {
-        Ok(text) => text,
-        Err(error) => {
-            let hint = "paths are relative to the machine file";
-            p.add_hint(file.span(), unreadable(&path, &error), hint);
-            return None;
-        }
-    };
-    if let Err(error) = p.files.add(SignedKind::Tables, &path, text.as_bytes()) {
-        p.add_hint(file.span(), error.to_string(), error.hint());
-        return None;
-    }
-    let mut rows = Vec::new();
-    for (number, line) in (1..).zip(text.lines()) {
-        let line = line.split('#').next().unwrap_or_default().trim();
-        let separator = |c: char| c == ',' || c == ';' || c.is_whitespace();
-        let mut fields = line
-            .split(separator)
-            .filter(|field| !field.is_empty())
-            .peekable();
-        let word = |field: &&str| field.starts_with(|c: char| c.is_alphabetic());
-        if fields.peek().is_none() || (rows.is_empty() && fields.peek().is_some_and(word)) {
-            continue;
-        }
-        let row: Result<Vec<f64>, _> = fields.map(str::parse).collect();
-        let Ok(row) = row else {
-            let message = format!("{}, line {number}: a field is not a number", path.display());
-            let hint = "a row is the master's position, the follower's, and if you like the slope";
-            p.add_hint(file.span(), message, hint);
-            return None;
-        };
-        rows.push(row);
-    }
-    Some((rows, file.span()))
+    let rows = csv::read(file, folder, HINT, p)?;
+    Some((
+        rows.into_iter().map(|row| row.fields).collect(),
+        file.span(),
+    ))
 }

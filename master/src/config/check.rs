@@ -14,6 +14,7 @@ use super::fields::KeyExt;
 use super::gantry;
 use super::needed;
 use super::optional::OptionalPlaces;
+use super::path;
 use super::position_output;
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawBus, RawDevice, RawMachine};
@@ -90,8 +91,10 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         })
         .collect();
     let cams = cam::check(&raw.cams, folder, p);
-    let known = &devices;
+    let mut tables = Vec::new();
     let cycle_s = bus.as_ref().map_or(1e-3, |b| b.cycle_ns as f64 * 1e-9);
+    let paths = path::check(&raw.paths, &axes, folder, cycle_s, &mut tables, p);
+    let known = &devices;
     let repeat = raw.repeat.value().unwrap_or(1);
     let resolved = Resolved {
         devices: known,
@@ -100,6 +103,8 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         cycle_s,
         gantries: &gantries,
         cams: &cams,
+        paths: &paths,
+        tables: &tables,
     };
     let names = (raw.signals, raw.variables, raw.program, raw.sim);
     let program = steps::check(

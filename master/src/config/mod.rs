@@ -9,7 +9,7 @@
 //! | `schema.rs` | the tables as a JSON schema, for editors |
 //! | `check.rs` | raw → [`Machine`]: bus, names, positions |
 //! | `position_output.rs` | outputs that follow the position of an axis |
-//! | `cam.rs` | cams |
+//! | `cam.rs`, `path.rs`, `csv.rs` | cams, paths, and files with rows of numbers |
 //! | `copy.rs` | inputs that are copied to outputs |
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
 //! | `locator.rs` | how a device is located on the bus |
@@ -42,6 +42,7 @@ mod axis_setup;
 mod cam;
 mod check;
 mod copy;
+mod csv;
 mod device;
 #[cfg(test)]
 mod documented;
@@ -55,6 +56,7 @@ mod gateway;
 mod locator;
 mod needed;
 mod optional;
+mod path;
 mod position_output;
 mod problem;
 mod program;
@@ -89,7 +91,7 @@ pub use position_output::PositionOutputSetup;
 pub use problem::{ConfigError, Problem};
 pub use program::{
     Action, AxisValue, NamedSignal, NumberPlace, ProgramInputs, Step, StopGroup, StopSetup,
-    Subject, SwitchedInput, TableFile, Test, Variable, VariableRef, VariableUse, When,
+    Subject, SwitchedInput, Test, Variable, VariableRef, VariableUse, When,
 };
 pub use signal::{NameError, Signal};
 pub use startup::{Startup, StartupOptions};
@@ -153,7 +155,7 @@ pub struct Machine {
     pub stop: StopSetup,
     pub overrides: OverrideConfig,
     /// The set-point tables that the steps play.
-    pub tables: Vec<TableFile>,
+    pub tables: Vec<ecaxis_axis::setpoint::Table>,
     /// The number of program runs, at least 1.
     pub repeat: u32,
     /// `true` if the axes get power. Otherwise the bus goes to Op and the axes stay disabled.

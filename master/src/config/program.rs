@@ -1,7 +1,5 @@
 //! The program of a machine, its stop settings, and their text for `explain`, progress and errors.
 
-use std::path::PathBuf;
-
 mod describe;
 mod variables;
 
@@ -89,11 +87,12 @@ pub enum Action {
         axis: AxisIndex,
         wave: ecaxis_axis::setpoint::Wave,
     },
-    /// Move to the table's first position, then play the table.
+    /// Move to the first positions of the tables, then play them in common time.
     Table {
-        axis: AxisIndex,
-        /// The index into [`Machine::tables`](super::Machine::tables).
-        table: usize,
+        /// The files, or the path.
+        name: String,
+        /// Each axis with an index into [`Machine::tables`](super::Machine::tables).
+        tables: Vec<(AxisIndex, usize)>,
         /// The fractions for the move to the first position, as in [`Action::Move`].
         speed: f64,
         ramp: f64,
@@ -219,11 +218,11 @@ impl Action {
             | Self::Velocity { targets, .. }
             | Self::Phase { targets }
             | Self::Torque { targets, .. } => targets.iter().map(|&(axis, _)| axis).collect(),
+            Self::Table { tables, .. } => tables.iter().map(|&(axis, _)| axis).collect(),
             Self::Mode { targets } => targets.iter().map(|&(axis, _)| axis).collect(),
-            Self::Wave { axis, .. }
-            | Self::Table { axis, .. }
-            | Self::Probe { axis, .. }
-            | Self::Gear { axis, .. } => vec![*axis],
+            Self::Wave { axis, .. } | Self::Probe { axis, .. } | Self::Gear { axis, .. } => {
+                vec![*axis]
+            }
             _ => Vec::new(),
         }
     }
@@ -405,11 +404,4 @@ pub struct StopGroup {
     /// The stop method of its other axes after a fault or trip.
     pub others: StopMethod,
     pub outside: GroupStopScope,
-}
-
-/// A table of set-points and its file.
-#[derive(Debug, Clone, PartialEq)]
-pub struct TableFile {
-    pub path: PathBuf,
-    pub table: ecaxis_axis::setpoint::Table,
 }

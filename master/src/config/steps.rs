@@ -21,6 +21,7 @@ mod target;
 
 use super::fields::{Key, KeyExt};
 use super::gantry::CheckedGantry;
+use super::path::NamedPath;
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{
     Levels, NamedValues, RawAction, RawAxes, RawNumber, RawOverride, RawProgram, RawSimulation,
@@ -29,10 +30,11 @@ use super::raw::{
 use super::subprograms::MOST_STEPS;
 use super::{
     Action, AxisSetup, DeviceConfig, NamedCam, NamedSignal, NumberPlace, OverrideConfig,
-    ProgramInputs, Signal, Step, StopSetup, SwitchedInput, TableFile, Variable, VariableUse,
+    ProgramInputs, Signal, Step, StopSetup, SwitchedInput, Variable, VariableUse,
 };
 use crate::rt::gantry::GantryConfig;
 use ecaxis_axis::Mode;
+use ecaxis_axis::setpoint::Table;
 use target::TargetKind;
 
 /// The default fraction of the limits for the move to the beginning of a table.
@@ -76,6 +78,9 @@ pub(crate) struct Resolved<'c> {
     pub cycle_s: f64,
     pub gantries: &'c [CheckedGantry],
     pub cams: &'c [NamedCam],
+    /// The paths, with indices into `tables`.
+    pub paths: &'c [NamedPath],
+    pub tables: &'c [Table],
 }
 
 /// The steps with their signals.
@@ -88,7 +93,7 @@ pub(crate) struct Program {
     pub outputs: Vec<Signal>,
     /// For each output, the first place that sets it.
     pub output_places: Vec<Span>,
-    pub tables: Vec<TableFile>,
+    pub tables: Vec<Table>,
     pub signals: Vec<NamedSignal>,
     pub variables: Vec<Variable>,
     pub buttons: ProgramInputs,
@@ -117,7 +122,8 @@ pub(crate) fn check(
         cycle_s: known.cycle_s,
         gantries: known.gantries.iter().map(|gantry| gantry.config).collect(),
         cams: known.cams,
-        tables: Vec::new(),
+        paths: known.paths,
+        tables: known.tables.to_vec(),
         inputs: Vec::new(),
         outputs: Vec::new(),
         output_places: Vec::new(),
@@ -149,6 +155,7 @@ pub(crate) fn check(
         step: button(buttons.step),
     };
     let stop = checker.stop(&stop, p);
+    checker.check_groups(&steps, &stop, p);
     let overrides = checker.overrides(&overrides, p);
     let switched = checker.switched_inputs(sim, p);
     Program {
@@ -173,7 +180,8 @@ struct ProgramChecker<'c> {
     cycle_s: f64,
     gantries: Vec<GantryConfig>,
     cams: &'c [NamedCam],
-    tables: Vec<TableFile>,
+    paths: &'c [NamedPath],
+    tables: Vec<Table>,
     inputs: Vec<Signal>,
     outputs: Vec<Signal>,
     output_places: Vec<Span>,
@@ -239,6 +247,23 @@ impl ProgramChecker<'_> {
         checked
     }
 
+    /// Returns the fractions for the move to the first position of a table.
+    fn gentle(
+        &mut self,
+        [speed, ramp]: [&Key<RawNumber>; 2],
+        p: &mut Problems<'_>,
+    ) -> Option<[f64; 2]> {
+        let mut fraction = |value: &Key<RawNumber>, place| match value {
+            Some(_) => self.fraction(value, place, p),
+            None => Some(GENTLE),
+        };
+        let fractions = (
+            fraction(speed, NumberPlace::Speed),
+            fraction(ramp, NumberPlace::Ramp),
+        );
+        Some([fractions.0?, fractions.1?])
+    }
+
     fn one(&mut self, raw: RawStep, number: &str, p: &mut Problems<'_>) -> Option<Action> {
         let RawStep {
             span,
@@ -302,14 +327,13 @@ impl ProgramChecker<'_> {
                 }
             }
             RawAction::Wave { square, axis, wave } => self.wave(square, &axis, &wave, p)?,
-            RawAction::Table { axis, file } => {
-                let mut gentle = |value: &Key<RawNumber>, place| match value {
-                    Some(_) => self.fraction(value, place, p),
-                    None => Some(GENTLE),
-                };
-                let speed = gentle(&speed, NumberPlace::Speed);
-                let ramp = gentle(&ramp, NumberPlace::Ramp);
-                self.table(&axis, &file, [speed?, ramp?], p)?
+            RawAction::Table(files) => {
+                let pace = self.gentle([&speed, &ramp], p)?;
+                self.table(&files, pace, p)?
+            }
+            RawAction::Path(name) => {
+                let pace = self.gentle([&speed, &ramp], p)?;
+                self.path(&name, pace, p)?
             }
             RawAction::Gear(axis, gear) => self.gear(&axis, &gear, p)?,
             RawAction::Phase(targets) => Action::Phase {

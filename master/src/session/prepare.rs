@@ -160,7 +160,7 @@ impl RunBuilder<'_> {
                     signals,
                     controller,
                     samples,
-                    tables: machine.tables.iter().map(|t| t.table.clone()).collect(),
+                    tables: machine.tables.clone().into(),
                     phase: bus.dc.as_ref().map(Phase::new),
                     end: rt_end,
                 };

@@ -155,17 +155,18 @@ impl Turn<'_, '_> {
             .await
     }
 
-    /// Moves to the first row of a table, then plays the table.
+    /// Moves to the first rows of the tables, then plays all in common time.
     pub(super) async fn play(
         &mut self,
         step: &Step,
         start: Nanos,
-        axis: AxisIndex,
-        table: usize,
+        tables: &[(AxisIndex, usize)],
         [speed, ramp]: [f64; 2],
     ) -> Result<(), Error> {
-        let [first, _] = self.machine.tables[table].table.ends();
-        let there = [(axis, first)];
+        let there: Vec<_> = tables
+            .iter()
+            .map(|&(axis, table)| (axis, self.machine.tables[table].ends()[0]))
+            .collect();
         self.move_and_wait(step, start, TargetKind::Position, &there, |position| {
             Command::MoveTo {
                 position,
@@ -178,12 +179,15 @@ impl Turn<'_, '_> {
             return Ok(());
         }
         let snapshot = self.poll_and_query().await?;
-        let limits = self.limits(axis).motion();
-        let at = commanded(&snapshot.axes[axis]);
-        let playback = Playback::new(&self.machine.tables[table].table, at, limits, 0.0)
-            .map_err(|error| self.refusal(step, axis, &error))?;
-        let generator = (axis, GeneratorRequest::Table { table, playback });
-        self.follow(step, start, &[generator], GeneratorState::Finished)
+        let mut generators = Vec::with_capacity(tables.len());
+        for &(axis, table) in tables {
+            let limits = self.limits(axis).motion();
+            let at = commanded(&snapshot.axes[axis]);
+            let playback = Playback::new(&self.machine.tables[table], at, limits, 0.0)
+                .map_err(|error| self.refusal(step, axis, &error))?;
+            generators.push((axis, GeneratorRequest::Table { table, playback }));
+        }
+        self.follow(step, start, &generators, GeneratorState::Finished)
             .await
     }
 

@@ -341,11 +341,11 @@ impl Turn<'_, '_> {
             }
             Action::Wave { axis, wave } => self.wave(step, start, *axis, *wave).await,
             Action::Table {
-                axis,
-                table,
+                tables,
                 speed,
                 ramp,
-            } => self.play(step, start, *axis, *table, [*speed, *ramp]).await,
+                ..
+            } => self.play(step, start, tables, [*speed, *ramp]).await,
             Action::Gear {
                 axis,
                 master,

@@ -99,15 +99,15 @@ impl Machine {
                 self.names(&[*axis]),
                 rounded(wave.duration_s())
             ),
-            Action::Table { axis, table, .. } => {
-                let file = self
-                    .tables
-                    .get(*table)
-                    .map(|t| t.path.display().to_string());
+            Action::Table { name, tables, .. } => {
+                let axes: Vec<_> = tables.iter().map(|&(axis, _)| axis).collect();
+                let first = tables
+                    .first()
+                    .and_then(|&(_, table)| self.tables.get(table));
                 format!(
-                    "move {} along {}",
-                    self.names(&[*axis]),
-                    file.unwrap_or_default()
+                    "move {} along {name}, {} s",
+                    self.names(&axes),
+                    rounded(first.map_or(0.0, ecaxis_axis::setpoint::Table::duration_s))
                 )
             }
             Action::Gear {

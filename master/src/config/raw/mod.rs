@@ -19,11 +19,13 @@ use super::{ExchangeMode, GroupStopScope, MailboxSource, SocketKind, Spin, Unkno
 mod axis;
 mod condition;
 mod number;
+mod path;
 mod step;
 
 pub(crate) use axis::{AxisTables, RawAxis, RawHoming, RawLimits};
 pub(crate) use condition::{Conditions, Levels, NamedValues, RawCondition, RawSignal, RawWhen};
 pub(crate) use number::{RawNumber, RawVariable};
+pub(crate) use path::{RawPath, RawPoint};
 pub(crate) use step::{Named, RawAction, RawAxes, RawGear, RawProbe, RawStep, RawWave, TimeLimit};
 
 table! { "the machine file",
@@ -41,6 +43,8 @@ table! { "the machine file",
         gantries: Vec<RawGantry> as "gantry",
         /// Cams that steps `gear` name
         cams: Vec<RawCam> as "cam",
+        /// Lines and arcs of several axes that steps `path` name
+        paths: Vec<RawPath> as "path",
         /// Outputs that are on at positions of an axis
         position_outputs: Vec<RawPositionOutput> as "position_output",
         /// Inputs of one device that become outputs of another

@@ -56,10 +56,8 @@ pub(crate) enum RawAction {
         axis: Spanned<String>,
         wave: RawWave,
     },
-    Table {
-        axis: Spanned<String>,
-        file: Spanned<String>,
-    },
+    Table(Named<String>),
+    Path(Spanned<String>),
     Gear(Spanned<String>, RawGear),
     Phase(Named<RawNumber>),
     Velocity(Named<RawNumber>),
@@ -170,7 +168,7 @@ table! { "a probe",
 /// The verbs, each with an example and the keys that go with it. The key of a step that is a verb
 /// defines the action.
 #[rustfmt::skip] // one row per verb
-const VERBS: [(&str, &str, &[&str]); 33] = [
+const VERBS: [(&str, &str, &[&str]); 34] = [
     ("enable", "enable = [\"x\"]", &[]),
     ("disable", "disable = true", &[]),
     ("reset", "reset = [\"x\"]", &[]),
@@ -186,6 +184,7 @@ const VERBS: [(&str, &str, &[&str]); 33] = [
     ("sine", "sine = { x = { amplitude = 1.0, frequency = 2.0, periods = 5 } }", &[]),
     ("square", "square = { x = { amplitude = 1.0, frequency = 0.5, periods = 5 } }", &[]),
     ("table", "table = { x = \"points.csv\" }", &["speed", "ramp"]),
+    ("path", "path = \"outline\"", &["speed", "ramp"]),
     ("gear", "gear = { y = { to = \"x\", ratio = 2.0 } }", &[]),
     ("phase", "phase = { y = 5.0 }", &[]),
     ("velocity", "velocity = { v = 100.0 }", &["ramp"]),
@@ -345,10 +344,8 @@ impl<'d> Step<'_, 'd> {
                 probe.distance(p)?;
                 RawAction::Probe(axis, probe)
             }
-            "table" => {
-                let (axis, file) = self.only(value, p)?;
-                RawAction::Table { axis, file }
-            }
+            "table" => RawAction::Table(self.named(value, p)?),
+            "path" => RawAction::Path(Spanned::read(value, verb, p)?),
             "gear" => {
                 let (axis, gear) = self.only(value, p)?;
                 RawAction::Gear(axis, gear)

@@ -9,15 +9,10 @@ use toml::Spanned;
 use super::ProgramChecker;
 use super::target::TargetKind;
 use crate::config::fields::KeyExt;
+use crate::config::path::NamedPath;
 use crate::config::problem::{Problems, suggestion};
-use crate::config::raw::{RawGear, RawWave};
-use crate::config::{Action, AxisSetup, NamedCam, TableFile};
-use crate::file;
-use crate::file::unreadable;
-use crate::signature::SignedKind;
-
-/// The maximum length of a table in bytes.
-const MAX_TABLE_BYTES: u64 = 64 << 20;
+use crate::config::raw::{Named, RawGear, RawWave};
+use crate::config::{Action, AxisSetup, NamedCam, Step, StopSetup, csv};
 
 /// The default smoothing of a gear that follows actual positions, in ns.
 const SMOOTHING_NS: u64 = 10_000_000;
@@ -129,49 +124,92 @@ impl ProgramChecker<'_> {
         }
     }
 
+    /// Returns the step that plays a table with each axis.
     pub(super) fn table(
         &mut self,
-        name: &Spanned<String>,
-        file: &Spanned<String>,
+        files: &Named<String>,
         [speed, ramp]: [f64; 2],
         p: &mut Problems<'_>,
     ) -> Option<Action> {
-        let path = self.folder.join(file.get_ref());
-        let text = match file::read_text(&path, MAX_TABLE_BYTES) {
-            Ok(text) => text,
-            Err(error) => {
-                let hint = "paths are relative to the machine file";
-                p.add_hint(file.span(), unreadable(&path, &error), hint);
-                return None;
+        let mut tables = Vec::with_capacity(files.len());
+        for (name, file) in files {
+            let text = csv::text(file, self.folder, p)?;
+            let path = self.folder.join(file.get_ref());
+            let (index, axis) = self.positioned(name, "table", p)?;
+            let limits = &axis.config.limits;
+            let table = Table::parse(&text, Interpolation::Cubic).and_then(|table| {
+                table.check(limits.motion(), limits.position, 0.0, self.cycle_s)?;
+                Ok(table)
+            });
+            match table {
+                Ok(table) => {
+                    self.tables.push(table);
+                    tables.push((index, self.tables.len() - 1));
+                }
+                Err(error) => {
+                    let message = format!("{}, {error}", path.display());
+                    let hint = "a row is time in seconds, position, and if you like velocity";
+                    p.add_hint(file.span(), message, hint);
+                    return None;
+                }
             }
-        };
-        let used = p.files.add(SignedKind::Tables, &path, text.as_bytes());
-        if let Err(error) = used {
-            p.add_hint(file.span(), error.to_string(), error.hint());
-            return None;
         }
-        let (index, axis) = self.positioned(name, "table", p)?;
-        let limits = &axis.config.limits;
-        let table = Table::parse(&text, Interpolation::Cubic).and_then(|table| {
-            table.check(limits.motion(), limits.position, 0.0, self.cycle_s)?;
-            Ok(table)
-        });
-        match table {
-            Ok(table) => {
-                self.tables.push(TableFile { path, table });
-                let table = self.tables.len() - 1;
-                Some(Action::Table {
-                    axis: index,
-                    table,
-                    speed,
-                    ramp,
-                })
+        let names = files.iter().map(|(_, file)| file.get_ref().as_str());
+        Some(Action::Table {
+            name: names.collect::<Vec<_>>().join(", "),
+            tables,
+            speed,
+            ramp,
+        })
+    }
+
+    /// Returns the step that moves axes on a path of the machine file.
+    pub(super) fn path(
+        &self,
+        name: &Spanned<String>,
+        [speed, ramp]: [f64; 2],
+        p: &mut Problems<'_>,
+    ) -> Option<Action> {
+        let known = |path: &&NamedPath| path.name == *name.get_ref();
+        let Some(path) = self.paths.iter().find(known) else {
+            let message = format!("no path is named `{}`", name.get_ref());
+            let names = self.paths.iter().map(|path| path.name.as_str());
+            let hint = match self.paths.is_empty() {
+                true => "add a [[path]] with this `name`".to_owned(),
+                false => suggestion(name.get_ref(), names, "paths"),
+            };
+            p.add_hint(name.span(), message, hint);
+            return None;
+        };
+        for &(axis, _) in &path.tables {
+            let axis = self.axes.get(axis)?;
+            self.positioned(&Spanned::new(name.span(), axis.name.to_owned()), "path", p)?;
+        }
+        Some(Action::Table {
+            name: format!("path `{}`", path.name),
+            tables: path.tables.clone(),
+            speed,
+            ramp,
+        })
+    }
+    /// Checks that axes that play tables together stop together: their tables share one time.
+    pub(super) fn check_groups(&self, steps: &[Step], stop: &StopSetup, p: &mut Problems<'_>) {
+        for step in steps {
+            if let Action::Table { tables, .. } = &step.action {
+                let group_of = |&(axis, _): &(AxisIndex, usize)| {
+                    let device = self.axes.get(axis)?.device;
+                    stop.groups.iter().position(|g| g.devices.contains(&device))
+                };
+                let mut groups = tables.iter().map(group_of);
+                let first = groups.next();
+                if groups.any(|group| Some(group) != first) {
+                    let message = "the axes of this step are in different groups";
+                    let hint = "name all of them in one [[stop.group]]";
+                    p.add_hint(self.place_of(step), message, hint);
+                }
             }
-            Err(error) => {
-                let message = format!("{}, {error}", path.display());
-                let hint = "a row is time in seconds, position, and if you like velocity";
-                p.add_hint(file.span(), message, hint);
-                None
+            for inner in step.action.lists() {
+                self.check_groups(inner, stop, p);
             }
         }
     }

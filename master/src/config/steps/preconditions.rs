@@ -246,7 +246,11 @@ impl ProgramState<'_, '_, '_, '_> {
             Action::Wave { axis, .. } => {
                 self.follow_setpoints(step, "sine` or `square", *axis, true)
             }
-            Action::Table { axis, .. } => self.follow_setpoints(step, "table", *axis, false),
+            Action::Table { tables, .. } => {
+                for &(axis, _) in tables {
+                    self.follow_setpoints(step, "table", axis, false);
+                }
+            }
             Action::Gear { axis, master, .. } => {
                 let need = Precondition {
                     verb: "gear",

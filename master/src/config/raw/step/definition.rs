@@ -75,15 +75,14 @@ fn argument(verb: &str) -> Json {
             probe["oneOf"] = json!([{ "required": ["to"] }, { "required": ["by"] }]);
             only(probe)
         }
-        "table" => only(String::schema()),
         "gear" => only(RawGear::schema()),
-        "mode" => named(String::schema()),
+        "table" | "mode" => named(String::schema()),
         "dwell" => RawNumber::<Ns>::schema(),
         "wait" | "while" | "if" => RawWhen::schema(),
         "set" => Levels::schema(),
         "override" => any_of([f64::schema(), named(f64::schema())]),
         "let" | "add" => named(RawNumber::<f64>::schema()),
-        "message" | "alarm" | "call" => String::schema(),
+        "message" | "alarm" | "call" | "path" => String::schema(),
         "parallel" => json!({
             "type": "array", "minItems": 2, "maxItems": MOST_BRANCHES,
             "items": {
