@@ -30,6 +30,7 @@ mod paths;
 mod phase;
 mod position_outputs;
 mod probe;
+mod profile_modes;
 mod program;
 mod repeats;
 mod samples;

@@ -69,6 +69,7 @@ pub(crate) fn check(
             .extend(mailbox_note(device, image.as_deref(), mailbox));
         further_axes(chosen);
         repeated_outputs(chosen);
+        profile_objects(&raw, chosen, p);
     }
     let sim = raw.sim.take().map(|sim| {
         let axis = match axes.first() {
@@ -155,6 +156,32 @@ fn mailbox_note(
     })
 }
 
+/// Reports objects that a profile mode needs and the process data lacks.
+fn profile_objects(raw: &RawDevice, selection: &esi::Selection, p: &mut Problems<'_>) {
+    let Some(text) = &raw.mode else { return };
+    let missing = needed::profile(text.get_ref()).iter().find_map(|index| {
+        let objects = selection.axes.iter();
+        let object = objects.map(|number| esi::axis::object(*index, *number));
+        let there = |object: &u16| selection.layout.rx.iter().any(|f| f.index == *object);
+        let mut missing = object.filter(|object| !there(object));
+        missing.next()
+    });
+    if let Some(missing) = missing {
+        let message = format!(
+            "mode \"{}\" needs 0x{missing:04X} in the outputs, and they lack it",
+            text.get_ref()
+        );
+        let fields = selection.layout.rx.iter().filter(|field| field.index != 0);
+        let all = fields.map(|field| format!("\"0x{:04X}\"", field.index));
+        let all = all.chain([format!("\"0x{missing:04X}\"")]);
+        let hint = format!(
+            "write `pdo.rx = [{}]` if the drive can map it, or begin in \"csp\"",
+            all.collect::<Vec<_>>().join(", ")
+        );
+        p.add_hint(text.span(), message, hint);
+    }
+}
+
 /// Reports outputs that several PDOs map.
 fn repeated_outputs(selection: &mut esi::Selection) {
     let repeats = selection.layout.repeated_outputs().map(|(first, field)| {
@@ -212,12 +239,7 @@ fn identity(rule: Option<&Spanned<String>>, p: &mut Problems<'_>) -> Option<Revi
 
 /// Returns `Err` if the mode is invalid and has been reported.
 fn mode(raw: &RawDevice, p: &mut Problems<'_>) -> Result<Option<esi::Mode>, ()> {
-    let cyclic = || {
-        esi::Mode::ALL
-            .into_iter()
-            .filter(|m| m.is_cyclic())
-            .map(esi::Mode::name)
-    };
+    let possible = |mode: &esi::Mode| *mode != esi::Mode::Hm;
     let Some(text) = &raw.mode else {
         let Some(axis) = raw.axes.0.first() else {
             return Ok(None);
@@ -231,8 +253,8 @@ fn mode(raw: &RawDevice, p: &mut Problems<'_>) -> Result<Option<esi::Mode>, ()> 
         return Err(());
     };
     match text.get_ref().parse::<esi::Mode>() {
-        Ok(mode) if mode.is_cyclic() && !raw.axes.0.is_empty() => Ok(Some(mode)),
-        Ok(mode) if mode.is_cyclic() => {
+        Ok(mode) if possible(&mode) && !raw.axes.0.is_empty() => Ok(Some(mode)),
+        Ok(mode) if possible(&mode) => {
             let message = "a device with a `mode` is a drive and needs a [device.axis]";
             p.add_hint(
                 text.span(),
@@ -242,21 +264,16 @@ fn mode(raw: &RawDevice, p: &mut Problems<'_>) -> Result<Option<esi::Mode>, ()> 
             Err(())
         }
         Ok(mode) => {
-            let message = format!("mode \"{mode}\" is not driven every cycle");
-            p.add_hint(
-                text.span(),
-                message,
-                "axes run in \"csp\", \"csv\" or \"cst\"",
-            );
+            let message = format!("no axis begins in mode \"{mode}\"");
+            let hint = "write \"csp\", \"csv\", \"cst\", \"pp\" or \"pv\"; a step `home` switches by itself";
+            p.add_hint(text.span(), message, hint);
             Err(())
         }
         Err(_) => {
             let message = format!("unknown mode \"{}\"", text.get_ref());
-            p.add_hint(
-                text.span(),
-                message,
-                suggestion(text.get_ref(), cyclic(), "modes"),
-            );
+            let modes = esi::Mode::ALL.into_iter().filter(possible);
+            let hint = suggestion(text.get_ref(), modes.map(esi::Mode::name), "modes");
+            p.add_hint(text.span(), message, hint);
             Err(())
         }
     }

@@ -27,6 +27,27 @@ impl NeededObjects {
             }
         }
     }
+
+    /// Adds the objects of a mode. An unknown one is reported elsewhere.
+    fn add_mode(&mut self, mode: &str) {
+        let mode = mode.parse::<esi::Mode>();
+        let mode = mode.map(|mode| Mode::from_code(mode.code()));
+        let known = MODE_OBJECTS.iter().find(|(known, ..)| Ok(*known) == mode);
+        if let Some((_, targets, reported)) = known {
+            self.add(targets, reported);
+        }
+    }
+}
+
+/// Returns the outputs of PP and PV, and none of other modes.
+pub(crate) fn profile(mode: &str) -> &'static [u16] {
+    let mode = match mode.parse() {
+        Ok(esi::Mode::Pp) => Mode::Pp,
+        Ok(esi::Mode::Pv) => Mode::Pv,
+        _ => return &[],
+    };
+    let known = MODE_OBJECTS.iter().find(|(known, ..)| *known == mode);
+    known.map_or(&[], |(_, targets, _)| *targets)
 }
 
 /// The needs of each axis by name.
@@ -48,12 +69,7 @@ fn collect(steps: &[RawStep], needs: &mut Needs) {
                 for (axis, mode) in targets {
                     let own = needs.entry(axis.get_ref().clone()).or_default();
                     own.add(MODE.0, MODE.1);
-                    let mode = mode.get_ref().parse::<esi::Mode>();
-                    let mode = mode.map(|mode| Mode::from_code(mode.code()));
-                    let known = MODE_OBJECTS.iter().find(|(known, ..)| Ok(*known) == mode);
-                    if let Some((_, targets, reported)) = known {
-                        own.add(targets, reported);
-                    }
+                    own.add_mode(mode.get_ref());
                 }
             }
             RawAction::Probe(axis, probe) => {
@@ -103,6 +119,9 @@ pub(crate) fn missing(
         let mut own = own.cloned().unwrap_or_default();
         if axis.homing.is_some() {
             own.add(MODE.0, MODE.1);
+        }
+        if let Some(mode) = &raw.mode {
+            own.add(profile(mode.get_ref()), &[]);
         }
         for (missing, (list, fields)) in missing
             .iter_mut()

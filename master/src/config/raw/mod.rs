@@ -197,8 +197,7 @@ impl Schema for Spin {
     }
 }
 
-/// The cyclic modes.
-const MODES: [&str; 3] = ["csp", "csv", "cst"];
+const MODES: [&str; 5] = ["csp", "csv", "cst", "pp", "pv"];
 
 const IDENTITIES: [&str; 6] = ["equal", ">=", "newer", "high-word", "low-word", "ignore"];
 
@@ -240,8 +239,8 @@ table! { "[[device]]",
         /// Parameter file (`ecaxis sdo dump`) of the device; its settings are written to a device with
         /// another serial number (path; default none)
         parameters: Key<String>,
-        /// Selects module or PDO set, 0x6060 and start-up SDOs (`"csp"`, `"csv"`, `"cst"`; default
-        /// none: no axis)
+        /// Selects module or PDO set, 0x6060 and start-up SDOs (`"csp"`, `"csv"`, `"cst"`, `"pp"`,
+        /// `"pv"`; default none: no axis)
         mode: Key<String> [MODES],
         /// OpMode by name; `"off"`: no distributed clock (text; default the ESI's first OpMode)
         dc: Key<String>,

@@ -39,7 +39,7 @@ fn config_reports_each_mistake_with_its_place() {
         ("position = 0", "position = 0\nproduct = 0x11", "matches product 0x00000011", "", "0x11"),
         ("position = 0", "position = 0\ndc = \"FreeRun\"", "no DC mode", "", "\"FreeRun\""),
         ("\"csp\"", "\"cps\"", "unknown mode", "did you mean `csp`?", "\"cps\""),
-        ("\"csp\"", "\"pp\"", "not driven every cycle", "csv", "\"pp\""),
+        ("\"csp\"", "\"hm\"", "no axis begins in mode", "csv", "\"hm\""),
         ("index = 0x6065", "index = 0x6066", "no such object", "type", "{ index = 0x6066, value = 2500 }"),
         ("value = 2500", "value = -1", "does not fit", "", "-1"),
         ("value = 2500", "valeu = 2500", "unknown key `valeu`", "did you mean `value`?", "valeu"),
