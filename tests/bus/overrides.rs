@@ -6,6 +6,7 @@ use std::fmt::Write as _;
 
 use ecaxis_master::config::Machine;
 use ecaxis_test_support::bench::Bench;
+use ecaxis_test_support::random::Random;
 use ecaxis_test_support::recordings::process_images;
 use ecaxis_test_support::{assert_contains, recorded, run_badly, run_well, virtual_time};
 
@@ -109,18 +110,6 @@ const KINDS: [Kind; 9] = [
     ),
 ];
 
-/// xorshift64*.
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, bound: u64) -> u64 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        (self.0.wrapping_mul(0x2545_f491_4f6c_dd1d) >> 33) % bound
-    }
-}
-
 /// Returns a folder with a terminal that has an analog input.
 fn bench() -> Bench {
     let bench = Bench::new();
@@ -140,7 +129,7 @@ fn bench() -> Bench {
 fn machine(bench: &Bench, steps: &str, random: Option<u64>) -> Machine {
     let mut inputs = String::from("{ at = \"0s\", set = { pot = 1000 } },\n");
     if let Some(seed) = random {
-        let mut random = Random(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
+        let mut random = Random::new(seed);
         let mut at = 700;
         while at < 5000 {
             at += 20 + random.below(400);

@@ -5,6 +5,7 @@
 
 use std::fmt::Write as _;
 
+use ecaxis_test_support::random::Random;
 use ecaxis_test_support::recordings::process_images;
 use ecaxis_test_support::{assert_contains, faults, machine, recorded, run_badly, run_well};
 
@@ -12,18 +13,6 @@ use ecaxis_test_support::{assert_contains, faults, machine, recorded, run_badly,
 const TERMINAL: usize = 13;
 const COUNTS: f64 = 131_072.0;
 const DT: f64 = 0.001;
-
-/// xorshift64*.
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, bound: u64) -> u64 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        (self.0.wrapping_mul(0x2545_f491_4f6c_dd1d) >> 33) % bound
-    }
-}
 
 fn text(outputs: &str, steps: &str) -> String {
     format!(
@@ -90,7 +79,7 @@ fn outputs_switch_within_a_cycle_of_the_ideal() {
     let seeds = seeds.map_or(12, |n| n.parse().expect("a number"));
     let mut worst = [0.0_f64; 2];
     for seed in 1..=seeds {
-        let mut random = Random(u64::wrapping_mul(seed, 0x9e37_79b9_7f4a_7c15) | 1);
+        let mut random = Random::new(seed);
         let lead_ms = [0, 0, 2, 5][usize::try_from(random.below(4)).expect("small")];
         let outputs = format!(
             "[[position_output]]\noutput = \"io.Output 1\"\naxis = \"x\"\nranges = [[5.0, 11.0], [15.0, 18.5]]\nlead = \"{lead_ms}ms\"\n\

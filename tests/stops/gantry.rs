@@ -5,6 +5,7 @@
 
 use std::path::Path;
 
+use ecaxis_test_support::random::Random;
 use ecaxis_test_support::recordings::process_images;
 use ecaxis_test_support::{
     assert_contains, faults, load, machine, recorded, run, run_badly, run_well, virtual_time,
@@ -44,18 +45,6 @@ fn halves(recording: &Path) -> Vec<[Seen; 2]> {
     images
         .map(|(out, data)| [0, REGION].map(|at| half(&out[at..], &data[at..])))
         .collect()
-}
-
-/// xorshift64*.
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, bound: u64) -> u64 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        (self.0.wrapping_mul(0x2545_f491_4f6c_dd1d) >> 33) % bound
-    }
 }
 
 fn seeds() -> std::ops::RangeInclusive<u64> {
@@ -158,7 +147,7 @@ fn lost_frames_do_not_part_the_halves() {
 fn a_blocked_half_never_skews_the_gantry_beyond_its_limit() {
     let mut worst = 0.0_f64;
     for seed in seeds() {
-        let mut random = Random(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
+        let mut random = Random::new(seed);
         let limits = Limits {
             velocity: 8 + random.below(12),
             acceleration: 400 + random.below(300),
@@ -213,7 +202,7 @@ fn a_blocked_half_never_skews_the_gantry_beyond_its_limit() {
 #[test]
 fn holds_and_emergency_stops_do_not_part_the_halves() {
     for seed in seeds() {
-        let mut random = Random(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
+        let mut random = Random::new(seed);
         let emergency = 1500 + random.below(1500);
         let mut inputs = String::new();
         let mut at = 650;

@@ -18,6 +18,7 @@ pub mod host;
 pub mod machines;
 pub mod mailbox;
 pub mod program;
+pub mod random;
 pub mod recordings;
 pub mod ros2;
 pub mod script;
