@@ -171,3 +171,39 @@ fn wrong_paths_are_refused() {
         }
     }
 }
+
+/// Two lines in branches that run at the same time: the override of one group leaves the other line
+/// as fast as it was.
+#[test]
+fn lines_in_parallel_branches_are_independent() {
+    let mut text = String::from("[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n");
+    for (position, name) in ["a", "b", "c", "d"].iter().enumerate() {
+        text += &format!(
+            "[[device]]\nname = \"{name}\"\nesi = \"esi/SV1.xml\"\nposition = {position}\nmode = \"csp\"\n[device.axis]\nencoder = {COUNTS}\n\
+             limits = {{ velocity = 20.0, acceleration = {ACCELERATION:.1}, torque = 100.0, following_error = 4.0 }}\n"
+        );
+    }
+    text += "[[stop.group]]\nname = \"left\"\naxes = [\"a\", \"b\"]\n[[step]]\noverride = { left = 20 }\n\
+        [[step]]\nparallel = [{ step = [{ line = { a = 10.0, b = 5.0 } }] }, { step = [{ line = { c = -8.0, d = 16.0 } }] }]\n";
+    let bench = Bench::new();
+    let (options, recording) = recorded(virtual_time(), bench.path());
+    run_well(bench.machine(&text), options);
+    let mut alone = 0;
+    for (out, _) in process_images(&recording) {
+        if out.len() < 4 * REGION - 1 || (0..4).any(|n| out[n * REGION] != 0x0f) {
+            continue;
+        }
+        let at = |n: usize| {
+            let target = [2, 3, 4, 5].map(|byte| out[n * REGION + byte]);
+            i64::from(i32::from_le_bytes(target))
+        };
+        // The devices of a group follow the others in the image.
+        let [c, d, a, b] = [0, 1, 2, 3].map(at);
+        // Each axis begins where its drive stands, at most some counts from 0.
+        assert!((a - 2 * b).abs() <= 8, "{a} {b}");
+        assert!((2 * c + d).abs() <= 8, "{c} {d}");
+        // The right line is at its end.
+        alone += usize::from(d == 16 * COUNTS as i64 && a < 10 * COUNTS as i64);
+    }
+    assert!(alone > 1000, "{alone}");
+}

@@ -21,7 +21,10 @@ fn a_device_begins_in_a_profile_mode() {
         [[step]]\nvelocity = { y = 0.0 }\n[[step]]\nmove_by = { x = -3.0 }\n";
     let machine = Bench::new().machine(&text(steps));
     let module = |device: usize| {
-        let device = machine.devices.get(ecaxis_ecat::index::DeviceIndex(device)).expect("a device");
+        let device = machine
+            .devices
+            .get(ecaxis_ecat::index::DeviceIndex(device))
+            .expect("a device");
         device.selection.modules[0].type_name.clone()
     };
     assert_eq!([0, 1, 2].map(module), ["PPM", "PVM", "CSP"]);

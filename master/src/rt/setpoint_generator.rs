@@ -18,8 +18,11 @@ use super::overrides::Rates;
 /// A request to start following a set-point source.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum GeneratorRequest {
-    /// The axis' part of a straight line.
-    Line(LinePath),
+    /// The axis' part of a straight line. `first`: the first axis of this line names it.
+    Line {
+        along: LinePath,
+        first: AxisIndex,
+    },
     /// A move of its own, synchronised in time with other axes.
     Move(JerkLimited),
     Wave(PositionWave),
@@ -58,7 +61,10 @@ impl CamRef {
 /// The source that an axis follows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Source {
-    Line(LinePath),
+    Line {
+        along: LinePath,
+        first: AxisIndex,
+    },
     Move(JerkLimited),
     Wave(PositionWave),
     Table {
@@ -188,7 +194,7 @@ impl SetpointGenerator {
             return;
         }
         let source = match start {
-            GeneratorRequest::Line(along) => Ok(Source::Line(along)),
+            GeneratorRequest::Line { along, first } => Ok(Source::Line { along, first }),
             // From rest, slower moves of the same duration still arrive together.
             GeneratorRequest::Move(planned) => Ok(Source::Move(planned.slowed(rate))),
             GeneratorRequest::Wave(wave) => Ok(Source::Wave(wave)),
@@ -217,10 +223,13 @@ impl SetpointGenerator {
         };
     }
 
-    /// True while the axis follows a line. All axes on lines at the same time are on the same line.
+    /// Returns the first axis of the line on which the axis moves.
     #[must_use]
-    pub fn on_line(&self) -> bool {
-        matches!(self.source, Some(Source::Line(_)))
+    pub fn line(&self) -> Option<AxisIndex> {
+        match self.source {
+            Some(Source::Line { first, .. }) => Some(first),
+            _ => None,
+        }
     }
 
     /// True while the axis plays a table.
@@ -325,7 +334,7 @@ impl SetpointGenerator {
         let before = self.resume_motion(axis, dt_s);
         let mut interrupted = false;
         let (next, finished, state) = match &mut source {
-            Source::Line(along) => {
+            Source::Line { along, .. } => {
                 along.set_rate(rates.line, dt_s);
                 let next = along.advance(before, dt_s);
                 (next, along.finished(next), GeneratorState::Running)

@@ -17,6 +17,11 @@ const LIMITS: Limits = Limits {
     following_error: Some(2.0),
 };
 
+fn line_request(along: LinePath) -> GeneratorRequest {
+    let first = AxisIndex(0);
+    GeneratorRequest::Line { along, first }
+}
+
 /// An enabled axis whose drive reports the target of the previous cycle.
 struct Rig {
     axis: Axis,
@@ -107,7 +112,7 @@ fn six_axes_on_lines_there_and_back_arrive_in_the_same_cycle() {
         let parts = all.map(|i| axes[i].part(targets[i], speed));
         let line = Line::plan(&parts).expect("a line");
         for (rig, part) in axes.iter_mut().zip(&parts) {
-            rig.begin(GeneratorRequest::Line(line.along(part)), None);
+            rig.begin(line_request(line.along(part)), None);
         }
         let planned = (line.duration_s() / DT).ceil() as u32;
         for cycle in 0.. {
@@ -177,7 +182,7 @@ fn rejected_set_point_ends_the_generator() {
     let mut rig = Rig::new(250.0);
     let part = rig.part(30.0, 1.0);
     let line = Line::plan(&[part]).expect("a line");
-    rig.begin(GeneratorRequest::Line(line.along(&part)), None);
+    rig.begin(line_request(line.along(&part)), None);
     for _ in 0..60 {
         rig.cycle(None);
     }

@@ -57,10 +57,12 @@ impl Turn<'_, '_> {
         }
         let line = Line::plan(&line_axes)
             .map_err(|error| self.refusal(step, axes[error.axis], &error.error))?;
-        let generators = axes.iter().zip(&line_axes);
-        let generators: Vec<_> = generators
-            .map(|(&axis, part)| (axis, GeneratorRequest::Line(line.along(part))))
-            .collect();
+        let first = axes.first().copied().unwrap_or_default();
+        let generators = axes.iter().zip(&line_axes).map(|(&axis, part)| {
+            let along = line.along(part);
+            (axis, GeneratorRequest::Line { along, first })
+        });
+        let generators: Vec<_> = generators.collect();
         self.follow(step, start, &generators, GeneratorState::Finished)
             .await
     }

@@ -135,18 +135,6 @@ impl ProgramChecker<'_> {
     fn check_branches(&self, branches: &[Vec<Step>], p: &mut Problems<'_>) {
         let mut owners: BTreeMap<AxisIndex, &Step> = BTreeMap::new();
         let mut reported = BTreeSet::new();
-        let mut lines = branches.iter().filter_map(|branch| first_line(branch));
-        if let (Some(first), Some(second)) = (lines.next(), lines.next()) {
-            let message = format!(
-                "two branches move along lines at once: step {} in line {} and step {} in line {}",
-                first.number, first.line, second.number, second.line,
-            );
-            let hint =
-                "all lines of a moment are one path: use `line` in one branch, `move` in the other";
-            let place = second.action.commanded().first().copied();
-            let place = place.map(|axis| self.place(&second.number, axis));
-            p.add_hint(place.unwrap_or(0..0), message, hint);
-        }
         for branch in branches {
             let mut own = BTreeMap::new();
             moving(branch, &mut own);
@@ -167,14 +155,6 @@ impl ProgramChecker<'_> {
             }
         }
     }
-}
-
-/// Returns the first step that moves along a line.
-fn first_line(steps: &[Step]) -> Option<&Step> {
-    steps.iter().find_map(|step| match step.action {
-        Action::Line { .. } => Some(step),
-        _ => step.action.lists().into_iter().find_map(first_line),
-    })
 }
 
 /// Returns the variables that steps set.

@@ -175,17 +175,21 @@ impl Engine {
     /// Ends the lines that share an axis with a stopped group: the other axes can no longer follow
     /// them.
     fn abort_lines(&mut self, own: GroupIndex) {
-        let mut slots = self.axes.iter();
-        if !slots.any(|slot| slot.group == own && slot.generator.on_line()) {
-            return;
-        }
-        for (axis, slot) in self.axes.enumerate_mut() {
-            if slot.group == own || !slot.generator.on_line() {
+        for index in self.axes.indices() {
+            let slots = &mut self.axes;
+            let line = slots.get(index).and_then(|slot| slot.generator.line());
+            let Some(line) = line else { continue };
+            let broken = |slot: &RtAxis| slot.group == own && slot.generator.line() == Some(line);
+            if !slots.iter().any(broken) {
                 continue;
             }
+            let Some(slot) = slots.get_mut(index).filter(|slot| slot.group != own) else {
+                continue;
+            };
             slot.generator.abort_line();
             if let Some(group) = self.groups.get_mut(slot.group) {
-                group.found = group.found.or(Some(StopCause::FollowLost { axis }));
+                let cause = StopCause::FollowLost { axis: index };
+                group.found = group.found.or(Some(cause));
             }
         }
     }

@@ -1,27 +1,27 @@
 //! Passes override and hold to every axis, once per cycle.
 
 use ecaxis_axis::setpoint::table_rate;
-use ecaxis_ecat::index::GroupIndex;
+use ecaxis_ecat::index::{AxisIndex, GroupIndex};
 
 use super::Engine;
 use crate::rt::axis::RtAxis;
 use crate::rt::overrides::Rates;
 
 impl Engine {
-    /// Sets the rates of this cycle. All axes on lines have the lowest of their rates, so that they
-    /// stay on their line. The tables of a group keep their common time.
+    /// Sets the rates of this cycle. All axes of a line have the lowest of their rates, so that they
+    /// stay on it. The tables of a group keep their common time.
     pub(super) fn set_rates(&mut self) {
         if self.guarding {
             self.overrides.read(&self.inputs);
         }
-        let overrides = &self.overrides;
-        let lines = self.axes.iter().filter(|slot| slot.generator.on_line());
-        let line = lines.map(|slot| overrides.rate(slot.group));
-        let line = line.fold(f64::INFINITY, f64::min);
         for group in self.groups.indices() {
             self.set_table_rate(group);
         }
-        for slot in &mut self.axes {
+        for index in self.axes.indices() {
+            let line = self.line_rate(index);
+            let Some(slot) = self.axes.get_mut(index) else {
+                continue;
+            };
             let own = self.overrides.rate(slot.group);
             slot.axis.set_rate(own);
             slot.rates = Rates {
@@ -35,6 +35,17 @@ impl Engine {
                     .unwrap_or(0.0),
             };
         }
+    }
+
+    /// Returns the lowest rate of the axes on the line of an axis.
+    fn line_rate(&self, index: AxisIndex) -> f64 {
+        let Some(line) = self.axes.get(index).and_then(|slot| slot.generator.line()) else {
+            return f64::INFINITY;
+        };
+        let members = self.axes.iter();
+        let members = members.filter(|slot| slot.generator.line() == Some(line));
+        let rates = members.map(|slot| self.overrides.rate(slot.group));
+        rates.fold(f64::INFINITY, f64::min)
     }
 
     fn set_table_rate(&mut self, group: GroupIndex) {
