@@ -24,18 +24,18 @@ const COE_SDO_HEADER: usize = 6;
 const SEGMENT_HEADER: usize = 3;
 /// A segment is padded to this many data bytes, as on CAN. Only then the command contains the
 /// number of unused bytes.
-const SEGMENT_MIN: usize = 7;
+pub(super) const SEGMENT_MIN: usize = 7;
 
 const SERVICE_EMERGENCY: u16 = 1;
-const SERVICE_SDO_REQUEST: u16 = 2;
-const SERVICE_SDO_RESPONSE: u16 = 3;
-const SERVICE_SDO_INFORMATION: u16 = 8;
+pub(super) const SERVICE_SDO_REQUEST: u16 = 2;
+pub(super) const SERVICE_SDO_RESPONSE: u16 = 3;
+pub(super) const SERVICE_SDO_INFORMATION: u16 = 8;
 
 const COMPLETE_ACCESS: u8 = 0x10;
-const TOGGLE: u8 = 0x10;
-const EXPEDITED: u8 = 0x02;
-const SIZE_INDICATED: u8 = 0x01;
-const ABORT: u8 = 0x80;
+pub(super) const TOGGLE: u8 = 0x10;
+pub(super) const EXPEDITED: u8 = 0x02;
+pub(super) const SIZE_INDICATED: u8 = 0x01;
+pub(super) const ABORT: u8 = 0x80;
 
 /// Returns the data bytes that fit into a download request with a size field.
 pub fn download_room(mailbox: u16) -> usize {
@@ -176,7 +176,7 @@ impl<'a> Request<'a> {
 }
 
 /// Returns how many of `room` bytes are unused; 0 if `used` reaches or exceeds `room`.
-fn unused(room: usize, used: usize) -> u8 {
+pub(super) fn unused(room: usize, used: usize) -> u8 {
     u8::try_from(room.saturating_sub(used)).unwrap_or(0)
 }
 

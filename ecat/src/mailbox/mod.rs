@@ -17,8 +17,10 @@ use alloc::vec::Vec;
 
 pub mod abort_code;
 pub mod coe;
+mod coe_answer;
 mod error_text;
 pub mod foe;
+pub mod gateway;
 
 pub use abort_code::abort_text;
 pub use error_text::mailbox_error_text;
@@ -31,10 +33,25 @@ pub const MIN_LENGTH: u16 = 16;
 
 /// The type of a mailbox error reply.
 pub const TYPE_ERROR: u8 = 0;
+/// The type of an AoE message.
+pub const TYPE_AOE: u8 = 1;
+/// The type of an EoE message.
+pub const TYPE_EOE: u8 = 2;
 /// The type of a CoE message.
 pub const TYPE_COE: u8 = 3;
 /// The type of an FoE message.
 pub const TYPE_FOE: u8 = 4;
+/// The type of a SoE message.
+pub const TYPE_SOE: u8 = 5;
+/// The type of a VoE message.
+pub const TYPE_VOE: u8 = 15;
+
+/// The code of a mailbox error reply: the protocol is not supported.
+pub const ERROR_UNSUPPORTED_PROTOCOL: u16 = 2;
+/// The code of a mailbox error reply: the service is not supported.
+pub const ERROR_SERVICE: u16 = 4;
+/// The code of a mailbox error reply: the lengths contradict each other.
+pub const ERROR_SIZE: u16 = 8;
 
 /// A message that can be written to a mailbox.
 pub trait Encode {
@@ -63,6 +80,9 @@ pub enum DecodeError {
         /// Its length.
         length: usize,
     },
+    /// An EtherCAT header of another type than that of a mailbox telegram.
+    #[error("EtherCAT type {0} is not a mailbox telegram")]
+    FrameType(u16),
     /// An FoE opcode that does not exist.
     #[error("unexpected FoE opcode {0} from a SubDevice")]
     Opcode(u8),
@@ -121,6 +141,13 @@ impl<'a> Mailbox<'a> {
             }),
         }
     }
+}
+
+/// Returns the body of a mailbox error reply.
+#[must_use]
+pub fn error_body(code: u16) -> Vec<u8> {
+    // The first word is the type of the reply, always 1.
+    [1_u16.to_le_bytes(), code.to_le_bytes()].concat()
 }
 
 /// Writes header, message and padding.
