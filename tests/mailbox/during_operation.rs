@@ -13,7 +13,7 @@ use ecaxis_test_support::mailbox::{block_on, client};
 
 /// A wire on which each delay takes one poll of the executor, with a cycle that reads the mailbox
 /// status.
-struct DuringOperation<'a> {
+pub struct DuringOperation<'a> {
     server: &'a Server,
     /// The interval at which the cycle reads the status.
     cycle: Option<Duration>,
@@ -22,7 +22,7 @@ struct DuringOperation<'a> {
 }
 
 impl<'a> DuringOperation<'a> {
-    fn new(server: &'a Server, cycle: Option<Duration>) -> Self {
+    pub fn new(server: &'a Server, cycle: Option<Duration>) -> Self {
         Self {
             server,
             cycle,
@@ -76,7 +76,7 @@ impl MailboxTransport for DuringOperation<'_> {
 }
 
 /// Polls a future until it is ready.
-fn finish<T>(future: impl Future<Output = T>) -> T {
+pub fn finish<T>(future: impl Future<Output = T>) -> T {
     let mut future = pin!(future);
     let mut context = Context::from_waker(Waker::noop());
     for _ in 0..100_000 {

@@ -3,6 +3,7 @@
 mod during_operation;
 mod errors;
 mod foe;
+mod gateway;
 mod hostile;
 mod info;
 mod start_up;

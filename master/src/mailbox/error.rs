@@ -112,6 +112,8 @@ pub enum Subject {
     Object(NamedObject),
     /// Reading and discarding the messages in the mailbox.
     Emptying,
+    /// A message of another program.
+    Telegram,
 }
 
 impl fmt::Display for Subject {
@@ -119,6 +121,7 @@ impl fmt::Display for Subject {
         match self {
             Self::Object(at) => at.fmt(f),
             Self::Emptying => f.write_str("emptying its mailbox"),
+            Self::Telegram => f.write_str("a message of the mailbox gateway"),
         }
     }
 }

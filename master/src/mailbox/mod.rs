@@ -7,6 +7,7 @@
 //! - `sdo`, `transfer`: [`CoeClient`], SDO upload and download.
 //! - `sdo_info`: the object dictionary as reported by the device (SDO Information).
 //! - [`foe`]: [`FoeClient`], file transfer.
+//! - `raw`: messages of any protocol from other programs.
 //! - `worker`: [`Mailboxes`], transfers from any thread while workers serve the mailboxes.
 //! - `error`, `emergency`, `object_names`: error types and texts.
 
@@ -17,6 +18,7 @@ use crate::cancel::CancelToken;
 mod emergency;
 mod error;
 pub mod foe;
+mod raw;
 mod sdo;
 mod sdo_info;
 mod transfer;
@@ -29,9 +31,10 @@ pub use ecaxis_ecat::object::{NamedObject, object_name};
 pub use emergency::{EMERGENCY_QUEUE, Emergencies, Emergency, Received};
 pub use error::{CoeCause, CoeError, InfoError, Phase, SdoError, Subject};
 pub use foe::{FoeCause, FoeClient, FoeError};
+pub use raw::{RawAnswer, RawMessage};
 pub use sdo::{CoeClient, MAX_OBJECT};
 pub use sdo_info::{EntryDescription, InfoRequest, ObjectDescription, ObjectList};
-pub use worker::{DeviceMailbox, MailboxError, Mailboxes};
+pub use worker::{DeviceMailbox, MailboxError, MailboxSession, Mailboxes};
 
 /// Datagrams to a SubDevice, and time. This module has no other access to the outside.
 #[allow(async_fn_in_trait)]

@@ -23,7 +23,7 @@ pub struct CoeClient {
     /// A transfer ended without its last answer, which may still arrive.
     pub(super) unsettled: bool,
     /// The object of the segmented transfer in progress, as far as known.
-    in_segments: Option<(u16, u8)>,
+    pub(super) in_segments: Option<(u16, u8)>,
 }
 
 impl CoeClient {

@@ -29,7 +29,7 @@ const BUSY_PAUSE: Duration = Duration::from_millis(10);
 
 const ILLEGAL: u32 = 0x8004;
 const PACKET_NUMBER: u32 = 0x8005;
-const NOT_DEFINED: u32 = 0x8000;
+pub(super) const NOT_DEFINED: u32 = 0x8000;
 const DISK_FULL: u32 = 0x8003;
 
 /// Timeouts per packet. Erasing a flash memory takes seconds, and not every SubDevice answers BUSY

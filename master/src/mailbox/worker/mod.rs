@@ -1,6 +1,7 @@
 //! Mailbox access from any thread and any executor during operation.
 //!
 //! - here: [`Mailboxes`] and [`DeviceMailbox`], the users' end; [`open`].
+//! - `session`: [`MailboxSession`], a device for several messages of another program.
 //! - `task`: [`MailboxWorker`], which owns the mailbox of one device.
 //!
 //! Each device has its own worker, so transfers to several devices run in parallel. A device that
@@ -14,10 +15,12 @@ use std::sync::Arc;
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use tokio::sync::{mpsc, oneshot};
 
-use super::{CoeClient, Emergencies, SdoError};
+use super::{CoeClient, Emergencies, MailboxLayout, SdoError};
 
+mod session;
 mod task;
 
+pub use session::MailboxSession;
 pub use task::{MailboxWorker, run_with_workers};
 
 /// The capacity of a device's queue; further requests wait in their futures.
@@ -39,6 +42,8 @@ enum Job {
         request: Request,
         reply: oneshot::Sender<Result<Vec<u8>, SdoError>>,
     },
+    /// Serves the messages of one user until the user leaves.
+    Session(mpsc::Receiver<session::SessionJob>),
     /// Lends the mailbox until it comes back or the other end is dropped.
     Loan {
         to: oneshot::Sender<CoeClient>,
@@ -86,6 +91,7 @@ struct RequestQueues {
     jobs: mpsc::Sender<Job>,
     /// Requests that explain a stop; they take precedence.
     urgent: mpsc::Sender<Job>,
+    layout: MailboxLayout,
 }
 
 /// The mailbox of one device. Cheap to clone.
@@ -115,6 +121,19 @@ impl Mailboxes {
         Ok(DeviceMailbox {
             name: Arc::clone(&device.name),
             lane: queues.jobs.clone(),
+        })
+    }
+
+    /// Returns the device with this station address, its mailbox and its mailbox sizes.
+    #[must_use]
+    pub fn at_station(&self, station: u16) -> Option<(DeviceIndex, DeviceMailbox, MailboxLayout)> {
+        self.devices.enumerate().find_map(|(index, device)| {
+            let queues = device.queues.as_ref()?;
+            let mailbox = DeviceMailbox {
+                name: Arc::clone(&device.name),
+                lane: queues.jobs.clone(),
+            };
+            (queues.layout.station == station).then_some((index, mailbox, queues.layout))
         })
     }
 
@@ -192,6 +211,24 @@ impl DeviceMailbox {
         self.ask(index, sub, false, Some(data)).await.map(drop)
     }
 
+    /// Reserves the device for several messages, after the requests of others. Urgent requests end
+    /// the session.
+    ///
+    /// # Errors
+    /// [`MailboxError::Closed`].
+    pub async fn session(&self) -> Result<MailboxSession, MailboxError> {
+        let (session, requests) = MailboxSession::new(&self.name);
+        let sent = self.lane.send(Job::Session(requests)).await;
+        sent.map_err(|_| self.closed())?;
+        Ok(session)
+    }
+
+    fn closed(&self) -> MailboxError {
+        MailboxError::Closed {
+            name: self.name.to_string(),
+        }
+    }
+
     async fn ask(
         &self,
         index: u16,
@@ -207,12 +244,9 @@ impl DeviceMailbox {
             complete,
             data,
         };
-        let closed = || MailboxError::Closed {
-            name: self.name.to_string(),
-        };
         let job = Job::Transfer { request, reply };
-        self.lane.send(job).await.map_err(|_| closed())?;
-        let answer = answer.await.map_err(|_| closed())?;
+        self.lane.send(job).await.map_err(|_| self.closed())?;
+        let answer = answer.await.map_err(|_| self.closed())?;
         answer.map_err(|source| MailboxError::Sdo {
             name: self.name.to_string(),
             source,
@@ -247,6 +281,7 @@ pub fn open<W>(
             let (jobs, asked) = mpsc::channel(QUEUE);
             let (urgent, first) = mpsc::channel(1);
             let name = Arc::clone(&name);
+            let layout = *coe.layout();
             workers.push(MailboxWorker::new(
                 name,
                 wire,
@@ -255,7 +290,11 @@ pub fn open<W>(
                 asked,
                 Arc::clone(listener),
             ));
-            RequestQueues { jobs, urgent }
+            RequestQueues {
+                jobs,
+                urgent,
+                layout,
+            }
         });
         counters.push(WorkerHandle { name, queues });
     }

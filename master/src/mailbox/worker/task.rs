@@ -15,17 +15,17 @@ use crate::mailbox::{CoeClient, Emergencies, MailboxTransport, SdoError};
 /// Owns the mailbox of one device.
 #[derive(Debug)]
 pub struct MailboxWorker<W> {
-    name: Arc<str>,
-    wire: W,
-    coe: CoeClient,
-    emergencies: Emergencies,
-    urgent: mpsc::Receiver<Job>,
+    pub(super) name: Arc<str>,
+    pub(super) wire: W,
+    pub(super) coe: CoeClient,
+    pub(super) emergencies: Emergencies,
+    pub(super) urgent: mpsc::Receiver<Job>,
     jobs: mpsc::Receiver<Job>,
     arrivals: Arc<Arrivals>,
     /// Wakes `arrivals`, which in turn wakes `outer`.
     waker: Waker,
     outer: Option<Waker>,
-    listener: Arc<dyn EmergencySink>,
+    pub(super) listener: Arc<dyn EmergencySink>,
 }
 
 /// A flag that a receiver may have a request. Checking the receivers costs more than all other work
@@ -121,6 +121,7 @@ impl<W: MailboxTransport> MailboxWorker<W> {
     async fn do_job(&mut self, job: Job) {
         let (request, mut reply) = match job {
             Job::Transfer { request, reply } => (request, reply),
+            Job::Session(requests) => return self.serve_session(requests).await,
             Job::Loan { to, back } => {
                 if to.send(self.coe.restarted()).is_ok() {
                     let restarted = self.coe.restarted();
@@ -213,7 +214,7 @@ async fn transfer<W: MailboxTransport>(
 }
 
 /// Reports emergencies as they arrive while the future runs.
-async fn forward_emergencies<F: Future>(
+pub(super) async fn forward_emergencies<F: Future>(
     name: &str,
     emergencies: &Emergencies,
     listener: &dyn EmergencySink,
