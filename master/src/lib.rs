@@ -47,6 +47,7 @@ pub mod file;
 pub mod file_digest;
 pub mod link;
 pub mod mailbox;
+mod mailbox_gateway;
 pub mod parameters;
 pub mod post_mortem;
 pub mod recording;

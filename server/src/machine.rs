@@ -172,6 +172,9 @@ impl Observer for Reporter<'_> {
                     "closed": device.closed,
                 }));
             }
+            Progress::MailboxGateway { address, write } => hub.event(json!({
+                "event": "mailbox_gateway", "address": address.to_string(), "write": write,
+            })),
             Progress::Warning(text) => warning(hub, text),
             Progress::Denied(denied) => warning(hub, &denied.to_string()),
             Progress::Overload(risk) => warning(hub, &risk.to_string()),

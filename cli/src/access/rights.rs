@@ -1,5 +1,6 @@
 //! Gives up the rights that a running machine does not need, before the first frame.
 
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use ecaxis_master::change_log::ChangeLog;
@@ -16,6 +17,9 @@ const VARIABLE: &str = "ECAXIS_RIGHTS";
 pub(crate) fn of_machine(machine: &Machine) -> NeededRights {
     let mut needed = NeededRights {
         one_bring_up: true,
+        low_port: machine
+            .mailbox_gateway
+            .is_some_and(|gateway| is_low(gateway.bind)),
         ..NeededRights::default()
     };
     let files = machine.files.iter().map(|file| folder(&file.path));
@@ -25,6 +29,11 @@ pub(crate) fn of_machine(machine: &Machine) -> NeededRights {
         .write
         .extend(log.iter().map(|log| folder(log.path())));
     needed
+}
+
+/// Returns `true` if only privileged programs may bind the port.
+pub(crate) fn is_low(address: SocketAddr) -> bool {
+    (1..1024).contains(&address.port())
 }
 
 /// Adds files that are written, with their folders, because parts or temporary files are next to

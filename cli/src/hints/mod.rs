@@ -136,6 +136,9 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
             "run the device without distributed clock: `dc = \"off\"`".to_owned()
         }
         Cause::State(state) => self::state(state),
+        Cause::MailboxGateway { .. } => {
+            "end the program that has this port, or name another with `bind` under [mailbox_gateway]".to_owned()
+        }
         Cause::Record(_) => "name a file that can be written, on a disk with room".to_owned(),
         Cause::Replay(_) => {
             // The recording is a user input.

@@ -152,6 +152,10 @@ impl Observer for ProgressPrinter {
             Progress::Ring { text, .. } | Progress::Warning(text) => {
                 note(&format!("warning: {text}"));
             }
+            Progress::MailboxGateway { address, write } => {
+                let rights = if *write { "" } else { ", read only" };
+                note(&format!("mailbox gateway: {address} (UDP and TCP){rights}"));
+            }
             Progress::Emergency(report) => note(&format!("warning: {report}")),
             // The stop of the group is reported.
             Progress::DeviceLost { .. }

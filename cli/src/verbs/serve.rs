@@ -122,9 +122,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut needed = rights::with_outputs(needed, sockets.chain(&args.record));
     needed.read.extend(args.recordings.clone());
     needed.one_bring_up = false;
-    needed.low_port = args
-        .http
-        .is_some_and(|address| (1..1024).contains(&address.port()));
+    needed.low_port |= args.http.is_some_and(rights::is_low);
     rights::limit(&needed)?;
     let defaults = Options::default();
     let run_options = Options {

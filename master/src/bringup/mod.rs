@@ -87,6 +87,8 @@ pub struct BusDevice {
     pub present: bool,
     /// The serial number in its EEPROM.
     pub serial: u32,
+    /// The revision in its EEPROM; 0 if it was absent.
+    pub revision: u32,
     /// Propagation delay from the reference clock in ns.
     pub propagation_delay: u32,
     /// DL status (0x0110) after the scan: which ports are in use.
@@ -312,6 +314,7 @@ async fn describe(
         follows: false,
         present: true,
         serial: sub_device.identity().serial,
+        revision: sub_device.identity().revision,
         propagation_delay,
         dl_status: topology::in_line(position, dl_status, wire.ring()),
         op_only: Vec::new(),
@@ -340,6 +343,7 @@ fn absent(config: &DeviceConfig, index: u16) -> BusDevice {
         follows: false,
         present: false,
         serial: 0,
+        revision: 0,
         propagation_delay: 0,
         dl_status: 0,
         op_only: Vec::new(),

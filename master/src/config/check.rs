@@ -12,6 +12,7 @@ use super::device::{self, CheckedDevice, EsiFiles};
 use super::duration::show;
 use super::fields::KeyExt;
 use super::gantry;
+use super::mailbox_gateway;
 use super::needed;
 use super::optional::OptionalPlaces;
 use super::path;
@@ -153,6 +154,8 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
     }
     gantry::check_groups(&gantries, &axes, &program.stop, p);
     let devices: IndexVec<_, _> = devices.into();
+    let gateway = raw.mailbox_gateway.as_ref();
+    let gateway = gateway.map(|raw| mailbox_gateway::check(raw, p));
     connections.check(&devices, p);
     optional.check(&devices, &program, p);
     Some(Machine {
@@ -185,6 +188,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
             stale_cycles: raw.server.stale_cycles.value().unwrap_or(10),
             lease_ns: raw.server.lease.value().unwrap_or(500_000_000),
         },
+        mailbox_gateway: gateway,
     })
 }
 

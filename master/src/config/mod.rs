@@ -27,6 +27,7 @@
 //! | `units.rs` | names of position units |
 //! | `gantry.rs` | two axes that move as one |
 //! | `gateway.rs` | the CAN network behind a gateway, its nodes and their axes |
+//! | `mailbox_gateway.rs` | the mailbox gateway for other vendors' tools |
 //! | `steps.rs` | checks of the program; `[stop]` in `steps/stop.rs` |
 //! | `program.rs` | the program, and its steps as text |
 //!
@@ -54,6 +55,7 @@ mod fields;
 mod gantry;
 mod gateway;
 mod locator;
+mod mailbox_gateway;
 mod needed;
 mod optional;
 mod path;
@@ -87,6 +89,7 @@ pub use drive_limits::LimitConflict;
 pub use drive_units::{AdoptedUnits, UnitProblem};
 pub use gateway::{GatewaySetup, NodeSetup};
 pub use locator::{Locator, SegmentHead};
+pub use mailbox_gateway::MailboxGatewaySetup;
 pub use position_output::PositionOutputSetup;
 pub use problem::{ConfigError, Problem};
 pub use program::{
@@ -161,6 +164,8 @@ pub struct Machine {
     /// `true` if the axes get power. Otherwise the bus goes to Op and the axes stay disabled.
     pub enable: bool,
     pub server: ServerSetup,
+    /// The mailbox gateway; `None`: there is none.
+    pub mailbox_gateway: Option<MailboxGatewaySetup>,
 }
 
 /// Settings of the server for clients that command the machine.

@@ -2,6 +2,7 @@
 
 use std::borrow::Borrow;
 use std::fmt;
+use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ecaxis_axis::{CommandError, Mode, State, Statusword, Trip};
@@ -55,6 +56,8 @@ pub enum Cause {
     Replay(String),
     #[error("starting a thread: {0}")]
     Thread(String),
+    #[error("the mailbox gateway cannot listen at {address}: {why}")]
+    MailboxGateway { address: SocketAddr, why: String },
     #[error("the link failed: {0}")]
     Link(#[source] LinkError),
     #[error(transparent)]

@@ -1,5 +1,6 @@
 //! Progress reports of a run.
 
+use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ecaxis_axis::units::UserUnits;
@@ -74,6 +75,11 @@ pub enum Progress {
     Topology(IndexVec<DeviceIndex, DevicePlace>),
     /// Mailbox access during operation, valid from now to the end of the run.
     Mailboxes(Mailboxes),
+    /// The mailbox gateway answers clients at this address.
+    MailboxGateway {
+        address: SocketAddr,
+        write: bool,
+    },
     /// A group of axes has begun to stop. The machine continues without it.
     GroupStopped {
         group: String,

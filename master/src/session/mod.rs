@@ -18,13 +18,14 @@ use crate::cancel::CancelToken;
 use crate::clock::{Clock, Nanos};
 use crate::config::Machine;
 use crate::link::Link;
+use crate::mailbox_gateway::{BoundGateway, GatewayThread};
 use crate::post_mortem::FaultReport;
 use crate::rt::controller::Controller;
 use crate::rt::cycle::EngineReport;
 use crate::rt::samples::SampleWriter;
 use crate::rt::stats::Stats;
-use crate::supervise::ProgramControl;
 use crate::supervise::operator::{self, Operator};
+use crate::supervise::{ProgramControl, Supervisor};
 
 mod bus;
 mod cycle_thread;
@@ -252,6 +253,42 @@ fn report_panics_briefly() {
     });
 }
 
+/// Binds the mailbox gateway before the first frame. `None` without the key, and in virtual time.
+fn bind_gateway(
+    machine: &Machine,
+    options: &Options,
+    progress: &Sender<Progress>,
+) -> Result<Option<BoundGateway>, Error> {
+    let Some(setup) = machine.mailbox_gateway else {
+        return Ok(None);
+    };
+    if options.clock == Clock::Virtual {
+        let text = "virtual time has no mailbox gateway: clients wait in real time";
+        let _ = progress.send(Progress::Warning(text.to_owned()));
+        return Ok(None);
+    }
+    let bound = BoundGateway::bind(setup).map_err(|error| Cause::MailboxGateway {
+        address: setup.bind,
+        why: error.to_string(),
+    })?;
+    Ok(Some(bound))
+}
+
+fn serve_gateway(bound: BoundGateway, supervisor: &mut Supervisor) -> Result<GatewayThread, Error> {
+    let failed = |error: std::io::Error| Error::from(Cause::Thread(error.to_string()));
+    let (address, write) = (bound.address().map_err(failed)?, bound.write());
+    let served = bound.serve(
+        &supervisor.machine,
+        &supervisor.bus,
+        supervisor.mailboxes.clone(),
+    );
+    let (thread, publisher) = served.map_err(failed)?;
+    supervisor.mailbox_gateway = Some(publisher);
+    let progress = &supervisor.progress;
+    let _ = progress.send(Progress::MailboxGateway { address, write });
+    Ok(thread)
+}
+
 fn run_on_link_thread(
     machine: &Arc<Machine>,
     options: &Options,
@@ -261,6 +298,10 @@ fn run_on_link_thread(
 ) -> Outcome {
     options.clock.enter();
     let reported = progress.clone();
+    let gateway = match bind_gateway(machine, options, &progress) {
+        Ok(gateway) => gateway,
+        Err(error) => return error.into(),
+    };
     let mut seen = BringUpEvidence::default();
     let link = attachments.link.take();
     let job = RunBuilder {
@@ -274,7 +315,10 @@ fn run_on_link_thread(
         Some(link) => job.prepare_with(link, &mut seen),
         None => job.prepare_with_evidence(&mut seen),
     };
-    let Prepared { parts, supervisor } = match prepared {
+    let Prepared {
+        parts,
+        mut supervisor,
+    } = match prepared {
         Ok(prepared) => prepared,
         Err(error) => {
             return Outcome {
@@ -282,6 +326,12 @@ fn run_on_link_thread(
                 ..error.into()
             };
         }
+    };
+    // Dropped at the end of the run: its port is free for the next one.
+    let _gateway = match gateway.map(|bound| serve_gateway(bound, &mut supervisor)) {
+        Some(Err(error)) => return error.into(),
+        Some(Ok(thread)) => Some(thread),
+        None => None,
     };
     let wire = supervisor.wire;
     let places = fault_evidence::places(&supervisor.bus);

@@ -200,6 +200,7 @@ impl RunBuilder<'_> {
                     control,
                     sim_inputs,
                     buttons: Buttons::default(),
+                    mailbox_gateway: None,
                     ring_delays,
                     device_log: DeviceLog::default(),
                 };

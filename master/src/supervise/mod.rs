@@ -25,6 +25,7 @@ use crate::datagram::{CyclicMailboxTransport, DatagramClient};
 use crate::link::sim::SimInputSender;
 use crate::mailbox::worker::{MailboxWorker, run_with_workers};
 use crate::mailbox::{DatagramError, Mailboxes};
+use crate::mailbox_gateway::LivePublisher;
 use crate::post_mortem::Witnessed;
 use crate::report::events::{clock_off, reference_replaced};
 use crate::report::{
@@ -125,6 +126,8 @@ pub struct Supervisor {
     pub(crate) returns: Option<ReturnPort>,
     /// What was reported of the ring, with cable redundancy.
     pub(crate) ring: RingWatch,
+    /// What clients of the mailbox gateway see of the cycle.
+    pub(crate) mailbox_gateway: Option<LivePublisher>,
     /// The propagation delays in the closed ring, with cable redundancy.
     pub(crate) ring_delays: Option<Arc<std::sync::Mutex<RingDelays>>>,
 }
@@ -182,7 +185,8 @@ impl Supervisor {
         ended.interrupted = worked.is_none();
         ended.group_stops = self.group_stops();
         let mut result = worked.unwrap_or(Ok(()));
-        // From here on devices leave Op on purpose, and none may return.
+        // From here on devices leave Op on purpose, and none may return. No other program delays it.
+        self.mailbox_gateway = None;
         (self.clock_tree, self.returns) = (None, None);
         if let Err(error) = &result {
             // The axes stop while the bus is read.
@@ -250,6 +254,9 @@ impl Supervisor {
     /// AL status shows no error. Otherwise, the devices are read one by one.
     async fn change_to_op(&mut self) -> Result<(), Error> {
         let op = AlState::Op;
+        if let Some(gateway) = &mut self.mailbox_gateway {
+            gateway.set_requested(op);
+        }
         let requested = clock::now();
         let snapshot = self.poll_and_query().await?;
         // A device with an error needs an acknowledgement first.
@@ -423,6 +430,9 @@ impl Supervisor {
         self.report_limits(&snapshot);
         self.follow_clock_tree(&snapshot);
         self.follow_ring();
+        if let Some(gateway) = &mut self.mailbox_gateway {
+            gateway.publish(&snapshot);
+        }
         if clock::now().saturating_sub(self.last_status) >= STATUS_PERIOD {
             self.last_status = clock::now();
             self.report(Progress::Status(Status::new(&self.machine, &snapshot)));

@@ -55,6 +55,8 @@ table! { "the machine file",
         overrides: RawOverride as "override",
         /// Clients of `ecaxis serve`
         server: RawServer,
+        /// Mailboxes for other vendors' tools
+        mailbox_gateway: Option<RawMailboxGateway>,
         /// The simulated bus: inputs that are switched by time
         sim: RawSimulation,
         /// Names of inputs and outputs, `start = "io.Input 1"`
@@ -537,6 +539,15 @@ table! { "[server]",
         /// The longest silence of the owner, unless it asks for another (time, 100 ms to 60 s;
         /// default `"500ms"`)
         lease: Key<Ns> [100 * MS..=60 * S],
+    }
+}
+
+table! { "[mailbox_gateway]",
+    table RawMailboxGateway {
+        /// IP address and port of UDP and TCP (text; default `"127.0.0.1:34980"`)
+        bind: Key<String>,
+        /// Clients may write objects and files (`true`, `false`; default `false`)
+        write: Key<bool>,
     }
 }
 
