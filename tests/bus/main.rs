@@ -22,6 +22,7 @@ mod gateway_stops;
 mod homing;
 mod long_segment;
 mod lrw;
+mod mailbox_gateway;
 mod mailbox_sizes;
 mod mailboxes;
 mod oddities;

@@ -14,9 +14,10 @@ use super::access::{mailbox_error, sdo_abort};
 use super::live::{DeviceLive, Live};
 use super::object::{self, Object, Objects};
 use crate::acyclic::topology;
-use crate::bringup::Bus;
+use crate::bringup::BusDevice;
 use crate::config::{DeviceConfig, Locator, Machine};
 use crate::mailbox::{Mailboxes, RawMessage};
+use crate::report::DevicePlace;
 use crate::rt::exchange::DiagnosticRegister;
 
 /// Modular device (5001) with the profile of an EtherCAT MainDevice (1100).
@@ -77,8 +78,8 @@ struct Scan {
 }
 
 impl DeviceInfo {
-    fn new(config: &DeviceConfig, index: DeviceIndex, bus: &Bus, mailboxes: &Mailboxes) -> Self {
-        let (device, found) = (&*config.device, bus.devices.get(index));
+    fn new(config: &DeviceConfig, found: Option<&BusDevice>, mailboxes: &Mailboxes) -> Self {
+        let device = &*config.device;
         let station = found.map_or(0, |found| found.at.station);
         let mailbox = device.mailbox.as_ref();
         let protocols = mailbox.map_or([false; 6], |mailbox| {
@@ -243,14 +244,16 @@ fn link_connection(dl_status: u16) -> u8 {
 impl Dictionary {
     pub(super) fn new(
         machine: &Machine,
-        bus: &Bus,
+        found: &IndexVec<DeviceIndex, BusDevice>,
+        places: &IndexVec<DeviceIndex, DevicePlace>,
         mailboxes: &Mailboxes,
         live: watch::Receiver<Live>,
     ) -> Self {
         let devices = machine.devices.enumerate();
-        let devices = devices.map(|(index, config)| DeviceInfo::new(config, index, bus, mailboxes));
+        let devices =
+            devices.map(|(index, config)| DeviceInfo::new(config, found.get(index), mailboxes));
         let mut devices: IndexVec<DeviceIndex, DeviceInfo> = devices.collect();
-        for (child, place) in bus.places().enumerate() {
+        for (child, place) in places.enumerate() {
             let Some((parent, port)) = place.parent else {
                 continue;
             };

@@ -38,7 +38,7 @@ pub(super) struct DeviceLive {
 }
 
 impl DeviceLive {
-    fn follow(&mut self, now: &SubDeviceDiagnostics, in_op: bool) {
+    pub(super) fn follow(&mut self, now: &SubDeviceDiagnostics, in_op: bool) {
         let before = std::mem::replace(&mut self.found, *now);
         self.absences += u32::from(before.answers && !now.answers);
         let left = before.is_in_op() && now.answers && !now.is_in_op();

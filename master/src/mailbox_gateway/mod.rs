@@ -96,7 +96,13 @@ impl BoundGateway {
         let (end, ended) = oneshot::channel();
         let gateway = Arc::new(Gateway {
             access: access::Access::new(machine, self.setup.write),
-            dictionary: dictionary::Dictionary::new(machine, bus, &mailboxes, published),
+            dictionary: dictionary::Dictionary::new(
+                machine,
+                &bus.devices,
+                &bus.places(),
+                &mailboxes,
+                published,
+            ),
             mailboxes,
         });
         let runtime = tokio::runtime::Builder::new_current_thread()
