@@ -21,6 +21,7 @@ function textOf(event) {
     case "failed": case "refused": case "replaced": case "let_go": return `${event.what ?? "command"}: ${event.event.replace("_", " ")}${why}`;
     case "program": return event.step !== undefined && event.step !== null ? `step ${event.step}${event.run ? `, run ${event.run}` : ""}: ${event.what ?? ""}` : `program ${event.ok ? "ended" : "failed"}${why}`;
     case "group_stopped": return `group ${event.group} stops${why}`;
+    case "mailbox_gateway": return `mailbox gateway at ${event.address}${event.write ? "" : ", read only"}`;
     case "group_waits": return `group ${event.group} waits for its optional devices`;
     case "group_released": return `group ${event.group} is released${why}`;
     case "fault": return event.why ?? "fault";

@@ -285,6 +285,23 @@ fn objects_of_the_cycle_are_protected_in_op() {
 }
 
 #[test]
+fn other_protocols_reach_the_device_with_the_key_write() {
+    let outcome = with_clients("write = true", |address| {
+        let client = Client::new(address);
+        // AoE, EoE, writing of SoE, VoE: the device answers that it has none of them.
+        for protocol in [1, 2, 5, 15] {
+            let answer = client.ask(X, protocol, &[3, 0, 1, 0, 0, 0, 0, 0]);
+            assert_eq!(answer, (0, vec![1, 0, 2, 0]), "{protocol}");
+        }
+        // The simulated drive decides about files itself.
+        let (protocol, answer) = client.ask(X, FOE, b"\x02\0\0\0\0\0firmware");
+        assert_eq!(protocol, FOE);
+        assert!(!answer.starts_with(b"\x05\0\x02\x80"), "{answer:02x?}");
+    });
+    outcome.result.expect("an undisturbed run");
+}
+
+#[test]
 fn a_segmented_transfer_holds_the_device_until_it_ends_or_its_client_is_silent() {
     let outcome = with_clients("", |address| {
         let [client, other] = [(); 2].map(|()| Client::new(address));

@@ -23,7 +23,7 @@ const UDP_CLIENTS: usize = 64;
 /// The requests of a UDP client that may wait; further ones are dropped.
 const UDP_QUEUE: usize = 16;
 /// A connection without a request for this time is closed.
-const IDLE: Duration = Duration::from_mins(10);
+const IDLE: Duration = Duration::from_secs(600);
 /// A client that does not take its answers for this time loses its connection.
 const WRITE: Duration = Duration::from_secs(5);
 /// The delay after an error of a socket, such as too many open files.
