@@ -11,7 +11,7 @@ use ecaxis_ecat::registers;
 /// The number of broadcasts without an answer after which a segment counts as silent.
 const MAX_ATTEMPTS: u32 = 5;
 /// The first station address assigned, as in ethercrab.
-pub(crate) const FIRST_STATION: u16 = 0x1000;
+pub const FIRST_STATION: u16 = 0x1000;
 
 const STEP: &str = "looking for SubDevices";
 

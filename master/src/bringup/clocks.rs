@@ -9,6 +9,7 @@ use std::future::Future;
 use std::time::Duration;
 
 use super::device::{read, write};
+use super::process_data::RegisterBlock;
 use super::{BusDevice, Step};
 use crate::acyclic::DeviceRef;
 use crate::clock::{self, Nanos};
@@ -135,7 +136,16 @@ pub(super) async fn start_pulses(
     dc: &DcSettings,
     first: u64,
 ) -> Result<(), Error> {
-    for (register, data) in [
+    for block in pulse_registers(dc, first) {
+        write(wire, at, STEP, block.register, &block.data).await?;
+    }
+    Ok(())
+}
+
+/// Returns the registers that start SYNC0 and SYNC1 at a system time, in order.
+#[must_use]
+pub fn pulse_registers(dc: &DcSettings, first: u64) -> [RegisterBlock; 5] {
+    [
         (registers::DC_CYCLIC_CONTROL, &[0, 0][..]),
         (registers::DC_START_TIME, &first.to_le_bytes()),
         (registers::DC_SYNC0_CYCLE, &dc.sync0_cycle_ns.to_le_bytes()),
@@ -144,10 +154,12 @@ pub(super) async fn start_pulses(
             registers::DC_CYCLIC_CONTROL,
             &dc.assign_activate.to_le_bytes(),
         ),
-    ] {
-        write(wire, at, STEP, register, data).await?;
-    }
-    Ok(())
+    ]
+    .map(|(register, data)| RegisterBlock {
+        register,
+        data: data.to_vec(),
+        op_only: None,
+    })
 }
 
 /// Waits until all devices have seen pulses of SYNC0.

@@ -2,9 +2,9 @@
 
 use ecaxis_ecat::mailbox::abort_code::is_no_such_object;
 use ecaxis_ecat::registers;
-use ecaxis_esi::layout::SmLayout;
 use ecaxis_esi::{StartupSdo, address};
 
+use super::process_data::ProcessDataPlan;
 use super::{BusDevice, Step};
 use crate::acyclic::{DeviceRef, Registers};
 use crate::config::duration::show;
@@ -12,11 +12,6 @@ use crate::config::{DeviceConfig, StartupOptions};
 use crate::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, abort_text, object_name};
 use crate::report::{Cause, Error};
 use crate::rt::image::DeviceRegion;
-
-const FMMU_SIZE: u16 = 16;
-/// The activation bytes of a SyncManager and of an FMMU.
-const SM_ACTIVATE: u16 = 6;
-const FMMU_ACTIVATE: u16 = 12;
 
 /// The state in which start-up SDOs are sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -267,25 +262,8 @@ fn format_value(data: &[u8]) -> String {
     format!("0x{value:0width$x}", width = data.len() * 2)
 }
 
-/// The logical memory of one FMMU.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Mapping {
-    logical: u32,
-    physical: u16,
-    len: u16,
-    /// [`READ`] or [`WRITE`].
-    kind: u8,
-    /// Enabled in Op only.
-    op_only: bool,
-}
-
-const READ: u8 = 1;
-const WRITE: u8 = 2;
-
-/// Configures the SyncManagers of the process data with one FMMU each, and the FMMU of the mailbox
-/// status at `status`. Outputs and inputs start at the same logical address. SyncManagers whose
-/// areas adjoin share an FMMU if the controller has too few. The mailbox status gets an FMMU only if
-/// one is left. What the ESI enables in Op only stays disabled.
+/// Writes the SyncManagers and FMMUs of [`ProcessDataPlan`]. What the ESI enables in Op only stays
+/// disabled.
 ///
 /// # Errors
 /// [`Cause::Fmmus`] if the controller has too few FMMUs.
@@ -296,92 +274,25 @@ pub(super) async fn map_process_data(
     region: Option<DeviceRegion>,
     status: Option<u32>,
 ) -> Result<(), Error> {
-    let layout = &config.selection.layout;
-    let mut mappings = Vec::new();
+    let plan = ProcessDataPlan::new(config, region, status);
     device.op_only.clear();
-    for (sms, kind) in [(&layout.outputs, WRITE), (&layout.inputs, READ)] {
-        let mut logical = region.map_or(0, |region| region.logical);
-        for sm in sms {
-            let register = registers::SYNC_MANAGER + registers::SYNC_MANAGER_LEN * u16::from(sm.sm);
-            let step = "configuring SyncManagers";
-            let op_only = config.device.op_only(sm);
-            let mut manager = sync_manager(sm);
-            if op_only.sync_manager && sm.len > 0 {
-                manager[usize::from(SM_ACTIVATE)] = 0;
-                device.op_only.push(register + SM_ACTIVATE);
-            }
-            write(wire, &device.at, step, register, &manager).await?;
-            if sm.len > 0 {
-                mappings.push(Mapping {
-                    logical,
-                    physical: sm.start_address,
-                    len: sm.len,
-                    kind,
-                    op_only: op_only.fmmu,
-                });
-                logical = logical.saturating_add(u32::from(sm.len));
-            }
-        }
+    for block in &plan.sync_managers {
+        device.op_only.extend(block.op_only);
+        let step = "configuring SyncManagers";
+        write(wire, &device.at, step, block.register, &block.data).await?;
     }
     let step = "configuring FMMUs";
-    let status = status.zip(config.device.mailbox_status_fmmu());
-    if mappings.is_empty() && status.is_none() {
+    if !plan.needs_fmmus() {
         return Ok(());
     }
     let [available] = read(wire, &device.at, step, registers::FMMU_COUNT).await?;
-    let available = usize::from(available);
-    if mappings.len() > available {
-        share_fmmus(&mut mappings);
-    }
-    if mappings.len() > available {
-        let needed = mappings.len();
-        let cause = Cause::Fmmus { needed, available };
-        return Err(cause.with_device(&device.at).with_action(step));
-    }
-    for (number, mapping) in mappings.iter().enumerate() {
-        let register = fmmu_register(number);
-        write(wire, &device.at, step, register, &fmmu(mapping)).await?;
-        if mapping.op_only {
-            device.op_only.push(register + FMMU_ACTIVATE);
-        }
-    }
-    if let Some((logical, (number, sm))) = status {
-        // The ESI's number, unless the process data already uses it.
-        let own = usize::from(number).max(mappings.len());
-        let number = if own < available { own } else { mappings.len() };
-        let mapping = Mapping {
-            logical,
-            physical: registers::SYNC_MANAGER_STATUS + registers::SYNC_MANAGER_LEN * u16::from(sm),
-            len: 1,
-            kind: READ,
-            op_only: false,
-        };
-        if number < available {
-            let register = fmmu_register(number);
-            write(wire, &device.at, step, register, &fmmu(&mapping)).await?;
-        }
+    let fmmus = plan.fmmus(usize::from(available));
+    let fmmus = fmmus.map_err(|cause| cause.with_device(&device.at).with_action(step))?;
+    for block in fmmus {
+        write(wire, &device.at, step, block.register, &block.data).await?;
+        device.op_only.extend(block.op_only);
     }
     Ok(())
-}
-
-/// Joins mappings that adjoin in logical and in physical memory.
-fn share_fmmus(mappings: &mut Vec<Mapping>) {
-    mappings.dedup_by(|next, last| {
-        let len = u32::from(last.len);
-        let adjoins = (next.kind, next.op_only) == (last.kind, last.op_only)
-            && u32::from(next.physical) == u32::from(last.physical) + len
-            && u64::from(next.logical) == u64::from(last.logical) + u64::from(len);
-        let sum = last.len.checked_add(next.len);
-        if let (true, Some(sum)) = (adjoins, sum) {
-            last.len = sum;
-            return true;
-        }
-        false
-    });
-}
-
-fn fmmu_register(number: usize) -> u16 {
-    registers::FMMU + FMMU_SIZE * u16::try_from(number).unwrap_or(u16::MAX / FMMU_SIZE)
 }
 
 /// Enables what is enabled in Op only, SyncManagers before FMMUs, or disables it in reverse order:
@@ -410,22 +321,6 @@ pub(crate) async fn enable_op_only(
     Ok(())
 }
 
-/// A SyncManager without data stays disabled: devices reject an active one of length 0.
-fn sync_manager(sm: &SmLayout) -> [u8; registers::SYNC_MANAGER_LEN as usize] {
-    let [p0, p1] = sm.start_address.to_le_bytes();
-    let [n0, n1] = sm.len.to_le_bytes();
-    [p0, p1, n0, n1, sm.control_byte, 0, u8::from(sm.len > 0), 0]
-}
-
-fn fmmu(mapping: &Mapping) -> [u8; FMMU_SIZE as usize] {
-    let [l0, l1, l2, l3] = mapping.logical.to_le_bytes();
-    let [n0, n1] = mapping.len.to_le_bytes();
-    let [p0, p1] = mapping.physical.to_le_bytes();
-    let (kind, on) = (mapping.kind, u8::from(!mapping.op_only));
-    // Start bit 0 to stop bit 7; physical start bit 0.
-    [l0, l1, l2, l3, n0, n1, 0, 7, p0, p1, 0, kind, on, 0, 0, 0]
-}
-
 /// Writes a register; fails if the device does not answer.
 pub(super) async fn write(
     wire: &impl MailboxTransport,
@@ -447,40 +342,4 @@ pub(super) async fn read<const N: usize>(
 ) -> Result<[u8; N], Error> {
     let registers = Registers { wire, device, step };
     registers.read(register).await
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// ETG.1000.4, FMMU: one FMMU maps one contiguous physical area to one contiguous logical area,
-    /// in one direction.
-    #[test]
-    fn share_fmmus_joins_adjoining_areas_of_one_direction() {
-        let mapping = |logical, physical, len, kind| Mapping {
-            logical,
-            physical,
-            len,
-            kind,
-            op_only: false,
-        };
-        let mut all = vec![
-            mapping(0x1_0000, 0x0f00, 1, WRITE),
-            mapping(0x1_0001, 0x0f01, 1, WRITE),
-            mapping(0x1_0002, 0x0f03, 1, WRITE),
-            mapping(0x1_0000, 0x1000, 2, READ),
-            mapping(0x1_0002, 0x1002, 4, READ),
-        ];
-        share_fmmus(&mut all);
-        let joined = [
-            mapping(0x1_0000, 0x0f00, 2, WRITE),
-            mapping(0x1_0002, 0x0f03, 1, WRITE),
-            mapping(0x1_0000, 0x1000, 6, READ),
-        ];
-        assert_eq!(all, joined);
-        all[1].op_only = true;
-        all[1].physical = 0x0f02;
-        share_fmmus(&mut all);
-        assert_eq!(all.len(), 3, "one is disabled outside Op");
-    }
 }

@@ -11,6 +11,7 @@ use ecaxis_ecat::registers;
 use ecaxis_esi::model::{SmUse, SyncManager};
 
 use super::device::{read, write};
+use super::process_data::RegisterBlock;
 use super::{Step, name_at};
 use crate::acyclic::enumerate::read_device;
 use crate::acyclic::{AlState, DeviceRef, StateTimeouts, al};
@@ -48,17 +49,31 @@ impl<'c> EsiMailbox<'c> {
         wire: &impl MailboxTransport,
         device: &DeviceRef,
     ) -> Result<(), Error> {
-        for (number, sm) in [self.out, self.inp] {
-            let [a0, a1] = sm.start_address.to_le_bytes();
-            let [n0, n1] = sm.default_size.to_le_bytes();
-            let register = sync_manager(number);
-            let enabled = [a0, a1, n0, n1, sm.control_byte, 0, 1, 0];
+        for block in self.registers() {
             // The other registers of an enabled SyncManager cannot be written (ETG.1000.4).
-            write(wire, device, STEP, register + ACTIVATE, &[0]).await?;
-            write(wire, device, STEP, register, &enabled).await?;
+            write(wire, device, STEP, block.register + ACTIVATE, &[0]).await?;
+            write(wire, device, STEP, block.register, &block.data).await?;
         }
         Ok(())
     }
+
+    fn registers(&self) -> [RegisterBlock; 2] {
+        [self.out, self.inp].map(|(number, sm)| {
+            let [a0, a1] = sm.start_address.to_le_bytes();
+            let [n0, n1] = sm.default_size.to_le_bytes();
+            RegisterBlock {
+                register: sync_manager(number),
+                data: vec![a0, a1, n0, n1, sm.control_byte, 0, 1, 0],
+                op_only: None,
+            }
+        })
+    }
+}
+
+/// Returns the mailbox SyncManagers of the ESI, out and in; `None` without mailboxes.
+#[must_use]
+pub fn mailbox_registers(config: &DeviceConfig) -> Option<[RegisterBlock; 2]> {
+    EsiMailbox::of(config).map(|mailbox| mailbox.registers())
 }
 
 /// The offset of a SyncManager's activate register.

@@ -47,17 +47,21 @@ mod limits;
 mod mailbox;
 mod mapping;
 mod output_defaults;
+pub mod process_data;
 pub(crate) mod ring;
 mod times;
 pub(crate) use identify::{compare as compare_identity, known as known_identity, name_at};
 mod watchdog;
 
 pub use crate::report::bring_up::{Step, StepTime};
+pub use clocks::pulse_registers;
 use device::StartupPhase;
 pub(crate) use device::enable_op_only;
 pub use device::{SdoOutcome, write_startup_sdo};
+pub use mailbox::mailbox_registers;
 pub use ring::RingDelays;
 pub use times::StepTimes;
+pub use watchdog::watchdog_registers;
 
 /// The size of ethercrab's own process image, which is not used.
 const MAX_PDI: usize = 1;

@@ -28,23 +28,7 @@ pub(super) async fn set(
     let has_axis = config.selection.mode.is_some();
     let outputs = &config.selection.layout.outputs;
     let is_watched = outputs.iter().any(|sm| sm.control_byte & TRIGGER != 0);
-    for (register, what, value) in [
-        (
-            registers::WATCHDOG_DIVIDER,
-            "the watchdogs' divider",
-            Bus::WATCHDOG_DIVIDER,
-        ),
-        (
-            registers::WATCHDOG_TIME_PDI,
-            "the PDI watchdog's time",
-            Bus::PDI_WATCHDOG,
-        ),
-        (
-            registers::WATCHDOG_TIME_PROCESS_DATA,
-            "the process data watchdog's time",
-            bus.process_data_watchdog(),
-        ),
-    ] {
+    for (register, what, value) in watchdog_registers(bus) {
         let wanted = value.to_le_bytes();
         let at = device.at.station;
         let written = wire.write(at, register, &wanted).await;
@@ -90,6 +74,28 @@ pub(super) async fn set(
         }
     }
     Ok(())
+}
+
+/// Returns the watchdog registers of every SubDevice, each with its name and value.
+#[must_use]
+pub fn watchdog_registers(bus: &Bus) -> [(u16, &'static str, u16); 3] {
+    [
+        (
+            registers::WATCHDOG_DIVIDER,
+            "the watchdogs' divider",
+            Bus::WATCHDOG_DIVIDER,
+        ),
+        (
+            registers::WATCHDOG_TIME_PDI,
+            "the PDI watchdog's time",
+            Bus::PDI_WATCHDOG,
+        ),
+        (
+            registers::WATCHDOG_TIME_PROCESS_DATA,
+            "the process data watchdog's time",
+            bus.process_data_watchdog(),
+        ),
+    ]
 }
 
 /// Returns `None` if the device has no such register.
