@@ -36,4 +36,4 @@ pub use select::{
     UserSdo, find_device, offered_modes, select,
 };
 pub use startup::StartupSdo;
-pub use xml::{parse, parse_where};
+pub use xml::{decode_text, parse, parse_where};

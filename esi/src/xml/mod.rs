@@ -38,6 +38,8 @@ mod slots;
 mod sync;
 mod text;
 
+use std::borrow::Cow;
+
 use crate::error::EsiError;
 use crate::model::{DeviceHeader, EsiFile, Warning};
 use pdo::PdoDefinitions;
@@ -63,6 +65,18 @@ pub fn parse_where(
     filter: &dyn Fn(&DeviceHeader) -> bool,
 ) -> Result<EsiFile, EsiError> {
     read(bytes, Some(filter))
+}
+
+/// Decodes an XML file by its byte order mark and its declaration: UTF-8, UTF-16, ISO-8859-1 or
+/// windows-1252.
+///
+/// ```
+/// let text = ecaxis_esi::decode_text(b"<?xml version='1.0' encoding='ISO-8859-1'?><\xfc/>");
+/// assert!(text.ends_with("<ü/>"));
+/// ```
+#[must_use]
+pub fn decode_text(bytes: &[u8]) -> Cow<'_, str> {
+    decode::decode(bytes).text
 }
 
 /// The longest chain of PDOs that refer to each other forwards.
