@@ -7,6 +7,7 @@ mod completions;
 mod conformance;
 mod doctor;
 mod documents;
+mod eni;
 mod esi;
 mod identity;
 mod init;

@@ -2,6 +2,7 @@
 //!
 //! - [`scan`]: the SubDevices of a segment, and a machine file generated from them;
 //! - [`compare`]: compares a machine file with a bus;
+//! - [`eni`]: network descriptions (ENI) of other configuration tools and MainDevices;
 //! - [`firmware`]: firmware updates;
 //! - [`doctor`]: checks of host settings that delay the cycle;
 //! - [`host`]: the state of a computer from its files;
@@ -17,6 +18,7 @@ pub mod bench;
 pub mod compare;
 pub mod doctor;
 pub mod document;
+pub mod eni;
 pub mod firmware;
 pub mod host;
 pub mod scan;

@@ -14,6 +14,7 @@ mod compare;
 mod completions;
 mod doctor;
 mod eeprom;
+mod eni;
 pub(crate) mod esi;
 mod explain;
 mod firmware;
@@ -40,6 +41,7 @@ pub(crate) enum Verb {
     Sdo(sdo::Args),
     Eeprom(eeprom::Args),
     Esi(esi::Args),
+    Eni(eni::Args),
     Sim(sim::Args),
     Doctor(doctor::Args),
     Bench(bench::Args),
@@ -123,6 +125,7 @@ impl Verb {
             Self::Sdo(args) => sdo::run(&args),
             Self::Eeprom(args) => eeprom::run(&args),
             Self::Esi(args) => esi::run(&args),
+            Self::Eni(args) => eni::run(&args),
             Self::Sim(args) => sim::run(&args),
             Self::Doctor(args) => doctor::run(&args),
             Self::Bench(args) => bench::run(&args),

@@ -73,10 +73,19 @@ impl EsiMatch {
 /// be read.
 #[must_use]
 pub fn describe(scan: &Scan, library: &Library) -> (Vec<Option<EsiMatch>>, Vec<LoadError>) {
-    let entries: Vec<_> = scan
-        .devices
+    let identities: Vec<_> = scan.devices.iter().map(Device::identity).collect();
+    describe_identities(&identities, library)
+}
+
+/// Like [`describe`], for devices that are known by their identity.
+#[must_use]
+pub fn describe_identities(
+    identities: &[Option<esi::Identity>],
+    library: &Library,
+) -> (Vec<Option<EsiMatch>>, Vec<LoadError>) {
+    let entries: Vec<_> = identities
         .iter()
-        .map(|device| find_entry(device, library))
+        .map(|identity| find_entry((*identity)?, library))
         .collect();
     let is_described = |header: &esi::DeviceHeader| {
         let mut known = entries.iter().flatten();
@@ -115,8 +124,7 @@ pub fn describe(scan: &Scan, library: &Library) -> (Vec<Option<EsiMatch>>, Vec<L
 
 type Files = BTreeMap<PathBuf, Option<Arc<esi::EsiFile>>>;
 
-fn find_entry<'l>(device: &Device, library: &'l Library) -> Option<(&'l Entry, RevisionMatch)> {
-    let identity = device.identity()?;
+fn find_entry(identity: esi::Identity, library: &Library) -> Option<(&Entry, RevisionMatch)> {
     let rules = [
         RevisionMatch::Equal,
         RevisionMatch::Newer,

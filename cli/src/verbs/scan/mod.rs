@@ -238,13 +238,15 @@ fn library(args: &Args) -> Result<Option<Library>, Failure> {
     if let Some(path) = &args.esi {
         return open(path).map(Some);
     }
-    let during = |file: &Option<PathBuf>| Some(file.as_deref()?.parent()?.join("esi"));
-    let places = [
-        during(&args.write),
-        during(&args.sim),
-        Some(PathBuf::from("esi")),
-    ];
-    let place = places.into_iter().flatten().find(|place| place.is_dir());
+    find_library([args.write.as_deref(), args.sim.as_deref()])
+}
+
+/// Returns the folder `esi` next to one of these files or here, if there is one.
+pub(crate) fn find_library(files: [Option<&Path>; 2]) -> Result<Option<Library>, Failure> {
+    let near = |file: &Path| Some(file.parent()?.join("esi"));
+    let places = files.into_iter().flatten().filter_map(near);
+    let mut places = places.chain([PathBuf::from("esi")]);
+    let place = places.find(|place| place.is_dir());
     place.map(|place| open(&place)).transpose()
 }
 

@@ -4,7 +4,7 @@
 const COMMENTS: usize = 36;
 
 #[derive(Debug, Default)]
-pub(super) struct TomlWriter {
+pub(crate) struct TomlWriter {
     header: Option<&'static str>,
     /// Key, value, comment; without a key, only a comment.
     lines: Vec<(String, String, String)>,

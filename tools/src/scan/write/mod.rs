@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use ecaxis_esi as esi;
+use ecaxis_esi::sii::MailboxDifference;
 
 use super::{Device, EsiMatch, Scan};
 use ecaxis_master::config::duration;
@@ -18,7 +19,7 @@ mod lines;
 #[cfg(test)]
 mod tests;
 
-use lines::TomlWriter;
+pub(crate) use lines::TomlWriter;
 
 /// The marker of uncertain lines, which users can search for.
 pub const MARK: &str = "CHECK:";
@@ -236,7 +237,11 @@ pub fn device_section(
             let comment = "its EEPROM: no ESI file here describes it";
             lines.add("sii", &quoted(&image_name(named)), comment);
         }
-        _ => esi_keys(device, described, place, &mut lines),
+        _ => {
+            let identity = device.identity().unwrap_or_default();
+            let mailbox = described.and_then(|described| described.mailbox_difference(device));
+            esi_keys(identity, described, mailbox, place.folder, &mut lines);
+        }
     }
     locator(device, aliases, &mut lines);
     if let Some(mode) = named.mode {
@@ -299,13 +304,13 @@ fn gateway(device: &Device, described: &EsiMatch) -> String {
 }
 
 /// Adds `esi` and the keys that select the device.
-fn esi_keys(
-    device: &Device,
+pub(crate) fn esi_keys(
+    identity: esi::Identity,
     described: Option<&EsiMatch>,
-    place: OutputPath<'_>,
+    mailbox: Option<MailboxDifference>,
+    folder: &Path,
     lines: &mut TomlWriter,
 ) {
-    let identity = device.identity().unwrap_or_default();
     let Some(described) = described else {
         let comment = format!(
             "{MARK} no ESI file here describes {identity}: get it from its vendor, put it here"
@@ -314,9 +319,9 @@ fn esi_keys(
         return;
     };
     let path = described.path.as_deref().unwrap_or(Path::new(""));
-    let path = relative(path, place.folder);
+    let path = relative(path, folder);
     lines.add("esi", &quoted(&path.display().to_string()), "");
-    if let Some(difference) = described.mailbox_difference(device) {
+    if let Some(difference) = mailbox {
         let comment = format!("{MARK} {difference}; or \"eeprom\"");
         lines.add("mailbox", &quoted("esi"), &comment);
     }

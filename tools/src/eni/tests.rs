@@ -1,0 +1,301 @@
+//! Machines → ENI → machines, files of other tools, and damaged files.
+
+#![allow(clippy::print_stdout, reason = "the tests count what they compare")]
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
+
+use ecaxis_esi as esi;
+use ecaxis_master::config::{self, Machine};
+use ecaxis_master::esi_library::Library;
+use ecaxis_test_support::{fixture, root};
+use proptest::prelude::*;
+
+use super::import::Import;
+use super::*;
+
+fn import_with(bytes: &[u8], esi: &Path) -> Import {
+    let library = match esi.is_dir() {
+        true => Library::open(esi, None),
+        false => Library::of_file(esi),
+    };
+    let library = library.expect("a library");
+    let path = root().join("configs/imported.toml");
+    import(bytes, Some(&library), &path).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// Object, first bit and length.
+type Place = (u16, u8, u32, u16);
+
+/// Returns the outputs and inputs of each device.
+fn layouts(machine: &Machine) -> Vec<[Vec<Place>; 2]> {
+    let place = |f: &esi::Field| (f.index, f.sub, f.bit_offset, f.bit_len);
+    let of = |fields: &[esi::Field]| fields.iter().map(place).collect();
+    let devices = machine.devices.iter();
+    let layouts = devices.map(|device| &device.selection.layout);
+    layouts
+        .map(|layout| [of(&layout.rx), of(&layout.tx)])
+        .collect()
+}
+
+fn samples() -> Vec<PathBuf> {
+    let folder = std::fs::read_dir(root().join("configs")).expect("our folder");
+    let files = folder.map(|entry| entry.expect("an entry").path());
+    let mut files: Vec<_> = files
+        .filter(|path| path.extension().is_some_and(|e| e == "toml"))
+        .collect();
+    files.sort();
+    files
+}
+
+#[test]
+fn samples_keep_their_process_data() {
+    let mut count = 0;
+    for file in samples() {
+        let name = file.display();
+        let machine = config::load(&file).expect("our file");
+        let exported = export(&machine).expect("an ENI");
+        let back = import_with(exported.text.as_bytes(), &root().join("configs/esi"));
+        let imported = back
+            .machine
+            .unwrap_or_else(|e| panic!("{name}: {e}\n{}", back.text));
+        assert_eq!(back.other_layouts, [""; 0], "{name}\n{}", back.text);
+        let mut by_position: Vec<_> = machine.devices.iter().zip(layouts(&machine)).collect();
+        by_position.sort_by_key(|(device, _)| match device.at {
+            config::Locator::Position(position) => (0, position),
+            _ => (1, u16::from(device.optional)),
+        });
+        let expected: Vec<_> = by_position.into_iter().map(|(_, layout)| layout).collect();
+        assert_eq!(layouts(&imported), expected, "{name}\n{}", back.text);
+        // ecaxis sends every exported command, except those of firmware updates.
+        let known = ["Bootstrap", "HotConnect"];
+        let mut unsent = back.unsent.iter();
+        let other = unsent.find(|unsent| {
+            let all = format!("{} {}", unsent.command, unsent.reason);
+            !known.iter().any(|known| all.contains(known))
+        });
+        assert_eq!(other, None, "{name}");
+        count += machine.devices.len();
+    }
+    println!("{count} devices");
+    assert!(count > 50);
+}
+
+/// Every device of every ESI file that a machine file can name keeps its process data.
+#[test]
+fn devices_of_vendors_keep_their_process_data() {
+    let Some(folder) = fixture("esi") else {
+        return;
+    };
+    let library = Library::open(&folder, None).expect("a library");
+    let (mut kept, mut lost, mut unusable) = (0, Vec::new(), 0);
+    let axis = "mode = \"csp\"\n[device.axis]\nencoder = 2000\nlimits = { velocity = 10.0, acceleration = 10.0 }";
+    let entries = library.entries().iter();
+    for (entry, axis) in entries.flat_map(|entry| [(entry, ""), (entry, axis)]) {
+        let path = folder.join(&entry.file);
+        let text = format!(
+            "[bus]\nnic = \"sim\"\ncycle = \"2ms\"\n[[device]]\nname = \"d\"\nposition = 0\nesi = \"{}\"\nproduct = 0x{:x}\nrevision = 0x{:x}\n{axis}\n",
+            path.display(),
+            entry.product,
+            entry.revision,
+        );
+        let machine = config::parse(&root().join("configs/vendor.toml"), &text);
+        let Ok(exported) = machine.as_ref().map(export) else {
+            unusable += 1;
+            continue;
+        };
+        let what = format!("{} 0x{:08x}", entry.file.display(), entry.product);
+        let exported = exported.unwrap_or_else(|e| panic!("{what}: {e}"));
+        let back = import_with(exported.text.as_bytes(), &path);
+        let same = back
+            .machine
+            .as_ref()
+            .map(|imported| layouts(imported) == layouts(machine.as_ref().expect("loaded")));
+        match same {
+            Ok(true) => kept += 1,
+            Ok(false) => lost.push(format!("{what}: another layout\n{}", back.text)),
+            Err(error) => lost.push(format!("{what}: {error}\n{}", back.text)),
+        }
+    }
+    println!(
+        "{kept} kept, {unusable} without a default selection, {} lost",
+        lost.len()
+    );
+    assert_eq!(lost, [""; 0], "{}", lost.join("\n"));
+    assert!(kept > 20);
+}
+
+/// TwinCAT's ENI of a drive with a module: the layout and the SDOs of the ENI, found in the ESI.
+#[test]
+fn recorded_eni_becomes_the_same_machine() {
+    let (Some(eni), Some(esi)) = (
+        fixture("eni/CherryECAT_CIA402_ENI.xml"),
+        fixture("esi/hpmicro/ECAT_CIA402.xml"),
+    ) else {
+        return;
+    };
+    let back = import_with(&std::fs::read(eni).expect("read"), &esi);
+    let machine = back
+        .machine
+        .unwrap_or_else(|e| panic!("{e}\n{}", back.text));
+    let unsent: Vec<_> = back.unsent.iter().map(|u| u.command.as_str()).collect();
+    // The other commands configure what ecaxis configures as well.
+    let registers = [
+        "BWR 0x0200",
+        "BWR 0x0300",
+        "BWR 0x0103",
+        "FPWR 0x0120 = 1300",
+        "FPRD 0x0130 (check device state for BOOT)",
+    ];
+    assert_eq!(unsent.len(), registers.len(), "{unsent:?}");
+    for (command, register) in unsent.iter().zip(registers) {
+        assert!(command.starts_with(register), "{unsent:?}");
+    }
+    assert_eq!(machine.bus.cycle_ns, 2_000_000);
+    let expected = [
+        vec![(0x6040, 0, 0, 16), (0x60ff, 0, 16, 32)],
+        vec![(0x6041, 0, 0, 16), (0x6064, 0, 16, 32)],
+    ];
+    assert_eq!(layouts(&machine), [expected], "{}", back.text);
+    assert_eq!(back.other_layouts, [""; 0]);
+}
+
+/// SOEM's sample has no ESI: the file says so, and no command is dropped silently.
+#[test]
+fn eni_without_esi_names_what_is_missing() {
+    let Some(eni) = fixture("eni/SOEM_sample-eni.xml") else {
+        return;
+    };
+    let bytes = std::fs::read(eni).expect("read");
+    let back = import(&bytes, None, Path::new("machine.toml")).expect("an ENI");
+    assert_eq!(back.without_esi, 2);
+    assert!(back.machine.is_err());
+    assert_eq!(back.unsent.len(), 5, "{:?}", back.unsent);
+    assert!(back.text.contains("\"Sample_device_A\""), "{}", back.text);
+}
+
+/// An ENI with copies, and one with start-up SDOs and clocks.
+static TEXTS: LazyLock<[String; 2]> = LazyLock::new(|| {
+    ["copy.toml", "demo.toml"].map(|name| {
+        let machine = config::load(&root().join("configs").join(name)).expect("our file");
+        export(&machine).expect("an ENI").text
+    })
+});
+
+static LIBRARY: LazyLock<Library> =
+    LazyLock::new(|| Library::open(&root().join("configs/esi"), None).expect("our files"));
+
+#[test]
+fn damaged_files_have_a_position_and_a_remedy() {
+    let deep = "<a>".repeat(100_000);
+    let wide = format!(
+        "<EtherCATConfig>{}</EtherCATConfig>",
+        "<a/>".repeat(600_000)
+    );
+    let mut bomb = "<!DOCTYPE b [<!ENTITY a \"aaaaaaaaaa\">".to_owned();
+    for n in 0..20 {
+        let _ = write!(bomb, "<!ENTITY a{n} \"&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;\">");
+    }
+    bomb += "]>\n<EtherCATConfig>&a9;</EtherCATConfig>";
+    let slave = |info: &str| {
+        format!("<EtherCATConfig><Config>\n<Slave>{info}</Slave></Config></EtherCATConfig>")
+    };
+    let sdo = |inner: &str| {
+        let commands = format!("<InitCmds><InitCmd>{inner}</InitCmd></InitCmds>");
+        slave(&format!("<Info/><Mailbox><CoE>{commands}</CoE></Mailbox>"))
+    };
+    for (text, position, message) in [
+        (String::new(), (1, 1), "no XML element"),
+        ("machine = 1".to_owned(), (1, 12), "no XML element"),
+        (
+            "<EtherCATInfo/>".to_owned(),
+            (1, 1),
+            "root element is <EtherCATInfo>",
+        ),
+        (
+            "<EtherCATConfig/>".to_owned(),
+            (1, 1),
+            "<Config> is missing",
+        ),
+        (
+            "<EtherCATConfig><Config>".to_owned(),
+            (1, 25),
+            "ends inside <Config>",
+        ),
+        (
+            "<EtherCATConfig>\n</Config>".to_owned(),
+            (2, 1),
+            "not well-formed",
+        ),
+        (deep, (1, 97), "nested deeper than 32"),
+        (wide, (1, 2_000_013), "more than 500000 elements"),
+        (bomb, (1, 1), "document type"),
+        (
+            "<EtherCATConfig>&x;</EtherCATConfig>".to_owned(),
+            (1, 17),
+            "unknown entity &x;",
+        ),
+        (slave(""), (2, 1), "<Slave> has no <Info>"),
+        (
+            slave("<Info><VendorId>99999999999</VendorId></Info>"),
+            (2, 14),
+            "does not fit 32 bits",
+        ),
+        (
+            slave("<Info><VendorId>two</VendorId></Info>"),
+            (2, 14),
+            "not a number that fits",
+        ),
+        (sdo("<SubIndex>1</SubIndex>"), (2, 39), "has no <Index>"),
+        (
+            sdo("<Index>65536</Index>"),
+            (2, 48),
+            "not a number that fits",
+        ),
+        (
+            sdo("<Index>1</Index><Data>0g</Data>"),
+            (2, 64),
+            "hexadecimal bytes",
+        ),
+    ] {
+        let head: String = text.chars().take(60).collect();
+        let error = import(text.as_bytes(), None, Path::new("m.toml")).expect_err(&head);
+        assert!(error.message.contains(message), "{head}: {error}");
+        let found = (error.position.line, error.position.column);
+        assert_eq!(found, position, "{head}: {error}");
+        assert!(!error.help.is_empty());
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(300))]
+
+    /// Bytes that change, vanish or repeat are an error with a position, or another machine.
+    #[test]
+    fn mutated_files_neither_panic_nor_hang(
+        text in 0..2_usize,
+        changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>(), 0..4_u8), 1..12),
+    ) {
+        let mut bytes = TEXTS[text].clone().into_bytes();
+        for (index, byte, kind) in changes {
+            let at = index.index(bytes.len());
+            match kind {
+                0 => bytes[at] = byte,
+                1 => { bytes.remove(at); }
+                2 => {
+                    let end = (at + usize::from(byte) * 8).min(bytes.len());
+                    let part = bytes[at..end].to_vec();
+                    bytes.splice(at..at, part);
+                }
+                // Digits become long or negative numbers.
+                _ => { bytes.splice(at..at, *b"-9"); }
+            }
+        }
+        let path = root().join("configs/imported.toml");
+        match import(&bytes, Some(&LIBRARY), &path) {
+            Ok(back) => prop_assert!(back.text.len() < 100_000),
+            Err(error) => prop_assert!(error.position.line > 0),
+        }
+    }
+}
