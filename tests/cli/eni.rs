@@ -255,6 +255,24 @@ fn changed_commands_are_listed_with_line_and_reason() {
     assert_eq!(machine.matches("[[copy]]").count(), copies, "{machine}");
 }
 
+/// `compare` takes an ENI as what another tool expects of the bus.
+#[test]
+fn compare_takes_an_eni_as_the_expected_bus() {
+    let folder = tempfile::tempdir().unwrap();
+    let bus = folder.path().join("bus.xml");
+    let bus = bus.to_str().unwrap();
+    eni(&["configs/demo.toml", "-o", bus]).exits(0);
+    let compare = |arguments: &[&str]| {
+        program::run([&["compare", bus, "--esi", "configs/esi"], arguments].concat())
+    };
+    let same = compare(&["--sim", "configs/demo.toml"]).exits(0);
+    assert_eq!(same.out, "as in the file\n");
+    compare(&["--sim", "configs/copy.toml"])
+        .fails(1, &["the bus is not as in", "export the file again"]);
+    compare(&[]).fails(2, &["is an ENI file", "--nic"]);
+    compare(&["--sim", "configs/demo.toml", "--apply"]).fails(2, &["is an ENI file", "eni import"]);
+}
+
 /// Help texts and the list of commands match the reviewed snapshots.
 #[test]
 fn eni_output_matches_the_snapshots() {

@@ -15,6 +15,7 @@ use crate::access::bus::{self, Bus};
 use crate::args::files::{back_up, replace};
 use crate::hints::{self, Failure};
 use crate::render::{note, page, print_json};
+use crate::verbs::eni::machine_of;
 use crate::verbs::scan::{ScanResult, open};
 
 const EXAMPLES: &str = "\
@@ -22,7 +23,8 @@ Examples:
   ecaxis compare m.toml                    the bus on the file's interface
   ecaxis compare m.toml --nic enp3s0       another interface
   ecaxis compare m.toml --sim other.toml   another file's simulated bus
-  ecaxis compare m.toml --apply            update the file to match the bus";
+  ecaxis compare m.toml --apply            update the file to match the bus
+  ecaxis compare bus.xml --nic enp3s0      an ENI file of another tool";
 
 /// Compare a machine file with the bus: devices, revisions, aliases, serial numbers, modules
 ///
@@ -31,7 +33,7 @@ Examples:
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// Machine file
+    /// Machine file, or ENI file of another tool
     #[arg(value_name = "FILE")]
     file: PathBuf,
     /// Use this network interface instead of the file's
@@ -49,9 +51,9 @@ pub(crate) struct Args {
     /// Update the file to match the bus; comments are kept
     #[arg(long, conflicts_with = "json")]
     apply: bool,
-    /// ESI file or folder for devices that are not in the file [default: the folders of the file's
-    /// ESI files]
-    #[arg(long, value_name = "PATH", requires = "apply")]
+    /// ESI file or folder for `--apply` and for an ENI file [default: the folders of the file's ESI
+    /// files; esi]
+    #[arg(long, value_name = "PATH")]
     esi: Option<PathBuf>,
     /// Print as JSON
     #[arg(long)]
@@ -61,7 +63,24 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let machine = load(&args.file)?;
+    let eni = machine_of(&args.file, args.esi.as_deref())?;
+    let is_eni = eni.is_some();
+    let machine = match eni {
+        Some(machine) => machine,
+        None => load(&args.file)?,
+    };
+    if args.esi.is_some() && !is_eni && !args.apply {
+        let failure = Failure::new(hints::WRONG, "--esi: the file names its ESI files itself");
+        return Err(failure.hint("`--esi` is for `--apply` and for ENI files"));
+    }
+    if is_eni && (args.apply || args.nic.is_none() && args.sim.is_none()) {
+        let file = args.file.display();
+        let failure = Failure::new(hints::WRONG, format!("{file} is an ENI file"));
+        return Err(match args.apply {
+            true => failure.hint("`ecaxis eni import` makes a machine file of it"),
+            false => failure.hint("name the interface with `--nic`"),
+        });
+    }
     let bus = match (&args.sim, &args.nic) {
         (Some(file), _) => {
             let mut other = load(file)?;
@@ -121,7 +140,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if args.apply {
         return rewrite(args, &machine, &seen, &comparison);
     }
-    Err(differs(&args.file, differences.len()))
+    Err(differs(&args.file, differences.len(), is_eni))
 }
 
 /// Returns a line for each optional device that is absent.
@@ -143,10 +162,14 @@ fn load(file: &Path) -> Result<Machine, Failure> {
     config::load(file).map_err(|e| hints::config(file, &e))
 }
 
-fn differs(file: &Path, count: usize) -> Failure {
+fn differs(file: &Path, count: usize, is_eni: bool) -> Failure {
     let (file, count) = (file.display(), pluralize(count, "difference"));
     let message = format!("the bus is not as in {file}: {count}");
-    Failure::new(hints::FAILED, message).hint(
+    let failure = Failure::new(hints::FAILED, message);
+    if is_eni {
+        return failure.hint("correct the bus, or export the file again");
+    }
+    failure.hint(
         "correct the bus, or `--apply` makes the file as the bus is; what revisions may stand for others, `identity` says",
     )
 }

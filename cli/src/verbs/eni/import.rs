@@ -3,12 +3,12 @@
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use ecaxis_master::config::ConfigError;
+use ecaxis_master::config::{ConfigError, Machine};
 use ecaxis_master::file;
 use ecaxis_master::text::pluralize;
 use ecaxis_tools::cells;
 use ecaxis_tools::document::{Document, Table};
-use ecaxis_tools::eni::{self, Import};
+use ecaxis_tools::eni::{self, EniError, Import};
 use serde_json::json;
 
 use crate::args::files::{Inputs, check_output, replace};
@@ -65,7 +65,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
     };
     let path = args.output.clone().unwrap_or(PathBuf::from("machine.toml"));
     let imported = eni::import(&bytes, library.as_ref(), &path);
-    let imported = imported.map_err(|error| wrong(format!("{shown}:{error}")).hint(error.help))?;
+    let imported = imported.map_err(|error| refused(&args.bus, &error))?;
     for error in &imported.unreadable {
         note(&format!("warning: {error}"));
     }
@@ -79,6 +79,40 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
         result(&imported.text)?;
     }
     report(&imported, &args.bus, args.output.as_deref())
+}
+
+/// Returns the machine of an ENI file, or `None` if the file is not XML.
+pub(crate) fn machine_of(path: &Path, esi: Option<&Path>) -> Result<Option<Machine>, Failure> {
+    let Ok(bytes) = file::read(path, eni::MAX_BYTES) else {
+        return Ok(None);
+    };
+    let text = bytes.trim_ascii_start();
+    if !text.starts_with(b"<") && !text.starts_with(b"\xef\xbb\xbf<") {
+        return Ok(None);
+    }
+    let library = match esi {
+        Some(esi) => Some(open(esi)?),
+        None => find_library([Some(path), None])?,
+    };
+    let near = path.with_file_name("machine.toml");
+    let imported = eni::import(&bytes, library.as_ref(), &near);
+    let imported = imported.map_err(|error| refused(path, &error))?;
+    let machine = imported.machine.map_err(|error| {
+        let message = match imported.without_esi {
+            0 => format!("{}: {error}", path.display()),
+            count => {
+                let devices = pluralize(count, "device");
+                format!("{}: no ESI file describes {devices}", path.display())
+            }
+        };
+        Failure::new(hints::WRONG, message).hint("name the folder of ESI files with `--esi`")
+    })?;
+    Ok(Some(*machine))
+}
+
+fn refused(path: &Path, error: &EniError) -> Failure {
+    let message = format!("{}:{error}", path.display());
+    Failure::new(hints::WRONG, message).hint(error.help)
 }
 
 fn report(imported: &Import, bus: &Path, output: Option<&Path>) -> Result<(), Failure> {

@@ -12,6 +12,8 @@ use crate::render::{note, result};
 
 mod import;
 
+pub(crate) use import::machine_of;
+
 const EXAMPLES: &str = "\
 Examples:
   ecaxis eni machine.toml -o bus.xml        for another MainDevice

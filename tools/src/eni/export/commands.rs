@@ -345,7 +345,6 @@ impl Network<'_> {
             .with("Destination", "ffffffffffff")
             .with("Source", "101010101010")
             .with("EtherType", "a488");
-        let count = u16::try_from(self.devices.len()).unwrap_or(u16::MAX);
         let all = |comment: &str, ado: u16| {
             EcatCommand::new(UP_TO_PRE_OP, comment, code::BWR, 0, ado).before_slave()
         };
@@ -357,7 +356,10 @@ impl Network<'_> {
             registers::AL_STATUS,
         );
         let commands = [
-            read.before_slave().data(&[0; 2]).cnt(count),
+            EcatCommand {
+                cnt: self.device_count(),
+                ..read.before_slave().data(&[0; 2])
+            },
             all("clear FMMUs", registers::FMMU).length(FMMUS_LEN),
             all("clear SyncManagers", registers::SYNC_MANAGER).length(SYNC_MANAGERS_LEN),
             all("clear system time", registers::DC_SYSTEM_TIME).length(32),

@@ -88,7 +88,7 @@ impl Network<'_> {
                 command: code::BRD,
                 target: CommandTarget::Physical(0, registers::AL_STATUS),
                 len: STATUS_LEN,
-                cnt: u16::try_from(self.devices.len()).ok(),
+                cnt: self.device_count(),
                 offset: self.status_offset(),
             };
             frame = frame.child(status.element());

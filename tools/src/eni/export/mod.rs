@@ -140,6 +140,12 @@ impl<'m> Network<'m> {
         })
     }
 
+    /// Returns the number of devices, unless some of them may be absent.
+    fn device_count(&self) -> Option<u16> {
+        let optional = self.devices.iter().any(|device| device.config.optional);
+        u16::try_from(self.devices.len()).ok().filter(|_| !optional)
+    }
+
     /// Returns what the ENI does not contain.
     fn notes(&self) -> Vec<String> {
         let mut notes = Vec::new();
@@ -159,7 +165,7 @@ impl<'m> Network<'m> {
                 )),
             }
             if config.optional {
-                add("optional here; the working counters of the ENI include it");
+                add("optional here; the working counters of the process data include it");
             }
             if matches!(
                 config.identity,
