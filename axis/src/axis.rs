@@ -19,14 +19,17 @@
 //! | `home` | homing |
 //! | `lead` | the second half of a gantry |
 //! | `stop` | power, stops, brake, automatic fault reset |
+//! | `correction` | backlash and pitch error between drive and load |
 //! | `feedback` | values reported by the drive |
 //! | `supervision` | supervision of these values; final limits of the set-point |
 //! | `lost_frames` | lost frames and skipped cycles |
+//! | `second_encoder` | a second encoder at the load, supervised |
 //! | `report` | status |
 
 use crate::cia402::{
     self, Controlword, Mode, Power, PowerProgress, PowerState, Request, State, Statusword,
 };
+use crate::compensation::Compensation;
 use crate::profile_mode::Profile;
 use crate::setpoint::Motion;
 use crate::status::{CommandError, DriveFault, Trip};
@@ -36,6 +39,7 @@ use crate::units::Counts;
 mod command;
 mod config;
 mod control_law;
+mod correction;
 mod feedback;
 mod home;
 mod io;
@@ -44,6 +48,7 @@ mod lost_frames;
 mod mode_switch;
 mod plan;
 mod report;
+mod second_encoder;
 mod stop;
 mod supervision;
 
@@ -51,9 +56,11 @@ pub use command::Command;
 pub use config::{AxisConfig, ConfigError};
 pub use io::{Inputs, Outputs};
 pub use lead::Losses;
+pub use second_encoder::SecondEncoder;
 
 use config::ControlledQuantity;
 use control_law::LoopState;
+use correction::Correction;
 use feedback::Actual;
 use home::HomingRun;
 use mode_switch::Switch;
@@ -75,6 +82,9 @@ pub const MIN_RATE: f64 = 1e-3;
 #[derive(Debug, Clone)]
 pub struct Axis {
     config: AxisConfig,
+    compensation: Compensation,
+    correction: Correction,
+    second: second_encoder::SecondPosition,
     /// The active mode; its targets apply.
     mode: Mode,
     switch: Option<Switch>,
@@ -137,6 +147,15 @@ pub struct Axis {
 impl Axis {
     /// Creates a disabled axis. Fails if the configuration is contradictory or out of range.
     pub fn new(config: AxisConfig) -> Result<Self, ConfigError> {
+        Self::compensated(config, Compensation::default())
+    }
+
+    /// Creates a disabled axis whose load has these errors. The limits of `config` are those of the
+    /// load ([`Compensation::load_limits`]).
+    pub fn compensated(
+        config: AxisConfig,
+        compensation: Compensation,
+    ) -> Result<Self, ConfigError> {
         config.check()?;
         Ok(Self {
             memory: PowerState::new(),
@@ -182,6 +201,9 @@ impl Axis {
             torque_feedforward: 0.0,
             fault: None,
             trip: None,
+            compensation,
+            correction: Correction::default(),
+            second: second_encoder::SecondPosition::default(),
             config,
         })
     }
@@ -285,7 +307,7 @@ impl Axis {
         if fresh {
             self.update_active();
         }
-        let sent = self.sent;
+        let (sent, play) = (self.sent, self.correction.play.position);
         if !self.active {
             self.track_actual();
         } else if self.setpoint_frozen() {
@@ -300,6 +322,7 @@ impl Axis {
         self.external_setpoint = None;
         self.led = false;
         self.previous_target = sent;
+        self.correction.previous_play = play;
         self.update_settling_times(dt_s);
         let outputs = self.outputs();
         self.torque_feedforward = 0.0;
@@ -317,14 +340,18 @@ impl Axis {
         } else {
             f64::INFINITY
         };
-        self.actual.read(inputs, &self.config.scale, fastest);
+        self.actual
+            .read(inputs, &self.config.scale, &self.compensation, fastest);
+        self.read_second_encoder(inputs);
         self.probe_mapped = inputs.touch_probe_status.is_some();
         if let Some(status) = inputs.touch_probe_status {
             let (actual, scale) = (&self.actual, &self.config.scale);
+            let compensation = &self.compensation;
             let stop = self.probes.step(status, |slot| {
                 let raw = inputs.touch_probe_positions.get(slot).copied().flatten()?;
                 let near = actual.counts().unwrap_or_default();
-                Some(scale.position_to_user(near.unwrap_next(raw)).0)
+                let latched = scale.position_to_user(near.unwrap_next(raw)).0;
+                Some(actual.load_at(latched, compensation))
             });
             // The homing sequence stops the axis itself.
             if stop && !self.home.running() {
@@ -388,7 +415,8 @@ impl Axis {
     /// Sets the targets to the reported values, so that enabling causes no step.
     fn track_actual(&mut self) {
         self.sent = self.actual.counts().unwrap_or_default();
-        self.motion = Motion::at(self.config.scale.position_to_user(self.sent).0);
+        self.motion = Motion::at(self.reported_load());
+        self.track_play();
         self.loop_state = LoopState::default();
         self.profile = Profile::new();
         self.plan = Plan::braking(&self.config, self.mode);

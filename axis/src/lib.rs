@@ -10,6 +10,7 @@
 //! | [`units`] | newtypes for drive-side and user-side quantities |
 //! | [`scale`] | counts ↔ user units, drive units (0x60A9, 0x60AA), polarity, modulo, torque |
 //! | [`cia402`] | Statusword, Controlword, power state machine, modes, error codes |
+//! | [`compensation`] | backlash and pitch error between drive and load |
 //! | [`supervision`] | limits that trip the axis, reaction to a trip, brake, fault reset |
 //! | [`homing`] | homing by the drive: methods and parameters |
 //! | [`setpoint`] | hold, moves, ramps, streams, tables, gears; advanced once per cycle |
@@ -24,6 +25,7 @@
 
 mod axis;
 pub mod cia402;
+pub mod compensation;
 pub mod group;
 pub mod homing;
 mod limits;
@@ -38,8 +40,10 @@ pub mod units;
 
 pub use axis::{
     Axis, AxisConfig, Command, ConfigError, Inputs, Losses, MAX_RATE, MIN_RATE, Outputs,
+    SecondEncoder,
 };
 pub use cia402::{Controlword, HaltOption, Mode, Modes, QuickStopOption, State, Statusword};
+pub use compensation::Compensation;
 pub use homing::{Homing, HomingError};
 pub use limits::{LimitError, Limits};
 pub use position_loop::{FeedForward, Loops, PositionPid, VelocityLoop};

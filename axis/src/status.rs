@@ -69,6 +69,10 @@ pub struct AxisStatus {
     pub max_following_error: f64,
     /// Target minus reported position, once the set-point of a position move has arrived.
     pub final_error_counts: Option<i64>,
+    /// Position minus that of the second encoder; `None` while they are not compared.
+    pub encoder_difference: Option<f64>,
+    /// True during a move, which ends after it has taken up the backlash.
+    pub takes_up: bool,
     /// True while a commanded velocity is reduced so that the axis can stop inside its range.
     pub held_by_range: bool,
     /// Cycles in which the final limiter changed a set-point. A value above 0 indicates a planning
@@ -268,6 +272,16 @@ pub enum Trip {
     OverAcceleration {
         /// The acceleration.
         acceleration: f64,
+        /// The limit.
+        limit: f64,
+    },
+    /// The second encoder shows another position.
+    #[error(
+        "the position is {difference:.4} off that of the second encoder: the limit is {limit:.4}"
+    )]
+    EncoderDifference {
+        /// Position of the axis minus that of the second encoder.
+        difference: f64,
         /// The limit.
         limit: f64,
     },

@@ -3,6 +3,7 @@
 #![allow(clippy::print_stdout, reason = "tests print counts and what they skip")]
 
 mod common;
+mod compensation;
 mod counting;
 mod enabling;
 mod loops;

@@ -1,5 +1,6 @@
 //! Configuration of an axis and its checks.
 
+use super::SecondEncoder;
 use crate::cia402::{Mode, Modes, QuickStopOption};
 use crate::limits::{LimitError, Limits};
 use crate::position_loop::Loops;
@@ -57,6 +58,8 @@ pub struct AxisConfig {
     /// True if no profile values (0x6081, 0x6083, 0x6084) are in the process data: a move in PP
     /// runs with those that the drive has, and takes no other speed or ramp.
     pub profile_fixed: bool,
+    /// The second encoder at the load.
+    pub second_encoder: Option<SecondEncoder>,
 }
 
 impl AxisConfig {
@@ -88,6 +91,7 @@ impl AxisConfig {
             follows_bit: true,
             absolute: false,
             profile_fixed: false,
+            second_encoder: None,
         }
     }
 
@@ -114,6 +118,14 @@ impl AxisConfig {
             ("supervised acceleration", watch.acceleration),
             ("standstill window", watch.standstill),
             ("stop_timeout_s", self.stop_timeout_s),
+            (
+                "max_difference",
+                self.second_encoder.map(|e| e.max_difference),
+            ),
+            (
+                "counts of the second encoder",
+                self.second_encoder.map(|e| e.counts_per_unit.abs()),
+            ),
             ("kv", csv.map(|l| l.kv)),
             ("kp", cst.map(|l| l.kp)),
             ("tn_s", cst.and_then(|l| l.tn_s)),

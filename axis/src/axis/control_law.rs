@@ -87,10 +87,10 @@ impl LoopState {
 }
 
 impl Axis {
-    /// Returns the position that a drive without following error would report now. `late_s`: time
-    /// since the set-point left.
+    /// Returns the drive position that a drive without following error would report now. `late_s`:
+    /// time since the set-point left.
     pub(super) fn expected(&self, late_s: f64) -> f64 {
-        let motion = &self.motion;
+        let motion = self.drive_motion();
         let late_s = late_s.max(0.0);
         motion.position - (motion.velocity - motion.acceleration * late_s * 0.5) * late_s
     }
@@ -100,7 +100,7 @@ impl Axis {
         let limits = self.config.limits;
         let loops = self.config.loops;
         let switch = self.other_mode();
-        let velocity = self.motion.velocity;
+        let velocity = self.drive_motion().velocity;
         match self.mode {
             Mode::Csp if switch.is_none() => {
                 let ramp = Ramp {
@@ -114,7 +114,7 @@ impl Axis {
                 None => self.loop_state.velocity = velocity,
                 Some(law) => {
                     if fresh {
-                        let error = self.expected(self.config.dead_time_s) - self.actual.position();
+                        let error = self.expected(self.config.dead_time_s) - self.actual.drive();
                         let ramp = Ramp {
                             target: bounded(law.correction(error), limits.velocity),
                             slope: limits.acceleration,
@@ -122,7 +122,8 @@ impl Axis {
                         self.loop_state.correction = ramp.advance(self.loop_state.correction, dt_s);
                     }
                     let wanted = law.feed_forward * velocity + self.loop_state.correction;
-                    self.loop_state.velocity = bounded(wanted, limits.velocity);
+                    let most = self.compensation.drive_velocity(limits.velocity);
+                    self.loop_state.velocity = bounded(wanted, most);
                 }
             },
             Mode::Cst if fresh && !matches!(self.plan, Plan::Torque(_)) => self.close_torque(dt_s),
@@ -140,7 +141,8 @@ impl Axis {
         let limits = self.config.limits;
         match self.other_mode() {
             Some(Mode::Csv | Mode::Pv) if self.mode != Mode::Csv => {
-                self.loop_state.velocity = bounded(self.motion.velocity, limits.velocity);
+                let most = self.compensation.drive_velocity(limits.velocity);
+                self.loop_state.velocity = bounded(self.drive_motion().velocity, most);
             }
             Some(Mode::Cst) => {
                 self.loop_state.torque = bounded(self.actual.torque(), limits.torque)
@@ -191,10 +193,11 @@ impl Axis {
             return;
         };
         let limit = self.config.limits.torque;
+        let motion = self.drive_motion();
         let seen = Deviation {
-            position: self.expected(self.config.dead_time_s) - self.actual.position(),
-            velocity: self.motion.velocity - self.actual.velocity(),
-            acceleration: self.motion.acceleration,
+            position: self.expected(self.config.dead_time_s) - self.actual.drive(),
+            velocity: motion.velocity - self.actual.drive_velocity(),
+            acceleration: motion.acceleration,
         };
         if core::mem::take(&mut self.loop_state.takes_over) {
             self.loop_state.integral = pid.starting_with(self.loop_state.torque, seen);
@@ -232,9 +235,7 @@ impl Axis {
         if counts(Mode::Csp) && self.controlled_quantity() == ControlledQuantity::Position {
             out.target_position = self.sent.wrapped();
         } else if mode == Mode::Csp {
-            out.target_position = scale
-                .position_to_counts(UserUnits(self.motion.position))
-                .wrapped();
+            out.target_position = self.drive_counts(self.motion.position).wrapped();
         }
         if counts(Mode::Csv) || (mode == Mode::Pv && self.mode != Mode::Pv) {
             let RawVelocity(raw) = scale.velocity_to_raw(UserVelocity(self.loop_state.velocity));
@@ -251,7 +252,7 @@ impl Axis {
                 out.velocity_offset = scale.velocity_to_raw(offset).0;
             }
             if loops.acceleration != 0.0 || self.torque_feedforward != 0.0 {
-                let torque = loops.acceleration * self.motion.acceleration;
+                let torque = loops.acceleration * self.drive_motion().acceleration;
                 let torque = torque + self.torque_feedforward;
                 let torque = Percent(bounded(torque, self.config.limits.torque));
                 out.torque_offset = scale.torque_to_raw(torque).0;

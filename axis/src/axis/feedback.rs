@@ -1,6 +1,7 @@
 //! Feedback of the drive, in user units.
 
 use super::Inputs;
+use crate::compensation::Compensation;
 use crate::scale::Scale;
 use crate::units::{Counts, PerMille, RawVelocity};
 
@@ -10,7 +11,12 @@ pub(super) const FILTER_S: f64 = 0.01;
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Actual {
     counts: Option<Counts>,
+    /// The position of the drive, and of the load.
+    drive: f64,
     position: f64,
+    /// Drive position minus that of the screw, and the drive's way per way of the load.
+    play: f64,
+    ratio: f64,
     velocity: f64,
     acceleration: f64,
     torque: f64,
@@ -24,25 +30,37 @@ impl Actual {
     pub(super) fn new(wants_acceleration: bool) -> Self {
         Self {
             wants_acceleration,
+            ratio: 1.0,
             ..Self::default()
         }
     }
 
     /// Reads the inputs. A position difference faster than `fastest` is a shift of the origin and
     /// is not used as velocity.
-    pub(super) fn read(&mut self, inputs: &Inputs, scale: &Scale, fastest: f64) {
+    pub(super) fn read(
+        &mut self,
+        inputs: &Inputs,
+        scale: &Scale,
+        compensation: &Compensation,
+        fastest: f64,
+    ) {
         let before = *self;
         if let Some(raw) = inputs.position {
             let counts = self
                 .counts
                 .map_or(Counts(i64::from(raw)), |c| c.unwrap_next(raw));
             self.counts = Some(counts);
-            self.position = scale.position_to_user(counts).0;
+            self.drive = scale.position_to_user(counts).0;
+            if before.counts.is_some() {
+                self.move_load(before.drive - before.play, compensation);
+            } else {
+                self.place_load(compensation);
+            }
         }
         if let Some(raw) = inputs.velocity {
-            self.velocity = scale.velocity_to_user(RawVelocity(raw)).0;
+            self.velocity = scale.velocity_to_user(RawVelocity(raw)).0 / self.ratio;
         } else if before.counts.is_some() && self.elapsed_s > 0.0 {
-            let velocity = (self.position - before.position) / self.elapsed_s;
+            let velocity = (self.drive - before.drive) / (self.elapsed_s * self.ratio);
             if velocity.abs() <= fastest {
                 self.velocity += (velocity - self.velocity) * self.weight();
             }
@@ -64,12 +82,43 @@ impl Actual {
     }
 
     /// Takes the reported position as it is, after the drive has shifted its origin.
-    pub(super) fn start_over(&mut self, scale: &Scale) {
+    pub(super) fn start_over(&mut self, scale: &Scale, compensation: &Compensation) {
         if let Some(counts) = self.counts {
             let counts = Counts(i64::from(counts.wrapped()));
             self.counts = Some(counts);
-            self.position = scale.position_to_user(counts).0;
+            self.drive = scale.position_to_user(counts).0;
+            self.place_load(compensation);
         }
+    }
+
+    /// Moves the load with the drive, whose screw was at `before`: the load stands until the drive
+    /// has passed the play.
+    fn move_load(&mut self, before: f64, compensation: &Compensation) {
+        let [low, high] = compensation.range_of_play();
+        self.play = (self.drive - before).max(low).min(high);
+        self.place_load(compensation);
+    }
+
+    /// Places the load at the present play.
+    fn place_load(&mut self, compensation: &Compensation) {
+        self.position = self.load_at(self.drive, compensation);
+        if compensation.is_active() {
+            self.ratio = compensation.ratio(self.position);
+        }
+    }
+
+    /// Returns the load's position for a position of the drive near the present one.
+    pub(super) fn load_at(&self, drive: f64, compensation: &Compensation) -> f64 {
+        if compensation.is_active() {
+            compensation.load(drive - self.play)
+        } else {
+            drive
+        }
+    }
+
+    /// Sets the load on its reference flank.
+    pub(super) fn reference(&mut self) {
+        self.play = 0.0;
     }
 
     pub(super) fn pass(&mut self, dt_s: f64) {
@@ -80,8 +129,23 @@ impl Actual {
         self.counts
     }
 
+    /// Returns the position of the load.
     pub(super) const fn position(&self) -> f64 {
         self.position
+    }
+
+    /// Returns the position of the drive.
+    pub(super) const fn drive(&self) -> f64 {
+        self.drive
+    }
+
+    /// Returns the velocity of the drive.
+    pub(super) fn drive_velocity(&self) -> f64 {
+        self.velocity * self.ratio
+    }
+
+    pub(super) const fn play(&self) -> f64 {
+        self.play
     }
 
     pub(super) const fn velocity(&self) -> f64 {

@@ -52,7 +52,8 @@ impl Axis {
     /// there before. Home is kept only by the absolute encoder of the same drive.
     pub fn restarted(&mut self, same: bool) {
         self.home.homed &= same && self.config.absolute;
-        self.actual.start_over(&self.config.scale);
+        self.actual
+            .start_over(&self.config.scale, &self.compensation);
     }
 
     pub(super) fn home(&mut self, timeout_s: f64) -> Result<(), CommandError> {
@@ -114,7 +115,9 @@ impl Axis {
         self.home.order = Some(order);
         if sequence.attained() && !before {
             self.home.homed = true;
-            self.actual.start_over(&self.config.scale);
+            self.actual.reference();
+            self.actual
+                .start_over(&self.config.scale, &self.compensation);
         }
         match outcome {
             Outcome::Running if order.mode != self.mode => {

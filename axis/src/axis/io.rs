@@ -19,6 +19,8 @@ pub struct Inputs {
     pub touch_probe_status: Option<u16>,
     /// 0x60BA, 0x60BB, 0x60BC, 0x60BD: positive and negative edge of probe 1, then of probe 2.
     pub touch_probe_positions: [Option<i32>; 4],
+    /// Counts of the second encoder; `None` without fresh data of its device.
+    pub second_position: Option<i32>,
     /// False if no answer arrived in time. The values are then old, and no decision uses them. The
     /// set-point continues for two consecutive cycles of this kind and then waits.
     pub fresh: bool,

@@ -54,9 +54,11 @@ impl Axis {
 
     /// The pending target was never sent: a drive in CSP stands at the target before it.
     fn restore_last_sent(&mut self) {
-        if self.mode == Mode::Csp && !self.left_csp() && self.motion.velocity != 0.0 {
+        let moves = self.motion.velocity != 0.0 || !self.play_rests();
+        if self.mode == Mode::Csp && !self.left_csp() && moves {
             self.sent = self.previous_target;
-            self.motion.position = self.config.scale.position_to_user(self.sent).0;
+            self.correction.play.position = self.correction.previous_play;
+            self.motion.position = self.load_position(self.sent, self.correction.previous_play);
         }
     }
 
@@ -66,6 +68,7 @@ impl Axis {
     pub(super) fn freeze(&mut self) {
         if self.mode == Mode::Csp && !self.left_csp() {
             self.motion = Motion::at(self.motion.position);
+            self.freeze_play();
         }
         self.interrupted = true;
         if self.plan == Plan::External {
@@ -100,6 +103,7 @@ impl Axis {
             ControlledQuantity::Drive => {}
         }
         self.clamp_setpoint(grip, before, dt_s);
+        self.take_up(before, false, dt_s);
         self.send_position(grip);
         self.close_loops(false, dt_s);
     }
@@ -115,6 +119,7 @@ impl Axis {
             // This includes CSP entered meanwhile: the drive has the target sent with the mode, and
             // stands there.
             self.motion = Motion::at(self.motion.position);
+            self.freeze_play();
             return;
         }
         let velocity = match self.mode {
@@ -122,6 +127,7 @@ impl Axis {
             _ => self.held_velocity(),
         };
         self.motion = self.motion_at_actual(velocity);
+        self.track_play();
         self.loop_state.take_over();
         // The target may now be too near for the planned deceleration.
         let limit = self.config.limits.acceleration;

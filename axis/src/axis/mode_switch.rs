@@ -14,7 +14,6 @@ use super::{Axis, Plan};
 use crate::cia402::{Mode, State};
 use crate::profile_mode::{Goal, Profile};
 use crate::setpoint::Ramp;
-use crate::units::UserUnits;
 
 /// Fresh cycles that must show the new mode, if the drive received both modes in turn.
 const MODE_CONFIRM_CYCLES: u8 = 10;
@@ -168,8 +167,7 @@ impl Axis {
         self.loop_state.enter();
         if to == Mode::Csp {
             // This position is already the target in the drive.
-            let position = UserUnits(self.motion.position);
-            self.sent = self.config.scale.position_to_counts(position);
+            self.sent = self.drive_counts(self.motion.position);
         }
         if to != Mode::Cst {
             self.loop_state.torque = 0.0;

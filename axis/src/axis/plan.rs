@@ -7,7 +7,6 @@ use crate::setpoint::{
     Goal, Hold, JerkLimited, Motion, MotionLimits, MoveRequest, Ramp, Setpoint, SetpointError,
     Trapezoid,
 };
-use crate::units::UserUnits;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[allow(
@@ -192,6 +191,7 @@ impl Axis {
                 && !self.follows_now() =>
             {
                 self.motion = self.following();
+                self.track_play();
             }
             Plan::Hold(hold) => self.motion = hold.advance(before, dt_s),
             Plan::Jerk(ref mut source) => {
@@ -241,20 +241,16 @@ impl Axis {
             },
         }
         self.clamp_setpoint(grip, before, dt_s);
+        self.take_up(before, true, dt_s);
         self.send_position(grip);
     }
 
     /// Stores the commanded position in counts; the actual position if no position is commanded.
     pub(super) fn send_position(&mut self, grip: ControlledQuantity) {
-        self.sent = if grip == ControlledQuantity::Position {
-            let position = UserUnits(self.motion.position);
-            self.config.scale.position_to_counts(position)
-        } else {
-            self.actual.counts().unwrap_or_default()
-        };
         if grip == ControlledQuantity::Velocity {
-            self.motion.position = self.config.scale.position_to_user(self.sent).0;
+            self.motion.position = self.reported_load();
         }
+        self.update_target(grip);
     }
 
     /// PV: halts a velocity that leads out of the range, while the drive can still stop inside it.
@@ -328,22 +324,30 @@ impl Axis {
                 self.loop_state.torque == 0.0 && self.loop_state.limited_torque() == 0.0
             }
             Plan::DriveProfile => !self.home.running() && self.at_standstill(),
-            _ => self.motion.velocity == 0.0,
+            _ => self.motion.velocity == 0.0 && self.play_rests(),
         }
     }
 
     /// Returns true if the set-point has reached its goal.
     pub(super) fn setpoint_arrived(&self) -> bool {
         match self.plan {
-            Plan::Hold(hold) => hold.finished(self.motion),
-            Plan::Move(trapezoid) => trapezoid.finished(self.motion),
-            Plan::Jerk(ref source) => source.finished(self.motion),
+            Plan::Hold(hold) => hold.finished(self.motion) && self.play_rests(),
+            Plan::Move(trapezoid) => trapezoid.finished(self.motion) && self.play_arrived(),
+            Plan::Jerk(ref source) => {
+                let moves = matches!(source.request().goal, Goal::Position(_));
+                let arrived = if moves {
+                    self.play_arrived()
+                } else {
+                    self.play_rests()
+                };
+                source.finished(self.motion) && arrived
+            }
             Plan::Velocity(ramp) => {
                 !self.holds(ramp.target) && self.motion.velocity == self.at_rate(ramp).target
             }
             Plan::Torque(ramp) => self.loop_state.torque == ramp.target,
             Plan::DriveProfile => self.profile_arrived(),
-            Plan::External => self.motion.velocity == 0.0,
+            Plan::External => self.motion.velocity == 0.0 && self.play_rests(),
         }
     }
 }

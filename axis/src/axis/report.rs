@@ -4,7 +4,7 @@ use super::stop::PowerGoal;
 use super::{Axis, Plan};
 use crate::cia402::{Mode, State, Statusword};
 use crate::status::{AxisStatus, EnableBlocker};
-use crate::units::{Counts, UserUnits};
+use crate::units::Counts;
 
 /// Longest time in seconds in a state on the way to Operation enabled. After it the axis reports
 /// why it waits.
@@ -21,9 +21,7 @@ impl Axis {
             Mode::Pv => (None, goal.map(|goal| self.profile_velocity(goal))),
             _ => (None, None),
         };
-        let sent = goal_position.map_or(self.sent, |goal| {
-            self.config.scale.position_to_counts(UserUnits(goal))
-        });
+        let sent = goal_position.map_or(self.sent, |goal| self.drive_counts(goal));
         let error_counts = self
             .actual
             .counts()
@@ -56,6 +54,8 @@ impl Axis {
             final_error_counts: (arrived
                 && (matches!(self.plan, Plan::Move(_) | Plan::Jerk(_)) || goal_position.is_some()))
             .then_some(error_counts),
+            takes_up: self.takes_up(),
+            encoder_difference: self.second.difference,
             held_by_range: self.held_by_range,
             guarded_cycles: self.guarded_cycles,
             stale_cycles: self.stale_cycles,

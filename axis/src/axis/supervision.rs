@@ -169,6 +169,7 @@ impl Axis {
             let scale = &self.config.scale;
             // This set-point is already one cycle old.
             let commanded = self.expected(self.config.dead_time_s - self.dt_s);
+            let position = self.actual.drive();
             self.supervision.following_error = commanded - position;
             // Lost frames took their targets with them: the axis may be anywhere between the last
             // known and the present target.
@@ -194,6 +195,7 @@ impl Axis {
         } else {
             self.supervision.following_error = 0.0;
         }
+        cause = cause.or(self.check_second_encoder());
         if self.mode == Mode::Pp && self.profile.not_taken() {
             cause = Some(Trip::SetPointNotTaken);
         }

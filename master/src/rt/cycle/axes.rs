@@ -139,7 +139,7 @@ impl Engine {
         let leader = self.axes.get(index).and_then(|slot| {
             let leader = slot.leader?;
             let first = self.axes.get(leader.axis)?.axis.status();
-            Some(leader.set_point(&first))
+            Some((leader.set_point(&first), first.takes_up))
         });
         let Some(slot) = self.axes.get_mut(index) else {
             return;
@@ -152,8 +152,8 @@ impl Engine {
         let lost = slot
             .generator
             .advance(&mut slot.axis, &self.tables, master, slot.rates, dt_s);
-        if let Some(motion) = leader {
-            slot.axis.follow(motion);
+        if let Some((motion, takes_up)) = leader {
+            slot.axis.follow(motion, takes_up);
         }
         let outputs = slot.axis.act();
         slot.write(self.exchange.outputs_mut(), &outputs);
