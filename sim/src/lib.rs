@@ -33,7 +33,7 @@ mod random;
 pub mod serve;
 
 pub use device::{DeviceOptions, MailboxOptions, SimDevice, SimError};
-pub use drive::{ElasticLoad, PlantParams, Track};
+pub use drive::{ElasticLoad, PitchError, PlantParams, Track};
 pub use esc::al::AlState;
 pub use esc::chip::{self, EscInfo};
 pub use esc::ports::Medium;

@@ -7,6 +7,7 @@
 //! * `io`, `touch_probe`, `travel`: inputs, latched positions, and the switches along the axis
 //! * `control`: position and velocity loops at 0.4 ms, current loop at 0.04 ms, gains
 //! * `plant`: motor, load, friction, encoder
+//! * `mechanics`: backlash and pitch error between motor and load
 //!
 //! The device calls `Drive::sync` when process data takes effect and `Drive::control` every 0.4
 //! ms of its own time. Neither allocates. This crate defines its own state and mask values, so that
@@ -31,6 +32,7 @@
 mod control;
 mod fault;
 mod io;
+mod mechanics;
 mod modes;
 mod objects;
 mod plant;
@@ -45,6 +47,7 @@ mod travel;
 
 pub(crate) use fault::{DeviceError, Emergency};
 pub use io::input;
+pub use mechanics::PitchError;
 pub use plant::{ElasticLoad, PlantParams};
 pub use state::State;
 pub use travel::Track;
@@ -52,6 +55,7 @@ pub use travel::Track;
 use control::{Bounds, Controller, Demand, Tuning};
 use fault::Faults;
 use io::Inputs as DigitalInputs;
+use mechanics::Mechanics;
 use modes::{Cycle, Mode, Motion, PositionFrame, SetPoints};
 use objects::{AXIS_STRIDE, HomingParameters, Objects, Parameters};
 use plant::Plant;
@@ -94,6 +98,8 @@ pub struct Drive {
     tuning_age: u32,
     params: PlantParams,
     plant: Plant,
+    /// The load with an encoder of its own.
+    mechanics: Option<Mechanics>,
     controller: Controller,
     power: Power,
     faults: Faults,
@@ -142,6 +148,8 @@ impl Drive {
         let tuning = objects.tuning(store);
         let motor = Plant::new(&plant);
         let counts = motor.counts();
+        let mechanics = Some(Mechanics::new(plant.backlash, plant.pitch_error, &motor));
+        let has_load_encoder = objects.load_position.is_some();
         let inputs = DigitalInputs::new(&plant, &motor);
         let mut drive = Self {
             frame: PositionFrame {
@@ -160,6 +168,7 @@ impl Drive {
             controller: Controller::new(&tuning, &plant, &motor),
             tuning,
             tuning_age: 0,
+            mechanics: mechanics.filter(|_| has_load_encoder),
             plant: motor,
             power: Power::new(plant.enable_cycles),
             faults: Faults::default(),
@@ -271,6 +280,9 @@ impl Drive {
     /// Runs the third part: inputs, state machine, mode and supervision.
     pub(crate) fn end_control(&mut self, store: &mut ObjectStore, in_op: bool) {
         self.controller.observe(&self.plant);
+        if let Some(mechanics) = &mut self.mechanics {
+            mechanics.follow(&self.plant);
+        }
         self.watch_inputs(store);
         self.connect(in_op);
         self.select_mode(store);

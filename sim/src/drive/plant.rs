@@ -2,6 +2,7 @@
 
 use std::f64::consts::TAU;
 
+use super::mechanics::PitchError;
 use super::objects::float;
 use super::travel::Track;
 
@@ -46,6 +47,10 @@ pub struct PlantParams {
     pub inertia: f64,
     /// A load on an elastic shaft.
     pub elastic: Option<ElasticLoad>,
+    /// The way of the motor between both flanks of the load, in counts.
+    pub backlash: f64,
+    /// The error between motor and load. The load's position is in 0x60E4:01, if the ESI has it.
+    pub pitch_error: PitchError,
     /// Viscous friction, in N·m·s/rad.
     pub viscous_friction: f64,
     /// Coulomb friction, static and sliding, in N·m.
@@ -82,6 +87,8 @@ impl Default for PlantParams {
             initial_position: 0,
             inertia: 3.6e-5,
             elastic: None,
+            backlash: 0.0,
+            pitch_error: PitchError::default(),
             viscous_friction: 2e-5,
             coulomb_friction: 4e-3,
             load_torque: 0.0,

@@ -68,6 +68,9 @@ impl Drive {
             o.velocity_demand,
             polarity.velocity(whole(speed / p.velocity_unit)),
         );
+        if let (Some(slot), Some(mechanics)) = (o.load_position, &self.mechanics) {
+            store.show(slot, polarity.way(mechanics.counts()));
+        }
         if let Some(slot) = o.velocity_averaged {
             let averaged = self.controller.averaged_velocity();
             store.show(slot, polarity.velocity(whole(averaged / p.velocity_unit)));

@@ -92,6 +92,8 @@ pub(super) struct Objects {
     pub current_averaged: Option<EntryHandle>,
     pub current_demand: Option<EntryHandle>,
     pub thermal_level: Option<EntryHandle>,
+    /// The position of an encoder at the load.
+    pub load_position: Option<EntryHandle>,
     pub following_error: EntryHandle,
     pub target_position: EntryHandle,
     pub target_velocity: EntryHandle,
@@ -171,6 +173,7 @@ impl Objects {
             current_averaged: b.own(0x30d1, 1, "Current actual value averaged"),
             current_demand: b.own(0x30d0, 0, "Current demand value"),
             thermal_level: b.own(0x3200, 1, "I2t level motor"),
+            load_position: b.slot(0x60e4, 1),
             following_error: b.bind(0x60f4, 0, "Following error actual value", 32, RO),
             target_position: b.bind(0x607a, 0, "Target position", 32, RW),
             target_velocity: b.bind(0x60ff, 0, "Target velocity", 32, RW),
