@@ -320,6 +320,7 @@ fn known_state(setup: &AxisSetup, status: &AxisStatus) -> Value {
         "target_torque": status.target_torque,
         "following_error": status.following_error,
         "max_following_error": status.max_following_error,
+        "encoder_difference": status.encoder_difference,
         "statusword": status.statusword,
         "statusword_text": Statusword::from_bits_retain(status.statusword).to_string(),
         "controlword": status.controlword,

@@ -9,6 +9,7 @@ mod cabling;
 mod cams;
 mod clock_wrap;
 mod clocks;
+mod compensation;
 mod controller;
 mod copy;
 mod cycles;

@@ -29,8 +29,8 @@ impl Losses {
 impl Axis {
     /// Takes `motion` as the set-point of this cycle, in CSP. Unlike [`Axis::set_point`] it is also
     /// valid while the axis stops by set-points, and the range of positions is the leader's.
-    /// `takes_up`: [`crate::AxisStatus::takes_up`] of the leader. Velocity and acceleration limits apply. Call it between [`Axis::observe`] and [`Axis::act`].
-    /// RT: O(1).
+    /// `takes_up`: [`crate::AxisStatus::takes_up`] of the leader. Velocity and acceleration limits
+    /// apply. Call it between [`Axis::observe`] and [`Axis::act`]. RT: O(1).
     pub fn follow(&mut self, motion: Motion, takes_up: bool) {
         let position = self.controlled_quantity() == ControlledQuantity::Position;
         let possible = self.active && position && self.mode == Mode::Csp && self.switch.is_none();

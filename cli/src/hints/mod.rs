@@ -450,6 +450,9 @@ fn trip(trip: &Trip) -> &'static str {
         Trip::NotStopped { .. } => {
             "check the drive's quick stop (0x605A, 0x6085), its torque limit and the load; `stop_timeout` sets how long a stop may take"
         }
+        Trip::EncoderDifference { .. } => {
+            "look for a slipping coupling, a wrong `counts_per_unit` or backlash; home the axis again"
+        }
         Trip::Skew { .. } | Trip::HomingSkew { .. } => {
             "look for what holds one half of the gantry; decouple the halves to move them alone"
         }

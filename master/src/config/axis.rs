@@ -1,7 +1,7 @@
 //! One axis: units, limits, and the drive's velocity unit.
 
 use ecaxis_axis::cia402::QuickStopOption;
-use ecaxis_axis::{Axis, AxisConfig, ConfigError, LimitError, Limits, Mode, Modes};
+use ecaxis_axis::{Axis, AxisConfig, Compensation, ConfigError, LimitError, Limits, Mode, Modes};
 use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_esi as esi;
 use toml::Spanned;
@@ -76,6 +76,8 @@ pub(crate) fn setup(
         torque,
         way: raw.way.value().unwrap_or_default(),
         homing,
+        compensation: Compensation::default(),
+        second_encoder: None,
         brake_output: None,
     })
 }

@@ -26,6 +26,10 @@ pub struct AxisSetup {
     /// The direction in which a modulo axis moves.
     pub way: ecaxis_axis::scale::ModuloDirection,
     pub homing: Option<HomingSetup>,
+    /// Its `config` has the limits of the load.
+    pub compensation: ecaxis_axis::Compensation,
+    /// The input of its second encoder.
+    pub second_encoder: Option<Signal>,
     /// The one-bit output that releases the axis's brake.
     pub brake_output: Option<Signal>,
 }

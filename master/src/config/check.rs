@@ -7,6 +7,7 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use toml::Spanned;
 
 use super::cam;
+use super::compensation;
 use super::copy::{self, OutputWriter};
 use super::device::{self, CheckedDevice, EsiFiles};
 use super::duration::show;
@@ -19,6 +20,7 @@ use super::path;
 use super::position_output;
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawBus, RawDevice, RawMachine};
+use super::second_encoder;
 use super::sim;
 use super::steps::{self, Resolved, ResolvedAxis, ResolvedDevice};
 
@@ -64,6 +66,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
     if checked.iter().all(|device| position(device).is_some()) {
         checked.sort_by_key(position);
     }
+    compensation::check(&mut checked, folder, p);
     let gantries = gantry::check(&raw.gantries, &mut checked, p);
     // Without a name, a device is invalid, and nothing refers to it.
     let named: Vec<_> = checked
@@ -83,6 +86,10 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
     let brakes: Vec<_> = each
         .clone()
         .filter_map(|(_, axis)| Some((axis.name.clone(), axis.brake_output.clone()?)))
+        .collect();
+    let encoders: Vec<_> = each
+        .clone()
+        .filter_map(|(_, axis)| Some((axis.name.clone(), axis.second_encoder.clone()?)))
         .collect();
     let axes: IndexVec<AxisIndex, ResolvedAxis<'_>> = each
         .map(|(device, axis)| ResolvedAxis {
@@ -116,6 +123,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         repeat,
         p,
     );
+    let encoders = second_encoder::check(&encoders, known, p);
     let brakes = brake_outputs(&brakes, known, &program.outputs, p);
     let steps = program.outputs.iter().zip(&program.output_places);
     let steps = steps.map(|(output, place)| {
@@ -151,6 +159,9 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
             brake.check_group(axis, &program.stop, p);
             axis.brake_output = Some(brake.output);
         }
+    }
+    for encoder in encoders {
+        encoder.add_to(&mut axes, &program.stop, p);
     }
     gantry::check_groups(&gantries, &axes, &program.stop, p);
     let devices: IndexVec<_, _> = devices.into();

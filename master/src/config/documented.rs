@@ -64,7 +64,7 @@ fn document_lists_every_key() {
 
 /// The tables of the schema that a section of the document describes.
 #[rustfmt::skip] // one row per section
-const SECTIONS: [(&str, &str); 15] = [
+const SECTIONS: [(&str, &str); 17] = [
     ("[bus]", "/properties/bus"),
     ("[[device]]", "/properties/device/items"),
     ("[device.axis]", "/definitions/axis"),
@@ -73,6 +73,8 @@ const SECTIONS: [(&str, &str); 15] = [
     ("Loops", "/definitions/axis"),
     ("Supervision and stopping", "/definitions/axis"),
     ("Homing", "/definitions/axis/properties/homing"),
+    ("Backlash and pitch error", "/definitions/axis"),
+    ("Second encoder", "/definitions/axis"),
     ("[device.can]", "/properties/device/items/properties/can"),
     ("[[device.node]]", "/properties/device/items/properties/node/items"),
     ("[device.sim]", "/properties/device/items/properties/sim"),

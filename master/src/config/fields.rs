@@ -189,7 +189,7 @@ macro_rules! table {
 }
 
 /// The keys that a table has.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, Clone)]
 pub(crate) struct Written {
     /// The known keys, each with its line.
     pub keys: Vec<(&'static str, u32)>,

@@ -537,6 +537,8 @@ impl CheckedNetwork {
             }),
             name: name.get_ref().clone(),
             brake_output: axis.brake.output.clone(),
+            compensation: axis.compensation.clone(),
+            second_encoder: axis.second_encoder.clone(),
         });
     }
 

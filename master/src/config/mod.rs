@@ -10,6 +10,8 @@
 //! | `check.rs` | raw → [`Machine`]: bus, names, positions |
 //! | `position_output.rs` | outputs that follow the position of an axis |
 //! | `cam.rs`, `path.rs`, `csv.rs` | cams, paths, and files with rows of numbers |
+//! | `compensation.rs` | backlash and pitch error of an axis |
+//! | `second_encoder.rs` | the encoder at the load of an axis |
 //! | `copy.rs` | inputs that are copied to outputs |
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
 //! | `locator.rs` | how a device is located on the bus |
@@ -42,6 +44,7 @@ mod axis;
 mod axis_setup;
 mod cam;
 mod check;
+mod compensation;
 mod copy;
 mod csv;
 mod device;
@@ -65,6 +68,7 @@ mod program;
 mod raw;
 pub mod schema;
 mod sdo;
+mod second_encoder;
 mod signal;
 pub mod sim;
 mod sim_input;

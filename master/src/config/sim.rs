@@ -84,7 +84,7 @@ pub(crate) fn check(
         gateway: None,
         motor: raw
             .motor
-            .map(|raw| sim_motor::check(&raw, axis.is_ok(), p))
+            .map(|raw| sim_motor::check(&raw, axis, p))
             .unwrap_or_default(),
         track: raw
             .track

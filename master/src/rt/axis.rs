@@ -22,6 +22,8 @@ pub struct RtAxis {
     pub cycles: u32,
     /// Fresh inputs, or a late answer, have arrived since the last step.
     pub(super) arrived: (bool, bool),
+    /// The counts of its second encoder, and their device.
+    pub second_encoder: Option<(SignalBits, DeviceIndex)>,
     /// The output that opens its brake; it may be on any device.
     pub brake: Option<SignalBits>,
     pub group: GroupIndex,
@@ -53,6 +55,7 @@ impl RtAxis {
             node: None,
             cycles: 1,
             arrived: (false, false),
+            second_encoder: None,
             brake: None,
             group,
             generator: SetpointGenerator::default(),
@@ -121,6 +124,7 @@ impl RtAxis {
             touch_probe_positions: bits
                 .touch_probe_positions
                 .map(|b| b.map(|b| b.get(image) as i32)),
+            second_position: None,
             fresh,
             late,
         }

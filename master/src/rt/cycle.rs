@@ -366,7 +366,12 @@ impl Engine {
             slot.acted = !due;
             if due {
                 let (fresh, late) = std::mem::take(&mut slot.arrived);
-                let inputs = slot.read(image, fresh && reported, late);
+                let mut inputs = slot.read(image, fresh && reported, late);
+                inputs.second_position = slot.second_encoder.and_then(|(bits, device)| {
+                    let answer = self.exchange.device_answers().get(device);
+                    let fresh = answer == Some(&DeviceAnswer::Fresh);
+                    fresh.then(|| bits.get(image) as i64 as i32)
+                });
                 slot.axis.observe(&inputs, slot.dt_s(self.config.cycle_ns));
             }
         }

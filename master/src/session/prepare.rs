@@ -297,7 +297,8 @@ fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
         // A feedback value belongs to the set-point of an earlier cycle.
         config.answers_late = machine.bus.exchange.frame_sets() - 1;
         config.dead_time_s += f64::from(config.answers_late) * machine.bus.cycle_ns as f64 * 1e-9;
-        let axis = Axis::new(config).map_err(|error| Cause::Axis(error).with_name(&setup.name))?;
+        let axis = Axis::compensated(config, setup.compensation.clone())
+            .map_err(|error| Cause::Axis(error).with_name(&setup.name))?;
         let mut slot = RtAxis::new(axis, bits, index, image.groups[index]);
         if let Some(node) = setup.node {
             let gateway = gateways.iter().position(|g: &Gateway| g.device() == index);
@@ -354,6 +355,9 @@ fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
     };
     for (slot, setup) in slots.iter_mut().zip(&machine.axes) {
         slot.brake = all(setup.brake_output.as_slice(), true)?.pop();
+        let encoder = all(setup.second_encoder.as_slice(), false)?.pop();
+        let device = setup.second_encoder.as_ref().map(|input| input.device);
+        slot.second_encoder = encoder.zip(device);
     }
     Ok(CyclePlan {
         image,

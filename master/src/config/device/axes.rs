@@ -5,7 +5,7 @@ use toml::Spanned;
 
 use super::super::fields::KeyExt;
 use super::super::problem::Problems;
-use super::super::raw::{RawAxis, RawDevice, RawSdo};
+use super::super::raw::{RawAxis, RawCompensation, RawDevice, RawSdo, RawSecondEncoder};
 use super::super::{AxisSetup, axis, drive_limits};
 
 /// An axis; its setup is missing if it is invalid and has been reported.
@@ -13,6 +13,8 @@ pub(crate) struct CheckedAxis {
     pub name: String,
     pub setup: Option<AxisSetup>,
     pub brake_output: Option<Spanned<String>>,
+    pub compensation: Option<RawCompensation>,
+    pub second_encoder: Option<RawSecondEncoder>,
 }
 
 /// Checks the axes of a device, and adds their start-up SDOs and notes to the selection. `mode`:
@@ -36,6 +38,8 @@ pub(super) fn check(
             }),
             name,
             brake_output: axis.brake.output.clone(),
+            compensation: axis.compensation.clone(),
+            second_encoder: axis.second_encoder.clone(),
         });
     }
     axes

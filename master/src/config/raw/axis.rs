@@ -1,5 +1,6 @@
 //! `[device.axis]` as written.
 
+use ecaxis_axis::compensation::ReferenceFlank;
 use ecaxis_axis::scale::ModuloDirection;
 use ecaxis_axis::{StopMethod, VelocityUnit};
 use toml::de::DeValue;
@@ -96,6 +97,10 @@ table! { "[device.axis]",
         on_emergency: Key<StopMethod> [STOPS_BY_DRIVE],
         /// The drive keeps home without power: absolute encoder (`true`, `false`; default `false`)
         absolute: Key<bool>,
+        /// Backlash and pitch error between drive and load
+        compensation: Option<RawCompensation>,
+        /// Encoder at the load that is compared with the axis
+        second_encoder: Option<RawSecondEncoder>,
         /// Homing by the drive; 0x6060 and 0x6061 must be mapped
         homing: Option<RawHoming>,
     }
@@ -161,6 +166,40 @@ table! { "`limits`",
         /// Set-point minus reported position, after the dead time (above 0, unit; default not
         /// supervised)
         following_error: Key<f64>,
+    }
+}
+
+const FLANKS: [(&str, ReferenceFlank); 2] = [
+    ("positive", ReferenceFlank::Positive),
+    ("negative", ReferenceFlank::Negative),
+];
+
+table! { "`compensation`",
+    #[derive(Clone)]
+    table RawCompensation {
+        /// Way of the drive between both flanks (above 0, unit; default none)
+        backlash: Key<f64> = "0.05",
+        /// Direction of the last motion of homing; required with `backlash` (`"positive"`, `"negative"`)
+        homing_ends: Key<ReferenceFlank> [FLANKS],
+        /// Pitch error, load minus drive, at positions of the load (list of [position, error], unit;
+        /// default this, `file`, or none)
+        errors: Key<Vec<Vec<f64>>>,
+        /// CSV file with the same columns (path)
+        file: Key<String>,
+    }
+}
+
+table! { "`second_encoder`",
+    #[derive(Clone)]
+    table RawSecondEncoder {
+        /// Input of 32 bits with its counts (device.input, text)
+        input: Key<String> = "\"x.0x60E4:01\"",
+        /// Counts per unit of the axis; negative if it counts the other way (not 0, 1/unit)
+        counts_per_unit: Key<f64> = "1000.0",
+        /// Largest difference from the position of the axis, which trips beyond (above 0, unit)
+        max_difference: Key<f64> = "0.2",
+        /// Position of the axis at count 0 (unit; default the difference is 0 when home is found)
+        offset: Key<f64>,
     }
 }
 

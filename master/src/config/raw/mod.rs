@@ -22,7 +22,9 @@ mod number;
 mod path;
 mod step;
 
-pub(crate) use axis::{AxisTables, RawAxis, RawHoming, RawLimits};
+pub(crate) use axis::{
+    AxisTables, RawAxis, RawCompensation, RawHoming, RawLimits, RawSecondEncoder,
+};
 pub(crate) use condition::{Conditions, Levels, NamedValues, RawCondition, RawSignal, RawWhen};
 pub(crate) use number::{RawNumber, RawVariable};
 pub(crate) use path::{RawPath, RawPoint};
