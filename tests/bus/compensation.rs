@@ -5,6 +5,7 @@ use std::path::Path;
 
 use ecaxis_axis::Command;
 use ecaxis_master::config::{self, ConfigError, Machine};
+use ecaxis_test_support::random::Random;
 use ecaxis_test_support::recordings::process_images;
 use ecaxis_test_support::script::{Act, home, move_to, perform_well};
 use ecaxis_test_support::{assert_contains, faults, recorded, root, run_badly, run_well};
@@ -96,11 +97,19 @@ impl Seen {
 }
 
 fn seen(recording: &Path) -> Vec<Seen> {
+    seen_of(recording, 0)
+}
+
+/// Returns the part of a device. Each has 9 bytes out and 15 bytes in, at the same place.
+fn seen_of(recording: &Path, device: usize) -> Vec<Seen> {
+    const REGION: usize = 15;
+    let at = device * REGION;
     let word = |data: &[u8]| u16::from_le_bytes([data[0], data[1]]);
     let long = |data: &[u8]| i32::from_le_bytes([data[0], data[1], data[2], data[3]]);
     let images = process_images(recording).into_iter();
-    let images = images.filter(|(out, data)| out.len() >= 7 && data.len() >= 15);
+    let images = images.filter(|(out, data)| out.len() >= at + 9 && data.len() >= at + REGION);
     images
+        .map(|(out, data)| (out[at..].to_vec(), data[at..].to_vec()))
         .map(|(out, data)| Seen {
             controlword: word(&out),
             mode: out[2],
@@ -209,20 +218,8 @@ fn homing_ends_on_the_reference_flank() {
     }
 }
 
-/// xorshift64*.
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, bound: u64) -> u64 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        (self.0.wrapping_mul(0x2545_f491_4f6c_dd1d) >> 33) % bound
-    }
-
-    fn within(&mut self, low: f64, high: f64) -> f64 {
-        low + (high - low) * self.below(1_000_000) as f64 * 1e-6
-    }
+fn within(random: &mut Random, low: f64, high: f64) -> f64 {
+    low + (high - low) * random.below(1_000_000) as f64 * 1e-6
 }
 
 /// Random moves with stops at random moments, while frames are lost. The targets keep the limits of
@@ -230,26 +227,26 @@ impl Random {
 #[test]
 fn stops_at_random_moments_keep_the_limits() {
     for seed in 1..=12 {
-        let mut random = Random(0x9e37_79b9_7f4a_7c15_u64.wrapping_mul(seed) | 1);
+        let mut random = Random::new(seed);
         let mut acts = vec![home(5.0)];
         for _ in 0..25 {
             let order = match random.below(3) {
                 0 => Command::Velocity {
-                    velocity: random.within(-60.0, 60.0),
+                    velocity: within(&mut random, -60.0, 60.0),
                     ramp: 0.5,
                 },
                 1 => Command::MoveBy {
-                    distance: random.within(-0.3, 0.3),
+                    distance: within(&mut random, -0.3, 0.3),
                     speed: 1.0,
                     ramp: 1.0,
                 },
                 _ => Command::MoveTo {
-                    position: random.within(-30.0, 30.0),
-                    speed: random.within(0.05, 1.0),
-                    ramp: random.within(0.1, 1.0),
+                    position: within(&mut random, -30.0, 30.0),
+                    speed: within(&mut random, 0.05, 1.0),
+                    ramp: within(&mut random, 0.1, 1.0),
                 },
             };
-            let moving = random.within(0.01, 0.3);
+            let moving = within(&mut random, 0.01, 0.3);
             acts.extend([Act::Begin(order), Act::Dwell(moving)]);
             acts.extend([Act::Begin(Command::Stop), Act::Dwell(0.4)]);
         }
@@ -358,4 +355,68 @@ fn wrong_corrections_are_refused() {
     let csv = text(&corrected(), "").replace("mode = \"csp\"", "mode = \"csv\"").replace("0x607A", "0x60FF");
     let error = bench.parse(&csv.replace("csp = {", "#")).expect_err("csv").to_string();
     assert_contains(&error, &["nothing commands the position of an axis in `mode = \"csv\"`", "csv = { kv = 20.0 }"]);
+    let pp = text(&corrected(), "").replace("mode = \"csp\"", "mode = \"pp\"").replace("\"0x60B2\"", "\"0x6081\", \"0x6083\", \"0x6084\"");
+    let error = bench.parse(&pp.replace("csp = {", "#")).expect_err("pp").to_string();
+    assert_contains(&error, &["the drive plans with its own positions", "mode = \"csp\""]);
+}
+
+/// A second drive whose mechanics have other errors.
+fn two(own: &str, steps: &str) -> String {
+    let first = text(&corrected(), "");
+    let (bus, device) = first.split_at(first.find("[[device]]").expect("a device"));
+    let second = device
+        .replace("name = \"x\"", "name = \"y\"")
+        .replace("position = 0\nmode", "position = 1\nmode")
+        .replace(&format!("backlash = {BACKLASH}"), "backlash = 0.1")
+        .replace(ERRORS, own);
+    format!("{bus}{device}{second}{steps}")
+}
+
+const OTHER: &str = "[[-40.0, -0.02], [-10.0, 0.01], [20.0, 0.03], [50.0, -0.01]]";
+
+/// Halves with different errors: their loads are at the same place after each move, and both drives
+/// keep their limits.
+#[test]
+fn halves_of_a_gantry_have_corrections_of_their_own() {
+    let mut steps = String::from(
+        "[[gantry]]\naxes = [\"x\", \"y\"]\nmax_skew = 0.5\n[[step]]\nhome = [\"x\"]\n[[step]]\ndwell = \"200ms\"\n",
+    );
+    for target in TARGETS {
+        steps += &format!("[[step]]\nmove = {{ x = {target:?} }}\n[[step]]\ndwell = \"200ms\"\n");
+    }
+    let bench = Bench::new();
+    let (options, path) = recorded(faults(""), bench.path());
+    run_well(bench.machine(&two(OTHER, &steps)), options);
+    for device in [0, 1] {
+        let seen = seen_of(&path, device);
+        assert_limits(&seen);
+        let stays = stays(&seen);
+        let arrived = &stays[stays.len() - TARGETS.len()..];
+        for (load, target) in arrived.iter().zip(TARGETS) {
+            let error = (load - target).abs() * COUNTS;
+            assert!(error <= 2.0, "drive {device} at {target}: {error} counts");
+        }
+    }
+}
+
+/// The partner fails at moments around a reversal: the targets keep the limits, and come to rest.
+#[test]
+fn a_fault_of_the_partner_stops_the_correction_too() {
+    for at in (0..12).map(|n| 700 + 25 * n) {
+        let steps = "[[step]]\nmove = { x = 10.0, y = 10.0 }\n[[step]]\nmove = { x = -30.0, y = -30.0 }\n[[step]]\nmove = { x = 5.0 }\n";
+        let script = format!(
+            "[[fault]]\nkind = \"drive-fault\"\nat = \"{at}ms\"\ndevice = 1\ncode = 0x2310\n"
+        );
+        let bench = Bench::new();
+        let (options, path) = recorded(faults(&script), bench.path());
+        let (error, _) = run_badly(bench.machine(&two(OTHER, steps)), options);
+        assert_contains(&error, &["`y`", "0x2310"]);
+        let seen = seen(&path);
+        assert_limits(&seen);
+        let powered: Vec<_> = seen.iter().filter(|c| c.controlword == 0x0f).collect();
+        let [.., before, last] = powered.as_slice() else {
+            panic!("no cycles")
+        };
+        assert_eq!(before.target, last.target, "{at}: at rest before power-off");
+    }
 }

@@ -31,6 +31,11 @@ pub(crate) fn check(devices: &mut [CheckedDevice], folder: &Path, p: &mut Proble
 fn check_mode(setup: &AxisSetup, raw: &RawCompensation, p: &mut Problems<'_>) {
     let loops = &setup.config.loops;
     let (mode, key) = match setup.config.mode {
+        Mode::Pp => {
+            let message = "in mode \"pp\" the drive plans with its own positions";
+            p.add_hint(raw.span.clone(), message, "write `mode = \"csp\"`");
+            return;
+        }
         Mode::Csv if loops.csv.is_none() => ("csv", "csv = { kv = 20.0 }"),
         Mode::Cst if loops.cst.is_none() => ("cst", "cst = { kp = 10.0 }"),
         _ => return,
