@@ -175,7 +175,7 @@ fn plan(
                 PathError::Straight { .. } => "choose `through` off the straight line",
                 PathError::Positions { .. } => "write a position for each of `axes`",
                 PathError::TooLong { .. } | PathError::Points { .. } => {
-                    "divide it into several paths, or raise its limits"
+                    "divide it, or raise its limits or its tolerance"
                 }
                 _ => "change the points or the limits",
             };

@@ -3,7 +3,7 @@
 use super::{PathError, PathSegment};
 use crate::setpoint::check_position;
 
-/// Above this cosine of half the change of direction, a corner is a reversal, which is not blended.
+/// Above this sine of half the change of direction, a corner is a reversal, which is not blended.
 const REVERSAL: f64 = 0.998;
 /// Below this sine of half the change of direction, the path has no corner.
 const SMOOTH: f64 = 1e-7;
