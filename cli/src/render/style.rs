@@ -118,17 +118,22 @@ fn is_word(c: char) -> bool {
 
 /// Writes a message and colours the prefixes of its lines.
 pub(crate) fn complaint(out: &mut impl Write, text: &str) -> io::Result<()> {
+    let mut lines = String::new();
     for line in text.split('\n') {
         let start = STARTS.iter().find(|(start, _)| line.starts_with(start));
         match start {
             Some((start, style)) => {
                 let rest = line.strip_prefix(start).unwrap_or_default();
-                writeln!(out, "{style}{start}{style:#}{rest}")?;
+                lines += &format!("{style}{start}{style:#}{rest}\n");
             }
-            None => writeln!(out, "{line}")?,
+            None => {
+                lines += line;
+                lines += "\n";
+            }
         }
     }
-    Ok(())
+    // One write: lines of stdout would come between the parts of several.
+    out.write_all(lines.as_bytes())
 }
 
 #[cfg(test)]
