@@ -246,6 +246,22 @@ impl Compensation {
         }
     }
 
+    /// Returns the limits of the drive for those of its load, the range of positions included.
+    #[must_use]
+    pub fn drive_limits(&self, load: &Limits) -> Limits {
+        let Some([_, drive]) = &self.limits else {
+            return *load;
+        };
+        let [least, most] = self.range_of_play();
+        let range = |[low, high]: [f64; 2]| [self.screw(low) + least, self.screw(high) + most];
+        Limits {
+            velocity: drive.velocity,
+            acceleration: drive.acceleration,
+            position: load.position.map(range),
+            ..*load
+        }
+    }
+
     /// Returns the velocity limit of a drive whose load has the limit `velocity`.
     pub(crate) fn drive_velocity(&self, velocity: f64) -> f64 {
         self.limits.map_or(velocity, |[load, drive]| {

@@ -3,7 +3,8 @@
 use crate::common::{DT, Drive, LIMITS};
 use ecaxis_axis::compensation::{Compensation, Mechanics, ReferenceFlank};
 use ecaxis_axis::{
-    Axis, AxisConfig, AxisStatus, Command, Limits, Mode, Outputs, Scale, StopMethod,
+    Axis, AxisConfig, AxisStatus, Command, Limits, Mode, Outputs, Scale, SecondEncoder, StopMethod,
+    Trip,
 };
 
 /// Fine enough for limits per cycle: 400 000 counts per mm.
@@ -104,6 +105,8 @@ struct Rig {
     targets: Vec<f64>,
     largest: [f64; 2],
     silent: u32,
+    /// The counts of the second encoder.
+    second: Option<i32>,
 }
 
 impl Rig {
@@ -125,6 +128,7 @@ impl Rig {
             targets: Vec::new(),
             largest: [0.0; 2],
             silent: 0,
+            second: None,
         };
         rig.enable();
         rig
@@ -138,6 +142,7 @@ impl Rig {
     fn cycle(&mut self, fresh: bool) -> AxisStatus {
         let mut inputs = self.drive.inputs();
         inputs.velocity = None;
+        inputs.second_position = self.second;
         inputs.fresh = fresh;
         if fresh {
             self.drive.cycle(&self.out, DT);
@@ -430,5 +435,62 @@ fn loops_of_the_main_device_correct_too() {
         }
         println!("{mode}: {position} is {real:.4}");
         assert!((real - position).abs() <= 2.0 / 400.0, "{position}: {real}");
+    }
+}
+
+/// A slip trips the axis. Then its place is unknown: it can be reset and enabled, for homing.
+#[test]
+fn an_axis_that_has_slipped_can_be_enabled_again() {
+    let config = |config: &mut AxisConfig| {
+        config.absolute = true;
+        config.second_encoder = Some(SecondEncoder {
+            counts_per_unit: 1000.0,
+            max_difference: 0.1,
+            offset: None,
+        });
+    };
+    let mut rig = Rig::new(Compensation::default(), config, ReferenceFlank::Positive);
+    rig.second = Some(0);
+    for _ in 0..10 {
+        let status = rig.cycle(true);
+        assert_eq!((status.trip, status.encoder_difference), (None, Some(0.0)));
+    }
+    rig.second = Some(-101);
+    let tripped = rig.until(|status| status.trip.is_some());
+    assert!(
+        matches!(tripped.trip, Some(Trip::EncoderDifference { .. })),
+        "{tripped:?}"
+    );
+    assert!(!tripped.homed);
+    rig.until(|status| !status.enabled);
+    rig.axis.command(Command::ResetFault).unwrap();
+    rig.until(|status| status.trip.is_none() && status.stop.is_none());
+    rig.enable();
+    for _ in 0..100 {
+        assert_eq!(rig.cycle(true).trip, None);
+    }
+}
+
+/// An encoder that has restarted from 0 does not trip the axis: it waits for the next homing.
+#[test]
+fn an_encoder_that_restarts_is_compared_after_homing() {
+    for offset in [None, Some(0.0)] {
+        let config = |config: &mut AxisConfig| {
+            config.absolute = true;
+            config.second_encoder = Some(SecondEncoder {
+                counts_per_unit: 1000.0,
+                max_difference: 0.1,
+                offset,
+            });
+        };
+        let mut rig = Rig::new(Compensation::default(), config, ReferenceFlank::Positive);
+        rig.second = Some(0);
+        rig.cycle(true);
+        rig.axis.restart_second_encoder();
+        rig.second = Some(5000);
+        let status = rig.cycle(true);
+        // With a configured offset its counts mean a place.
+        assert_eq!(status.encoder_difference, offset.map(|_| -5.0));
+        assert_eq!(status.trip.is_some(), offset.is_some());
     }
 }

@@ -317,3 +317,33 @@ fn the_dead_time_is_the_expected_one() {
         assert!((measured - expected).abs() <= 1.0, "SYNC {sync_ms} ms");
     }
 }
+
+/// A gateway steps its nodes in cycles of its own: a path shares them with nodes of the same gateway
+/// only.
+#[test]
+fn a_path_has_axes_of_one_network() {
+    let text = mixed();
+    let end = text.find("[[step]]").expect("a program");
+    let with = |axes: &str| {
+        let path = format!(
+            "[[path]]\nname = \"p\"\naxes = {axes}\ntolerance = 1.0\npoints = [[0.0, 0.0], [5.0, 0.0], [5.0, 5.0]]\n\
+             [[step]]\nenable = true\n[[step]]\npath = \"p\"\n"
+        );
+        let file = root().join("configs/m.toml");
+        ecaxis_master::config::parse(&file, &format!("{}{path}", &text[..end]))
+    };
+    let mixed = with("[\"x\", \"feed\"]").expect_err("two networks");
+    assert_contains(
+        &mixed.to_string(),
+        &["different networks", "behind the same one"],
+    );
+    let machine = with("[\"feed\", \"lift\"]").expect("one gateway");
+    let summary = run_well(machine, virtual_time());
+    for axis in summary
+        .axes
+        .iter()
+        .filter(|axis| ["feed", "lift"].contains(&axis.name.as_str()))
+    {
+        assert_eq!(axis.target_position, 5.0, "{}", axis.name);
+    }
+}

@@ -163,6 +163,9 @@ impl Axis {
         self.sent = if grip == ControlledQuantity::Position {
             self.drive_counts(self.motion.position)
         } else {
+            // The drive goes on with the velocity of both.
+            let [_, slope] = self.compensation.error(self.motion.position);
+            self.motion.velocity += self.correction.play.velocity / (1.0 - slope);
             self.track_play();
             self.actual.counts().unwrap_or_default()
         };

@@ -54,6 +54,7 @@ impl Axis {
         self.home.homed &= same && self.config.absolute;
         self.actual
             .start_over(&self.config.scale, &self.compensation);
+        self.restart_second_encoder();
     }
 
     pub(super) fn home(&mut self, timeout_s: f64) -> Result<(), CommandError> {
@@ -71,6 +72,7 @@ impl Axis {
         }
         self.check_switch(Mode::Hm)?;
         self.switch_failed = None;
+        self.home_second_encoder();
         self.home = HomingRun {
             sequence: Some(Sequence::new(self.mode, timeout_s)),
             order: None,

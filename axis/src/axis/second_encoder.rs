@@ -22,12 +22,15 @@ pub(super) struct SecondPosition {
     offset: Option<f64>,
     /// The position of the axis minus that of the encoder, once they are compared.
     pub(super) difference: Option<f64>,
+    /// The encoder has restarted, and its counts have no known place until homing.
+    waits_for_home: bool,
 }
 
 impl Axis {
     /// Reads the second encoder, after the position of the axis. An axis that is not homed is not
     /// compared, and neither is an encoder without fresh data.
     pub(super) fn read_second_encoder(&mut self, inputs: &Inputs) {
+        self.second.difference = None;
         let (Some(encoder), Some(raw)) = (self.config.second_encoder, inputs.second_position)
         else {
             return;
@@ -37,8 +40,7 @@ impl Axis {
             .counts
             .map_or(Counts(i64::from(raw)), |counts| counts.unwrap_next(raw));
         second.counts = Some(counts);
-        second.difference = None;
-        if !self.home.homed || self.actual.counts().is_none() {
+        if second.waits_for_home || !self.home.homed || self.actual.counts().is_none() {
             second.offset = None;
             return;
         }
@@ -48,6 +50,24 @@ impl Axis {
             .offset
             .get_or_insert(encoder.offset.unwrap_or(own - position));
         second.difference = Some(own - position - offset);
+    }
+
+    /// Takes the counts of an encoder that has restarted. Without an offset in the configuration,
+    /// they are compared after the next homing.
+    pub fn restart_second_encoder(&mut self) {
+        let offset = self.config.second_encoder.and_then(|e| e.offset);
+        self.second = SecondPosition {
+            waits_for_home: offset.is_none(),
+            ..SecondPosition::default()
+        };
+    }
+
+    /// Forgets the place of the counts while homing runs.
+    pub(super) fn home_second_encoder(&mut self) {
+        self.second = SecondPosition {
+            counts: self.second.counts,
+            ..SecondPosition::default()
+        };
     }
 
     /// Returns the trip of a difference beyond its limit.

@@ -195,7 +195,10 @@ impl Axis {
         } else {
             self.supervision.following_error = 0.0;
         }
-        cause = cause.or(self.check_second_encoder());
+        let elsewhere = self.check_second_encoder();
+        // Where the load is, is known again after homing.
+        self.home.homed &= elsewhere.is_none();
+        cause = cause.or(elsewhere);
         if self.mode == Mode::Pp && self.profile.not_taken() {
             cause = Some(Trip::SetPointNotTaken);
         }

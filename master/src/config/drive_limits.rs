@@ -4,7 +4,7 @@
 use std::fmt;
 
 use ecaxis_axis::units::{Counts, RawAcceleration, RawVelocity};
-use ecaxis_axis::{Mode, VelocityUnit};
+use ecaxis_axis::{Limits, Mode, VelocityUnit};
 use ecaxis_esi as esi;
 
 use super::problem::Problems;
@@ -102,6 +102,11 @@ impl AxisSetup {
         found
     }
 
+    /// Returns what the drive must permit.
+    fn drive_limits(&self) -> Limits {
+        self.compensation.drive_limits(&self.config.limits)
+    }
+
     /// Checks a position range; an inverted range does not count.
     fn positions(&self, index: u16, low: i64, high: i64, found: &mut Vec<LimitConflict>) {
         if low >= high {
@@ -113,7 +118,7 @@ impl AxisSetup {
         for (sub, count, full) in [(1, low, i32::MIN), (2, high, i32::MAX)] {
             let at = scale.position_to_user(Counts(count)).0;
             let is_upper = (sub == 2) != scale.inverted();
-            let file = self.config.limits.position;
+            let file = self.drive_limits().position;
             let end = file.map(|[low, high]| if is_upper { high } else { low });
             let exceeds = match end {
                 Some(end) if is_upper => end > at + half,
@@ -146,7 +151,7 @@ impl AxisSetup {
         };
         let shown = unit.unwrap_or(VelocityUnit::RPM);
         let most = allowed(shown);
-        let limit = self.config.limits.velocity;
+        let limit = self.drive_limits().velocity;
         if !exceeds(limit, most) {
             return None;
         }
@@ -172,7 +177,7 @@ impl AxisSetup {
     fn profile_velocity(&self, raw: i32) -> Option<LimitConflict> {
         let scale = &self.config.scale;
         let most = scale.velocity_to_user(RawVelocity(raw)).0.abs();
-        let limit = self.config.limits.velocity;
+        let limit = self.drive_limits().velocity;
         let modes = self.config.modes;
         let profiles = [Mode::Pp, Mode::Pv, Mode::Hm];
         let certain = self.velocity_unit_from != UnitSource::Nothing
@@ -193,7 +198,7 @@ impl AxisSetup {
     fn acceleration(&self, raw: u32) -> Option<LimitConflict> {
         let scale = &self.config.scale;
         let most = scale.acceleration_to_user(RawAcceleration(raw)).0.abs();
-        let limit = self.config.limits.acceleration;
+        let limit = self.drive_limits().acceleration;
         let certain = self.acceleration_unit_from != UnitSource::Nothing;
         let (unit, name) = (scale.acceleration_unit(), &self.unit);
         let doubt = match certain {

@@ -165,7 +165,8 @@ fn plan(
                 (
                     PathError::Positions { point, .. }
                     | PathError::Position { point, .. }
-                    | PathError::Straight { point },
+                    | PathError::Straight { point }
+                    | PathError::Circle { point },
                     Some(lines),
                 ) => lines.get(*point - 1).map(|line| format!("line {line}: ")),
                 _ => None,
@@ -173,6 +174,7 @@ fn plan(
             let hint = match error {
                 PathError::ArcWithoutTolerance => "add `tolerance = 0.01`, or what the part allows",
                 PathError::Straight { .. } => "choose `through` off the straight line",
+                PathError::Circle { .. } => "write one half of it, then the other",
                 PathError::Positions { .. } => "write a position for each of `axes`",
                 PathError::TooLong { .. } | PathError::Points { .. } => {
                     "divide it, or raise its limits or its tolerance"

@@ -338,6 +338,10 @@ impl Engine {
             if let Some(same) = self.exchange.take_restart(device) {
                 let own = self.axes.iter_mut().filter(|slot| slot.device == device);
                 own.for_each(|slot| slot.axis.restarted(same));
+                let at =
+                    |slot: &&mut RtAxis| slot.second_encoder.is_some_and(|(_, at)| at == device);
+                let encoders = self.axes.iter_mut().filter(at);
+                encoders.for_each(|slot| slot.axis.restart_second_encoder());
             }
         }
     }

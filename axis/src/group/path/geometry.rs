@@ -55,15 +55,49 @@ impl Part {
         self.to - self.from
     }
 
-    /// The number of computed intervals: enough for the bends of the velocity.
-    pub(super) fn intervals(&self) -> usize {
-        match self.curve {
-            Curve::Line { .. } => 40,
-            Curve::Blend(_) => 16,
+    /// Returns the parameters of the computed nodes, from the beginning of the part. They are close
+    /// at the ends of lines and arcs, where the axes accelerate.
+    pub(super) fn nodes(&self) -> Vec<f64> {
+        let (count, even) = match self.curve {
+            Curve::Line { .. } => (40, false),
+            Curve::Blend(_) => (16, true),
             Curve::Arc { radius, .. } => {
                 let angle = self.length() / radius;
-                (angle * 20.0).ceil().clamp(16.0, 4000.0) as usize
+                ((angle * 32.0).ceil().clamp(40.0, 4000.0) as usize, false)
             }
+        };
+        let node = |n: usize| {
+            let share = n as f64 / count as f64;
+            let share = match even {
+                true => share,
+                false => 0.5 - 0.5 * (core::f64::consts::PI * share).cos(),
+            };
+            self.length() * share
+        };
+        (0..=count).map(node).collect()
+    }
+
+    /// Returns the distance of a position from a line, or from the circle of an arc.
+    fn distance(&self, position: &[f64]) -> f64 {
+        match &self.curve {
+            Curve::Line { from, direction } => {
+                let out = difference(position, from);
+                let along = dot(&out, direction).clamp(self.from, self.to);
+                let off = out.iter().zip(direction).map(|(o, d)| o - d * along);
+                norm(&off.collect::<Vec<_>>())
+            }
+            Curve::Arc {
+                center,
+                plane: [u, w],
+                radius,
+            } => {
+                let out = difference(position, center);
+                let (x, y) = (dot(&out, u), dot(&out, w));
+                let off = out.iter().zip(u.iter().zip(w));
+                let off = off.map(|(o, (u, w))| o - x * u - y * w);
+                norm(&off.collect::<Vec<_>>()).hypot(x.hypot(y) - radius)
+            }
+            Curve::Blend([_, _, _, end]) => norm(&difference(position, end)),
         }
     }
 
@@ -162,6 +196,9 @@ impl Geometry {
                     check(through, axes, number)?;
                     if blending.distance <= 0.0 {
                         return Err(PathError::ArcWithoutTolerance);
+                    }
+                    if line(&at, to).is_none() {
+                        return Err(PathError::Circle { point: number });
                     }
                     let arc = arc(&at, through, to);
                     Some(arc.ok_or(PathError::Straight { point: number })?)
@@ -310,33 +347,47 @@ fn blended(whole: Vec<Part>, blend: f64) -> Vec<Part> {
     parts
 }
 
-/// Separates the ends of lines that the average mixes with curves.
+/// Separates the ends of lines that the average mixes with curves. A short line may pass the rest of
+/// the way on to the next one.
 fn near_curves(parts: Vec<Part>, blending: &Blending) -> Vec<Part> {
     let mut at = At::default();
     // The way from a curve in half the time of the average.
-    let mut way = |curve: Option<&Part>, end: bool| {
-        let curve = curve.filter(|part| part.curved)?;
-        curve.at(if end { curve.length() } else { 0.0 }, &mut at);
+    let mut way = |curve: &Part, along: f64| {
+        curve.at(along, &mut at);
         let fastest = (blending.acceleration / norm(&at.second)).sqrt();
         let time = blending.time;
-        Some(fastest.min(blending.velocity) * time + blending.acceleration * time * time * 0.5)
+        fastest.min(blending.velocity) * time + blending.acceleration * time * time * 0.5
     };
-    let mut split = Vec::with_capacity(parts.len() * 2);
-    for (index, part) in parts.iter().enumerate() {
+    let mut reached = vec![[0.0_f64; 2]; parts.len()];
+    let mut left = 0.0_f64;
+    for (part, reached) in parts.iter().zip(&mut reached) {
+        reached[0] = left;
+        left = (left - part.length()).max(0.0);
         if part.curved {
-            split.push(part.clone());
-            continue;
+            left = left.max(way(part, part.length()));
         }
-        let before = parts.get(index.wrapping_sub(1)).filter(|part| !part.stops);
-        let after = parts.get(index + 1).filter(|_| !part.stops);
-        let cuts = [
-            part.from + way(before, true).unwrap_or_default(),
-            part.to - way(after, false).unwrap_or_default(),
-        ];
-        if cuts[0] >= cuts[1] {
+        if part.stops {
+            left = 0.0;
+        }
+    }
+    left = 0.0;
+    for (part, reached) in parts.iter().zip(&mut reached).rev() {
+        if part.stops {
+            left = 0.0;
+        }
+        reached[1] = left;
+        left = (left - part.length()).max(0.0);
+        if part.curved {
+            left = left.max(way(part, 0.0));
+        }
+    }
+    let mut split = Vec::with_capacity(parts.len() * 2);
+    for (part, [before, after]) in parts.into_iter().zip(reached) {
+        let cuts = [part.from + before, part.to - after];
+        if part.curved || cuts[0] >= cuts[1] {
             split.push(Part {
                 curved: true,
-                ..part.clone()
+                ..part
             });
             continue;
         }
@@ -378,15 +429,20 @@ fn corner(before: &Part, after: &Part, blend: f64, room: f64) -> Corner {
     let mut trim = (2.0 * blend / turn).min(room);
     loop {
         let curve = between(before, after, trim);
-        let nearest = (0..MEASURED).map(|n| {
+        // The blend passes the corner, and leaves the path, by at most `blend`.
+        let (mut nearest, mut farthest) = (f64::INFINITY, 0.0_f64);
+        for n in 0..MEASURED {
             curve.at(curve.length() * n as f64 / (MEASURED - 1) as f64, &mut at);
-            norm(&difference(&at.position, &point))
-        });
-        let distance = nearest.fold(f64::INFINITY, f64::min);
-        if distance <= blend * (1.0 + 1e-9) {
+            nearest = nearest.min(norm(&difference(&at.position, &point)));
+            let off = before
+                .distance(&at.position)
+                .min(after.distance(&at.position));
+            farthest = farthest.max(off);
+        }
+        if nearest.max(farthest) <= blend * (1.0 + 1e-9) {
             return Corner::Blend { trim, curve };
         }
-        trim *= 0.9 * blend / distance;
+        trim *= 0.8;
     }
 }
 

@@ -78,6 +78,12 @@ pub enum PathError {
         /// The number of the end point, from 1.
         point: usize,
     },
+    /// An arc ends where it begins.
+    #[error("the arc to point {point} ends where it begins: a circle needs two arcs")]
+    Circle {
+        /// The number of the end point, from 1.
+        point: usize,
+    },
     /// An arc with a tolerance of 0.
     #[error("an arc needs a tolerance, because the jerk limit cuts it a little")]
     ArcWithoutTolerance,
@@ -200,6 +206,9 @@ impl PathPlan {
                     length: geometry.length(),
                 });
             }
+            if most == f64::INFINITY {
+                break;
+            }
             used *= USED * 0.9999 / most;
         }
         Err(PathError::Unsolved)
@@ -244,6 +253,9 @@ fn largest_share(points: &[f64], axes: &[MotionLimits], path: [f64; 2], dt_s: f6
             let [a, b, c] = [row(n)[axis], row(n + 1)[axis], row(n + 2)[axis]];
             let velocity = (b - a) / dt_s;
             let acceleration = (c - 2.0 * b + a) / (dt_s * dt_s);
+            if !acceleration.is_finite() {
+                return f64::INFINITY;
+            }
             most = most.max(velocity.abs() / limits.velocity);
             most = most.max(acceleration.abs() / limits.acceleration);
             squares[0] += velocity * velocity;

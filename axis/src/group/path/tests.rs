@@ -191,7 +191,7 @@ fn impossible_paths_are_refused() {
     let straight = arc(&[0.0, 0.0], &[1.0, 1.0], &[2.0, 2.0], 0.1);
     assert_eq!(straight, Err(PathError::Straight { point: 2 }));
     let same = arc(&[0.0, 0.0], &[1.0, 1.0], &[0.0, 0.0], 0.1);
-    assert_eq!(same, Err(PathError::Straight { point: 2 }));
+    assert_eq!(same, Err(PathError::Circle { point: 2 }));
     let exact = arc(&[0.0, 0.0], &[1.0, 1.0], &[2.0, 0.0], 0.0);
     assert_eq!(exact, Err(PathError::ArcWithoutTolerance));
     assert_eq!(
@@ -213,4 +213,55 @@ fn impossible_paths_are_refused() {
     let line = [PathSegment::Line { to: vec![1.0] }];
     let slow = PathPlan::new(&[0.0], &line, &[LIMITS], &slow, DT);
     assert!(matches!(slow, Err(PathError::TooLong { .. })), "{slow:?}");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(300))]
+    /// Short lines, lines that continue straight, and lines that leave an arc almost tangentially.
+    #[test]
+    fn short_and_tangent_parts_keep_the_tolerance(
+        lengths in prop::collection::vec((0.001..30.0_f64, prop_oneof![Just(0.0), -3.0..3.0_f64]), 3..14),
+        tolerance in 0.02..0.5,
+        jerk in 20.0..100.0,
+    ) {
+        let limits = [MotionLimits { jerk: LIMITS.acceleration * jerk, ..LIMITS }; 2];
+        let (mut at, mut heading) = ([0.0_f64, 0.0], 0.0_f64);
+        let mut corners = vec![at.to_vec()];
+        for (length, turn) in lengths {
+            heading += turn;
+            at = [at[0] + length * heading.cos(), at[1] + length * heading.sin()];
+            corners.push(at.to_vec());
+        }
+        let segments: Vec<_> = corners[1..].iter().map(|to| PathSegment::Line { to: to.clone() }).collect();
+        let path = PathLimits { motion: UNLIMITED, tolerance };
+        let plan = PathPlan::new(&corners[0], &segments, &limits, &path, DT).unwrap();
+        let rows = played(&plan);
+        let farthest = rows.iter().map(|row| distance(row, &corners)).fold(0.0, f64::max);
+        prop_assert!(farthest <= tolerance + 1e-9, "{} of {}", farthest, tolerance);
+    }
+
+    #[test]
+    fn lines_at_arcs_keep_the_tolerance(
+        radius in 5.0..1000.0_f64,
+        sweep in 0.1..2.0_f64,
+        length in 1.0..200.0_f64,
+        off in prop_oneof![Just(0.0), -1e-3..1e-3_f64, -1.0..1.0_f64],
+        tolerance in 0.02..0.5,
+    ) {
+        // The arc ends at the origin in the direction of x; the line leaves it by `off`.
+        let on_arc = |angle: f64| vec![-radius * angle.sin(), radius * (1.0 - angle.cos())];
+        let end = vec![length * off.cos(), length * off.sin()];
+        let segments = [
+            PathSegment::Arc { through: on_arc(sweep * 0.5), to: vec![0.0, 0.0] },
+            PathSegment::Line { to: end.clone() },
+        ];
+        let limits = [MotionLimits { jerk: 30_000.0, ..LIMITS }; 2];
+        let path = PathLimits { motion: UNLIMITED, tolerance };
+        let plan = PathPlan::new(&on_arc(sweep), &segments, &limits, &path, DT).unwrap();
+        for row in played(&plan) {
+            let circle = (row[0].hypot(row[1] - radius) - radius).abs();
+            let line = distance(&row, &[vec![0.0, 0.0], end.clone()]);
+            prop_assert!(circle.min(line) <= tolerance + 1e-9, "{:?}: {} {}", row, circle, line);
+        }
+    }
 }

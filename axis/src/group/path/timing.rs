@@ -106,14 +106,13 @@ impl Timing {
     pub(super) fn new(geometry: &Geometry, bounds: &Bounds) -> Self {
         let mut intervals: Vec<Interval> = Vec::new();
         for (index, part) in geometry.parts.iter().enumerate() {
-            let count = part.intervals();
-            let length = part.length() / count as f64;
-            intervals.extend((0..count).map(|n| Interval {
+            let nodes = part.nodes();
+            intervals.extend(nodes.windows(2).map(|ends| Interval {
                 part: index,
-                along: length * n as f64,
-                length,
+                along: ends[0],
+                length: ends[1] - ends[0],
                 x: [0.0; 2],
-                stops: part.stops && n + 1 == count,
+                stops: part.stops && Some(&ends[1]) == nodes.last(),
             }));
         }
         let mut ends = Ends::default();

@@ -192,7 +192,8 @@ impl ProgramChecker<'_> {
             ramp,
         })
     }
-    /// Checks that axes that play tables together stop together: their tables share one time.
+    /// Checks that axes that play tables together stop together, and are due in the same cycles: their
+    /// tables share one time.
     pub(super) fn check_groups(&self, steps: &[Step], stop: &StopSetup, p: &mut Problems<'_>) {
         for step in steps {
             if let Action::Table { tables, .. } = &step.action {
@@ -200,6 +201,18 @@ impl ProgramChecker<'_> {
                     let device = self.axes.get(axis)?.device;
                     stop.groups.iter().position(|g| g.devices.contains(&device))
                 };
+                // A gateway steps its nodes in cycles of its own.
+                let network_of = |&(axis, _): &(AxisIndex, usize)| {
+                    let axis = self.axes.get(axis)?;
+                    axis.setup?.node.map(|_| axis.device)
+                };
+                let mut networks = tables.iter().map(network_of);
+                let first = networks.next();
+                if networks.any(|network| Some(network) != first) {
+                    let message = "the axes of this step are in different networks";
+                    let hint = "move axes behind a gateway together with those behind the same one";
+                    p.add_hint(self.place_of(step), message, hint);
+                }
                 let mut groups = tables.iter().map(group_of);
                 let first = groups.next();
                 if groups.any(|group| Some(group) != first) {
