@@ -141,7 +141,7 @@ fn wrong_paths_are_refused() {
         ("[\"x\", \"y\"]", "[\"x\", \"z\"]", &["no axis is named `z`"]),
         ("[\"x\", \"y\"]", "[\"x\", \"x\"]", &["`x` is named twice"]),
         ("[10.0, 10.0]", "[10.0]", &["point 3 has 1 positions for 2 axes"]),
-        ("[10.0, 10.0]", "[30.0, 10.0]", &["`x` cannot follow this path", "20"]),
+        ("[10.0, 10.0]", "[30.0, 10.0]", &["`x` cannot follow this path", "s after its begin", "20"]),
         ("[10.0, 0.0], [10.0, 10.0]", "{ through = [5.0, 0.0], to = [10.0, 0.0] }", &["three points on a straight line"]),
         ("tolerance = 0.2\n", "", &[]),
         ("tolerance = 0.2\npoints = [[0.0, 0.0], [10.0, 0.0]", "points = [[0.0, 0.0], { through = [5.0, 1.0], to = [10.0, 0.0] }", &["an arc needs a tolerance"]),

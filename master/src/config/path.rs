@@ -13,12 +13,14 @@ use super::fields::{Key, KeyExt};
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawPath, RawPoint};
 use super::steps::ResolvedAxis;
+use crate::text::rounded;
 
 /// A path and its name in the machine file.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct NamedPath {
     pub name: String,
-    /// Each axis with an index into the tables of the machine.
+    /// Each axis with an index into the tables of the machine. Empty: the path is invalid and has been
+    /// reported.
     pub tables: Vec<(AxisIndex, usize)>,
 }
 
@@ -41,18 +43,35 @@ pub(crate) fn check(
             p.add_hint(name.span(), message, "give it another name");
             continue;
         }
+        paths.push(NamedPath {
+            name: name.get_ref().clone(),
+            tables: Vec::new(),
+        });
         let Some(members) = members(raw, axes, p) else {
             continue;
         };
         let setups: Vec<_> = members.iter().map(|(_, setup)| *setup).collect();
-        let Some((planned, place)) = plan(raw, &setups, folder, cycle_s, p) else {
+        let Some(Planned {
+            tables: planned,
+            place,
+            is_timed,
+        }) = plan(raw, &setups, folder, cycle_s, p)
+        else {
             continue;
         };
         let mut possible = true;
         for (table, setup) in planned.iter().zip(&setups) {
             let limits = &setup.config.limits;
             if let Err(error) = table.check(limits.motion(), limits.position, 0.0, cycle_s) {
-                let message = format!("`{}` cannot follow this path: {error}", setup.name);
+                let why = match is_timed {
+                    true => error.to_string(),
+                    // A row is a cycle.
+                    false => {
+                        let time = error.line.saturating_sub(1) as f64 * cycle_s;
+                        format!("{} s after its begin, {}", rounded(time), error.problem)
+                    }
+                };
+                let message = format!("`{}` cannot follow this path: {why}", setup.name);
                 let hint = "change the points, or the limits of the axis";
                 p.add_hint(place.clone(), message, hint);
                 possible = false;
@@ -61,10 +80,9 @@ pub(crate) fn check(
         if possible {
             let first = tables.len();
             let members = members.iter().map(|(axis, _)| *axis);
-            paths.push(NamedPath {
-                name: name.get_ref().clone(),
-                tables: members.zip(first..).collect(),
-            });
+            if let Some(path) = paths.last_mut() {
+                path.tables = members.zip(first..).collect();
+            }
             tables.extend(planned);
         }
     }
@@ -115,14 +133,22 @@ fn members<'c>(
     Some(members)
 }
 
-/// Returns the table of each axis, and the place of the points.
+/// The table of each axis, and the place of the points.
+struct Planned {
+    tables: Vec<Table>,
+    place: Span,
+    /// The rows of the tables are those of a file with times.
+    is_timed: bool,
+}
+
+/// Plans a path.
 fn plan(
     raw: &RawPath,
     axes: &[&AxisSetup],
     folder: &Path,
     cycle_s: f64,
     p: &mut Problems<'_>,
-) -> Option<(Vec<Table>, Span)> {
+) -> Option<Planned> {
     let count = axes.len();
     let (segments, place, lines) = match (&raw.points, &raw.file) {
         (Some(points), None) => (
@@ -133,7 +159,11 @@ fn plan(
         (None, Some(file)) => {
             let rows = csv::read(file, folder, HINT, p)?;
             if rows.first().is_some_and(|row| row.fields.len() != count) {
-                return Some((timed(raw, file, &rows, count, p)?, file.span()));
+                return Some(Planned {
+                    tables: timed(raw, file, &rows, count, p)?,
+                    place: file.span(),
+                    is_timed: true,
+                });
             }
             let lines: Vec<_> = rows.iter().map(|row| row.line).collect();
             let lined = rows
@@ -159,7 +189,11 @@ fn plan(
         .collect();
     let limits = limits(raw, p)?;
     match PathPlan::new(start, segments, &motions, &limits, cycle_s) {
-        Ok(plan) => Some((plan.into_tables(), place)),
+        Ok(plan) => Some(Planned {
+            tables: plan.into_tables(),
+            place,
+            is_timed: false,
+        }),
         Err(error) => {
             let at = match (&error, lines) {
                 (

@@ -181,6 +181,9 @@ impl ProgramChecker<'_> {
             p.add_hint(name.span(), message, hint);
             return None;
         };
+        if path.tables.is_empty() {
+            return None;
+        }
         for &(axis, _) in &path.tables {
             let axis = self.axes.get(axis)?;
             self.positioned(&Spanned::new(name.span(), axis.name.to_owned()), "path", p)?;
