@@ -210,9 +210,10 @@ fn samples_are_read_in_another_thread() {
         (passed, samples.time_ns() - begin)
     });
     let (cycles, ns) = read.join().unwrap();
-    // The cycle follows the reference clock.
+    // A cycle may pass between both reads at the begin, and others are late on a busy computer.
+    let least = cycles.saturating_sub(2) * 1_000_000;
     assert!(
-        ns.abs_diff(cycles * 1_000_000) < cycles * 1_000 + 100_000,
+        (least..=2 * cycles * 1_000_000).contains(&ns),
         "{cycles} {ns}"
     );
 }
