@@ -171,7 +171,7 @@ def judge(report, objects, devices):
     report.equal("lost frames", master["CyclicLostFrames"], 0)
     report.equal("state of the MainDevice", master["MasterState"], OP)
     rate = master["CyclicFramesPerSecond"]
-    report.check("frames per second, about 500 at most", 0 < rate <= 550, rate)
+    report.check("frames per second, 500 at most", 100 <= rate <= 510, rate)
 
 
 def main():
@@ -189,7 +189,7 @@ def main():
             for _ in range(20):
                 objects = asyncio.run(dictionary(gateway.port))
                 # The rate of frames is known after the first second.
-                if objects.get(0xF120, {}).get("CyclicFramesPerSecond"):
+                if objects.get(0xF120, {}).get("CyclicFramesPerSecond", 0) >= 100:
                     break
                 time.sleep(0.5)
             child.send_signal(signal.SIGINT)

@@ -157,7 +157,7 @@ impl Timing {
             } else {
                 0.5 * (low + high)
             };
-            let next = (x + 2.0 * interval.length * u).clamp(0.0, top);
+            let next = (x + 2.0 * interval.length * u).max(0.0).min(top);
             interval.x = [x, next];
             x = next;
         }
