@@ -80,7 +80,7 @@ const KINDS: [Kind; 9] = [
             "path",
             "[[path]]\nname = \"p\"\naxes = [\"x\", \"y\", \"z\"]\ntolerance = 0.25\n\
              points = [[0.0, 0.0, 0.0], [4.0, 4.0, 0.0], [8.0, 0.0, 2.0], [8.0, -3.0, 0.0], [1.0, 2.0, 3.0]]\n[[step]]\npath = \"p\"\n",
-            false,
+            true,
             [1.0, 2.0, 3.0],
         )
     },

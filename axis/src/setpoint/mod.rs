@@ -61,7 +61,7 @@ pub use gear::{Gear, GearConfig, GearInMode};
 pub use hold::Hold;
 pub use jerk::{Goal, JerkLimited, MoveRequest};
 pub use ramp::Ramp;
-pub use rate::table_rate;
+pub use rate::{RateCourse, TableRate};
 pub use source::Source;
 pub use spline::{Interpolation, Knot};
 pub use stream::{Stream, StreamConfig, StreamState};

@@ -1,7 +1,6 @@
 //! The rate at which the time of waves and tables passes.
 //!
-//! Tables have no jerk limit, and a constant rate up to 1 keeps their limits. So each cycle takes
-//! the rate nearest to the wanted one that keeps the limits in this cycle: [`table_rate`].
+//! The rate of tables is searched cycle by cycle: [`TableRate`].
 //!
 //! A wave p(s) with the rate r has the velocity p′·r, the acceleration p″·r² + p′·r′ and the jerk
 //! p‴·r³ + 3·p″·r·r′ + p′·r″. With the highest slopes V, A and J of the wave, bounded r′ and r″ keep
@@ -77,30 +76,167 @@ impl Rate {
     }
 }
 
-/// Change of a table's rate per second.
+/// The highest change of a table's rate per second.
 const TABLE_SLEW: f64 = 5.0;
 
-/// Number of halvings of the change that the limits do not permit.
-const HALVINGS: u32 = 6;
+/// The smallest change of the slope per cycle, as a share of [`TABLE_SLEW`].
+const FINEST: f64 = 1.0 / 65_536.0;
 
-/// Returns the next rate of tables that play in step, between `now` and `wanted`, neither above 1.
-/// `permits`: true if one cycle at a rate keeps the limits of every table. RT: eight calls of
-/// `permits` at most.
-#[must_use]
-pub fn table_rate(now: f64, wanted: f64, dt_s: f64, mut permits: impl FnMut(f64) -> bool) -> f64 {
-    let most = TABLE_SLEW * dt_s;
-    let to = wanted.max(now - most).min(now + most);
-    if to == now || permits(to) {
-        return to;
+/// Most cycles from a slope to a constant rate.
+const LONGEST: f64 = 256.0;
+
+/// The rate of tables that play in common time.
+///
+/// A constant rate up to 1 keeps the limits that the tables keep. A changing rate may not: what is
+/// possible now can have no continuation within the limits some cycles later. So each change is
+/// taken only together with a [`RateCourse`] back to a constant rate that keeps all limits. While
+/// no new course does, the last one continues.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TableRate {
+    value: f64,
+    slope: f64,
+    /// Change of the slope per cycle.
+    bend: f64,
+}
+
+impl TableRate {
+    /// The rate 1.
+    pub const WHOLE: Self = Self {
+        value: 1.0,
+        slope: 0.0,
+        bend: TABLE_SLEW,
+    };
+
+    /// Returns the rate of this cycle.
+    #[must_use]
+    pub const fn value(&self) -> f64 {
+        self.value
     }
-    let (mut kept, mut refused) = (now, to);
-    for _ in 0..HALVINGS {
-        let middle = kept + (refused - kept) * 0.5;
-        if permits(middle) {
-            kept = middle;
-        } else {
-            refused = middle;
+
+    /// Sets a constant rate while no table plays.
+    pub const fn set(&mut self, value: f64) {
+        (self.value, self.slope) = (value, 0.0);
+    }
+
+    /// Advances one cycle towards `wanted`, from 0 to 1. `keeps`: true if every table keeps its
+    /// limits on a course. RT: five calls of `keeps` at most.
+    pub fn advance(
+        &mut self,
+        wanted: f64,
+        dt_s: f64,
+        mut keeps: impl FnMut(RateCourse) -> bool,
+    ) -> f64 {
+        let left = wanted - self.value;
+        if left == 0.0 && self.slope == 0.0 {
+            return self.value;
+        }
+        // First a new slope, then the present one. A bend that the limits do not permit is halved,
+        // and doubled again as soon as they do.
+        for (factor, changes) in [
+            (2.0, true),
+            (1.0, true),
+            (0.5, true),
+            (0.5, false),
+            (1.0, false),
+        ] {
+            let bend = (self.bend * factor).clamp(TABLE_SLEW * FINEST, TABLE_SLEW);
+            // The rate can become constant at the wanted one.
+            let fastest = braking_velocity(left.abs(), bend / dt_s, dt_s)
+                .min(TABLE_SLEW)
+                .min(bend * LONGEST);
+            let slope = if changes {
+                let toward = fastest.copysign(left);
+                toward.max(self.slope - bend).min(self.slope + bend)
+            } else {
+                self.slope
+            };
+            let away = slope * left < 0.0;
+            if (away && !changes)
+                || (!away && slope.abs() > fastest * (1.0 + 1e-9))
+                || (slope == 0.0 && self.slope == 0.0)
+            {
+                continue;
+            }
+            let course = RateCourse::new(self.value, slope, bend, dt_s);
+            if (0.0..=1.0).contains(&course.end()) && keeps(course) {
+                (self.slope, self.bend) = (slope, bend);
+                let step = slope * dt_s;
+                self.value = if (left - step).abs() <= left.abs() * 1e-9 {
+                    wanted
+                } else {
+                    (self.value + step).clamp(0.0, 1.0)
+                };
+                return self.value;
+            }
+        }
+        if self.slope == 0.0 {
+            // A finer change may be possible in the next cycle.
+            self.bend = (self.bend * 0.5).max(TABLE_SLEW * FINEST);
+        }
+        self.slope = towards_zero(self.slope, self.bend);
+        self.value = (self.value + self.slope * dt_s).clamp(0.0, 1.0);
+        self.value
+    }
+}
+
+fn towards_zero(slope: f64, bend: f64) -> f64 {
+    (slope.abs() - bend).max(0.0).copysign(slope)
+}
+
+/// The rates of the next cycles, until the rate is constant.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RateCourse {
+    value: f64,
+    /// The slope of the next cycle.
+    slope: f64,
+    bend: f64,
+    dt_s: f64,
+    cycles: u32,
+}
+
+impl RateCourse {
+    fn new(value: f64, slope: f64, bend: f64, dt_s: f64) -> Self {
+        // Velocity, acceleration and jerk are constant again two cycles after the rate.
+        let cycles = (slope.abs() / bend).ceil().min(LONGEST) as u32 + 3;
+        Self {
+            value,
+            slope,
+            bend,
+            dt_s,
+            cycles,
         }
     }
-    kept
+
+    /// Returns the number of cycles left.
+    #[must_use]
+    pub const fn cycles(&self) -> u32 {
+        self.cycles
+    }
+
+    /// Returns the constant rate at the end.
+    fn end(&self) -> f64 {
+        let (slope, whole) = (self.slope.abs(), (self.slope.abs() / self.bend).floor());
+        let way = (whole + 1.0) * (slope - self.bend * whole * 0.5);
+        let end = self.value + way.copysign(self.slope) * self.dt_s;
+        // Without the rounding of the sum.
+        if end.abs() < 1e-12 {
+            0.0
+        } else if (end - 1.0).abs() < 1e-12 {
+            1.0
+        } else {
+            end
+        }
+    }
+}
+
+impl Iterator for RateCourse {
+    type Item = f64;
+
+    /// Returns the rate of the next cycle.
+    fn next(&mut self) -> Option<f64> {
+        self.cycles = self.cycles.checked_sub(1)?;
+        self.value = (self.value + self.slope * self.dt_s).clamp(0.0, 1.0);
+        self.slope = towards_zero(self.slope, self.bend);
+        Some(self.value)
+    }
 }

@@ -70,6 +70,18 @@ impl Piece {
         self.time
     }
 
+    pub(crate) fn start_acceleration(&self) -> f64 {
+        2.0 * self.b
+    }
+
+    pub(crate) fn end_acceleration(&self) -> f64 {
+        2.0 * self.b + self.jerk() * self.time
+    }
+
+    pub(crate) fn jerk(&self) -> f64 {
+        6.0 * self.c
+    }
+
     pub(crate) fn position(&self, t: f64) -> f64 {
         if t >= self.time {
             return self.to.position;
@@ -103,7 +115,7 @@ impl Piece {
                 limit: limits.velocity,
             });
         }
-        let acceleration = fastest(2.0 * self.b, 2.0 * self.b + 6.0 * self.c * self.time);
+        let acceleration = fastest(self.start_acceleration(), self.end_acceleration());
         steep(acceleration, limits.acceleration)?;
         let Some([low, high]) = range else {
             return Ok(());

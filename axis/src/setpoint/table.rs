@@ -5,7 +5,7 @@
 
 use super::error::position;
 use super::spline::{Interpolation, Piece, check_corner, check_end, check_stop};
-use super::{Hold, Knot, Motion, MotionLimits, SetpointError};
+use super::{Hold, Knot, Motion, MotionLimits, RateCourse, SetpointError};
 
 /// A problem and its line in the text, counted from 1.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -65,6 +65,9 @@ pub enum TableProblem {
 /// Maximum number of rows; their pieces need 60 MB.
 const MOST_ROWS: usize = 1_000_000;
 
+/// Most steps of a course that are checked; a longer course is checked in steps of several cycles.
+const MOST_CHECKED: u32 = 64;
+
 /// Maximum length of fields quoted in errors.
 const QUOTED: usize = 40;
 
@@ -76,6 +79,10 @@ pub struct Table {
     /// Line of the end of each piece.
     lines: Box<[usize]>,
     first_line: usize,
+    /// The highest jerk of its pieces.
+    jerk: f64,
+    /// The largest step of the acceleration between two pieces.
+    acceleration_step: f64,
 }
 
 /// A row of a table.
@@ -141,12 +148,13 @@ impl Table {
             }),
             _ => None,
         });
-        Ok(Self {
+        let lines = rows.iter().skip(1).map(|row| row.line).collect();
+        Ok(Self::of_pieces(
             interpolation,
-            pieces: pieces.collect(),
-            lines: rows.iter().skip(1).map(|row| row.line).collect(),
+            pieces.collect(),
+            lines,
             first_line,
-        })
+        ))
     }
 
     /// Creates a table of cubics through points at constant distances in time.
@@ -155,11 +163,36 @@ impl Table {
             [from, to] => Some(Piece::new(from, to, distance_s)),
             _ => None,
         });
+        let lines = (2..=knots.len()).collect();
+        Self::of_pieces(Interpolation::Cubic, pieces.collect(), lines, 1)
+    }
+
+    fn of_pieces(
+        interpolation: Interpolation,
+        pieces: Box<[Piece]>,
+        lines: Box<[usize]>,
+        first_line: usize,
+    ) -> Self {
+        let jerk = pieces.iter().map(|piece| piece.jerk().abs());
+        let jerk = jerk.fold(0.0, f64::max);
+        let acceleration_step = match interpolation {
+            // The velocity has steps.
+            Interpolation::Linear => f64::INFINITY,
+            Interpolation::Cubic => {
+                let starts = pieces.iter().map(Piece::start_acceleration).chain([0.0]);
+                let ends = pieces.iter().map(Piece::end_acceleration);
+                let ends = [0.0].into_iter().chain(ends);
+                let steps = starts.zip(ends).map(|(start, end)| (start - end).abs());
+                steps.fold(0.0, f64::max)
+            }
+        };
         Self {
-            interpolation: Interpolation::Cubic,
-            pieces: pieces.collect(),
-            lines: (2..=knots.len()).collect(),
-            first_line: 1,
+            interpolation,
+            pieces,
+            lines,
+            first_line,
+            jerk,
+            acceleration_step,
         }
     }
 
@@ -432,20 +465,63 @@ impl Playback {
         self.state != State::Playing && motion.velocity == 0.0
     }
 
-    /// Returns true if one cycle at `rate` keeps the velocity and acceleration limits. A constant
-    /// rate up to 1 always does. RT: O(rows in a cycle).
+    /// Returns the last set-point.
     #[must_use]
-    pub fn permits(
+    pub const fn motion(&self) -> Motion {
+        self.last
+    }
+
+    /// Returns true if the rates of a course keep the limits of velocity, acceleration and jerk.
+    /// The jerk may be as high as the table's own. RT: O([`MOST_CHECKED`] + rows on the course).
+    #[must_use]
+    pub fn keeps(
         mut self,
         table: &Table,
-        motion: Motion,
         limits: &MotionLimits,
+        course: RateCourse,
         dt_s: f64,
-        rate: f64,
     ) -> bool {
-        let next = self.advance(table, motion, dt_s, rate);
-        let change = (next.velocity - motion.velocity).abs();
-        next.velocity.abs() <= limits.velocity && change <= limits.acceleration * dt_s
+        let highest_jerk = limits.jerk.max(table.jerk);
+        let stride = course.cycles().div_ceil(MOST_CHECKED);
+        // Before the first step: its length, its distance from the one before, the motion.
+        let (mut step_s, mut distance_s, mut before) = (dt_s, dt_s, self.last);
+        let (mut cycles, mut passed_s) = (0, 0.0);
+        for (index, rate) in course.enumerate() {
+            cycles += 1;
+            passed_s += rate * dt_s;
+            // The first cycles become real, so they are checked one by one.
+            if index >= 2 && cycles < stride {
+                continue;
+            }
+            let step = f64::from(cycles) * dt_s;
+            let position = self.pass(table, passed_s) + self.offset;
+            let velocity = (position - before.position) / step;
+            let distance = (step + step_s) * 0.5;
+            let acceleration = (velocity - before.velocity) / distance;
+            let apart = (distance + distance_s) * 0.5;
+            let jerk = (acceleration - before.acceleration) / apart;
+            // The rounding of positions.
+            let noise = 4.0 * f64::EPSILON * position.abs().max(before.position.abs());
+            let [noise, noise2, noise3] = [
+                noise,
+                noise * 2.0 / distance,
+                noise * 4.0 / (distance * apart),
+            ];
+            if velocity.abs() > limits.velocity + noise / step
+                || acceleration.abs() > limits.acceleration + noise2 / step
+                || jerk.abs() > highest_jerk + noise3 / step + table.acceleration_step / apart
+            {
+                return false;
+            }
+            before = Motion {
+                position,
+                velocity,
+                acceleration,
+            };
+            (step_s, distance_s) = (step, distance);
+            (cycles, passed_s) = (0, 0.0);
+        }
+        true
     }
 
     fn pass(&mut self, table: &Table, dt_s: f64) -> f64 {

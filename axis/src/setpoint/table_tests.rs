@@ -1,6 +1,6 @@
 use proptest::prelude::*;
 
-use super::super::table_rate;
+use super::super::TableRate;
 use super::super::test_support::Sequence;
 use super::*;
 
@@ -217,12 +217,12 @@ proptest! {
         prop_assume!(tables.iter().all(|table| table.check(limits, None, 0.0, DT).is_ok()));
         let start = Motion::at(0.0);
         let mut players = [0, 1].map(|index| (Playback::new(&tables[index], start, limits, 0.0).unwrap(), start));
-        let mut rate = 1.0;
+        let mut rate = TableRate::WHOLE;
         for (wanted, cycles) in rates.into_iter().chain([(0.0, 3000), (1.0, 20_000)]) {
             for _ in 0..cycles {
-                rate = table_rate(rate, wanted, DT, |rate| {
-                    players.iter().zip(&tables).all(|((play, motion), table)| {
-                        play.permits(table, *motion, &limits, DT, rate)
+                let rate = rate.advance(wanted, DT, |course| {
+                    players.iter().zip(&tables).all(|((play, _), table)| {
+                        play.keeps(table, &limits, course, DT)
                     })
                 });
                 for ((play, motion), table) in players.iter_mut().zip(&tables) {

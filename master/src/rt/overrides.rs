@@ -3,6 +3,7 @@
 //! The rate of an axis is the product of the machine's factor and its group's, at most [`MAX_RATE`].
 //! It is 0 while one of both is held. Stops do not use the rate.
 
+use ecaxis_axis::setpoint::TableRate;
 use ecaxis_axis::{MAX_RATE, MIN_RATE};
 use ecaxis_ecat::index::{GroupIndex, IndexVec};
 
@@ -86,7 +87,7 @@ pub(super) struct Overrides {
     /// What the inputs demand of the machine.
     input: Override,
     /// The present rate of the tables of each group.
-    pub tables: IndexVec<GroupIndex, f64>,
+    pub tables: IndexVec<GroupIndex, TableRate>,
 }
 
 /// The rates of one axis in one cycle.
@@ -95,15 +96,12 @@ pub struct Rates {
     pub own: f64,
     /// The lowest rate of all axes on lines.
     pub line: f64,
-    /// The rate of the tables of the group.
-    pub table: f64,
 }
 
 impl Rates {
     pub const WHOLE: Self = Self {
         own: 1.0,
         line: 1.0,
-        table: 1.0,
     };
 }
 
@@ -122,7 +120,7 @@ impl Overrides {
             config,
             requested,
             input: Override::default(),
-            tables: vec![1.0; groups].into(),
+            tables: vec![TableRate::WHOLE; groups].into(),
         }
     }
 

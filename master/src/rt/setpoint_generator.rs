@@ -7,8 +7,8 @@
 
 use ecaxis_axis::group::LinePath;
 use ecaxis_axis::setpoint::{
-    Cam, Gear, GearConfig, JerkLimited, Motion, Playback, PositionWave, Setpoint, SetpointError,
-    Table,
+    Cam, Gear, GearConfig, JerkLimited, Motion, Playback, PositionWave, RateCourse, Setpoint,
+    SetpointError, Table,
 };
 use ecaxis_axis::{Axis, AxisStatus, CommandError, HomingStatus};
 use ecaxis_ecat::index::AxisIndex;
@@ -213,7 +213,10 @@ impl SetpointGenerator {
                 }
             }),
         };
-        self.given = None;
+        self.given = match &source {
+            Ok(Source::Table { playback, .. }) => Some(playback.motion()),
+            _ => None,
+        };
         (self.source, self.state) = match source {
             Ok(source) => (Some(source), GeneratorState::Running),
             Err(error) => (
@@ -238,16 +241,25 @@ impl SetpointGenerator {
         matches!(self.source, Some(Source::Table { .. }))
     }
 
-    /// Returns true if the table keeps the limits of the axis in a cycle at `rate`. RT: O(rows in a
-    /// cycle).
-    pub fn permits_rate(&self, axis: &Axis, tables: &[Table], rate: f64, dt_s: f64) -> bool {
+    /// Returns true if the table keeps the limits of the axis on a course of rates. RT: as
+    /// [`Playback::keeps`].
+    pub fn keeps(&self, axis: &Axis, tables: &[Table], course: RateCourse, cycle_s: f64) -> bool {
         let Some(Source::Table { table, playback }) = self.source else {
             return true;
         };
-        let motion = self.resume_motion(axis, dt_s);
         let limits = axis.config().limits.motion();
         let table = tables.get(table);
-        table.is_none_or(|table| playback.permits(table, motion, &limits, dt_s, rate))
+        table.is_none_or(|table| playback.keeps(table, &limits, course, cycle_s))
+    }
+
+    /// Lets the time of the table pass, in every cycle of the bus. So all tables of a group have a
+    /// common time, however often their axes step. RT: O(rows in a cycle).
+    pub fn play(&mut self, tables: &[Table], rate: f64, cycle_s: f64) {
+        if let Some(Source::Table { table, playback }) = &mut self.source
+            && let Some(table) = tables.get(*table)
+        {
+            let _ = playback.advance(table, playback.motion(), cycle_s, rate);
+        }
     }
 
     /// Ends the line because another axis on it has stopped.
@@ -314,12 +326,10 @@ impl SetpointGenerator {
     }
 
     /// Gives the axis this cycle's set-point; call it between the axis' `observe` and `act`.
-    /// Returns true if the source has just ended without a command. RT: O(1), for a table O(rows in
-    /// a cycle).
+    /// Returns true if the source has just ended without a command. RT: O(1).
     pub fn advance(
         &mut self,
         axis: &mut Axis,
-        tables: &[Table],
         master: Option<Motion>,
         rates: Rates,
         dt_s: f64,
@@ -350,14 +360,12 @@ impl SetpointGenerator {
                 interrupted = wave.interrupted();
                 (next, wave.finished(next), GeneratorState::Running)
             }
-            Source::Table { table, playback } => match tables.get(*table) {
-                Some(table) => {
-                    let next = playback.advance(table, before, dt_s, rates.table);
-                    interrupted = playback.interrupted();
-                    (next, playback.finished(next), GeneratorState::Running)
-                }
-                None => (before, true, GeneratorState::Running),
-            },
+            Source::Table { playback, .. } => {
+                interrupted = self.given != Some(before);
+                let position = playback.motion().position;
+                let next = before.then(position, (position - before.position) / dt_s, dt_s);
+                (next, playback.finished(next), GeneratorState::Running)
+            }
             Source::Gear { gear, .. } => {
                 let next = gear.advance(master.unwrap_or_default(), before, dt_s);
                 let state = if gear.engaged() {
@@ -393,8 +401,13 @@ impl SetpointGenerator {
                 (self.source, self.state) = (Some(source), state);
                 self.given = Some(next);
             }
-            // The axis waits, and so does its source.
-            Err(CommandError::FramesLost) => {}
+            // The axis waits, and so does its source. Only the time of a table passes.
+            Err(CommandError::FramesLost) => {
+                if matches!(source, Source::Table { .. }) && next.position != before.position {
+                    self.fail(GeneratorError::Delayed);
+                    return true;
+                }
+            }
             Err(reason) => {
                 self.fail(GeneratorError::Refused(reason));
                 return true;

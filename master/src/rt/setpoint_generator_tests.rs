@@ -68,7 +68,7 @@ impl Rig {
         self.before = self.axis.status().target_position;
         let _ = self
             .generator
-            .advance(&mut self.axis, &[], master, Rates::WHOLE, DT);
+            .advance(&mut self.axis, master, Rates::WHOLE, DT);
         self.out = self.axis.act();
         self.axis.status().target_position
     }

@@ -1,7 +1,7 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::setpoint::Playback;
+use crate::setpoint::{Motion, Playback, TableRate};
 
 const DT: f64 = 0.001;
 
@@ -15,7 +15,7 @@ fn played(plan: &PathPlan) -> Vec<Vec<f64>> {
             acceleration: 1e6,
             jerk: 1e6,
         };
-        let mut motion = crate::setpoint::Motion::at(table.ends()[0]);
+        let mut motion = Motion::at(table.ends()[0]);
         let mut playback = Playback::new(table, motion, limits, 0.0).unwrap();
         let mut column = vec![motion.position];
         while !playback.finished(motion) {
@@ -111,6 +111,63 @@ proptest! {
                 });
                 prop_assert!(nearest.fold(f64::INFINITY, f64::min) == 0.0);
             }
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(60))]
+    /// A rate that changes at any time keeps the limits of all axes, their common time and the end.
+    #[test]
+    fn rates_keep_the_limits_of_paths(
+        axes in prop::collection::vec(limits(), 2..4),
+        points in prop::collection::vec(prop::array::uniform3(-200.0..200.0_f64), 2..8),
+        tolerance in prop_oneof![Just(0.0), 0.01..5.0],
+        quarter in any::<bool>(),
+        rates in prop::collection::vec((prop_oneof![Just(0.0), Just(1.0), 0.02..1.0_f64], 0.01..0.6_f64), 1..8),
+    ) {
+        let dt = if quarter { DT / 4.0 } else { DT };
+        let count = axes.len();
+        let corners: Vec<Vec<f64>> = points.iter().map(|p| p[..count].to_vec()).collect();
+        let segments: Vec<_> = corners[1..].iter().map(|to| PathSegment::Line { to: to.clone() }).collect();
+        let path = PathLimits { motion: UNLIMITED, tolerance };
+        let plan = PathPlan::new(&corners[0], &segments, &axes, &path, dt).unwrap();
+        let tables = plan.tables();
+        let mut players: Vec<_> = tables.iter().zip(&axes).map(|(table, limits)| {
+            Playback::new(table, Motion::at(table.ends()[0]), *limits, 0.0).unwrap()
+        }).collect();
+        let mut rate = TableRate::WHOLE;
+        let (mut ended, mut slowest) = (false, 0);
+        for (wanted, seconds) in rates.into_iter().chain([(0.0, 20.0), (1.0, 1e4)]) {
+            let mut cycles = 0;
+            while f64::from(cycles) * dt < seconds && !ended {
+                let value = rate.advance(wanted, dt, |course| {
+                    players.iter().zip(tables).zip(&axes).all(|((play, table), limits)| play.keeps(table, limits, course, dt))
+                });
+                ended = true;
+                for ((play, table), limits) in players.iter_mut().zip(tables).zip(&axes) {
+                    let before = play.motion();
+                    let next = play.advance(table, before, dt, value);
+                    let jerk = (next.acceleration - before.acceleration) / dt;
+                    prop_assert!(next.velocity.abs() <= limits.velocity * 1.000_001);
+                    prop_assert!(next.acceleration.abs() <= limits.acceleration * 1.000_001);
+                    prop_assert!(jerk.abs() <= limits.jerk * 1.01, "{} of {}", jerk, limits.jerk);
+                    ended &= play.finished(next);
+                }
+                cycles += 1;
+                if wanted == 0.0 && value == 0.0 {
+                    break;
+                }
+                slowest = slowest.max(if wanted == 0.0 { cycles } else { 0 });
+            }
+            // A hold ends, unless the path does.
+            prop_assert!(wanted > 0.0 || ended || rate.value() == 0.0 || seconds < 20.0);
+        }
+        prop_assert!(ended);
+        prop_assert!(f64::from(slowest) * dt < 3.0, "a hold took {} s", f64::from(slowest) * dt);
+        for ((play, table), corner) in players.iter().zip(tables).zip(corners.last().unwrap()) {
+            prop_assert_eq!(play.motion().position, table.ends()[1]);
+            prop_assert_eq!(play.motion().position, *corner);
         }
     }
 }

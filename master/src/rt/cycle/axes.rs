@@ -151,7 +151,7 @@ impl Engine {
         let dt_s = slot.dt_s(self.config.cycle_ns);
         let lost = slot
             .generator
-            .advance(&mut slot.axis, &self.tables, master, slot.rates, dt_s);
+            .advance(&mut slot.axis, master, slot.rates, dt_s);
         if let Some((motion, takes_up)) = leader {
             slot.axis.follow(motion, takes_up);
         }

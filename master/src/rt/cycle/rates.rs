@@ -1,6 +1,5 @@
 //! Passes override and hold to every axis, once per cycle.
 
-use ecaxis_axis::setpoint::table_rate;
 use ecaxis_ecat::index::{AxisIndex, GroupIndex};
 
 use super::Engine;
@@ -9,13 +8,13 @@ use crate::rt::overrides::Rates;
 
 impl Engine {
     /// Sets the rates of this cycle. All axes of a line have the lowest of their rates, so that they
-    /// stay on it. The tables of a group keep their common time.
+    /// stay on it. The tables of a group have a common time.
     pub(super) fn set_rates(&mut self) {
         if self.guarding {
             self.overrides.read(&self.inputs);
         }
         for group in self.groups.indices() {
-            self.set_table_rate(group);
+            self.play_tables(group);
         }
         for index in self.axes.indices() {
             let line = self.line_rate(index);
@@ -24,16 +23,7 @@ impl Engine {
             };
             let own = self.overrides.rate(slot.group);
             slot.axis.set_rate(own);
-            slot.rates = Rates {
-                own,
-                line,
-                table: self
-                    .overrides
-                    .tables
-                    .get(slot.group)
-                    .copied()
-                    .unwrap_or(0.0),
-            };
+            slot.rates = Rates { own, line };
         }
     }
 
@@ -48,35 +38,29 @@ impl Engine {
         rates.fold(f64::INFINITY, f64::min)
     }
 
-    fn set_table_rate(&mut self, group: GroupIndex) {
+    /// Advances the rate of the tables of a group, and their common time.
+    fn play_tables(&mut self, group: GroupIndex) {
         let wanted = self.overrides.rate(group).min(1.0);
-        let Some(now) = self.overrides.tables.get(group).copied() else {
+        let Some(rate) = self.overrides.tables.get_mut(group) else {
             return;
         };
         let plays = |slot: &&RtAxis| slot.group == group && slot.generator.plays();
-        let mut players = self.axes.iter().filter(plays);
-        // A node of a gateway steps in some cycles only; until then the rate is constant.
-        if now == wanted || players.any(|slot| slot.acted) {
+        if !self.axes.iter().any(|slot| plays(&slot)) {
+            rate.set(wanted);
             return;
         }
-        let mut dt_s = 0.0;
-        for slot in self.axes.iter().filter(plays) {
-            dt_s = slot.dt_s(self.config.cycle_ns);
-        }
-        let next = if dt_s == 0.0 {
-            wanted
-        } else {
-            table_rate(now, wanted, dt_s, |rate| {
-                let mut players = self.axes.iter().filter(plays);
-                players.all(|slot| {
-                    let dt_s = slot.dt_s(self.config.cycle_ns);
-                    slot.generator
-                        .permits_rate(&slot.axis, &self.tables, rate, dt_s)
-                })
+        let cycle_s = self.config.cycle_ns as f64 * 1e-9;
+        let value = rate.advance(wanted, cycle_s, |course| {
+            let mut players = self.axes.iter().filter(plays);
+            players.all(|slot| {
+                slot.generator
+                    .keeps(&slot.axis, &self.tables, course, cycle_s)
             })
-        };
-        if let Some(rate) = self.overrides.tables.get_mut(group) {
-            *rate = next;
+        });
+        for slot in &mut self.axes {
+            if slot.group == group {
+                slot.generator.play(&self.tables, value, cycle_s);
+            }
         }
     }
 }
