@@ -38,5 +38,6 @@ mod repeats;
 mod samples;
 mod several_axes;
 mod states;
+mod superimpose;
 mod units;
 mod vendor_esi;

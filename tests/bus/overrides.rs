@@ -37,7 +37,7 @@ const fn kind(name: &'static str, steps: &'static str, jerk_limited: bool, end: 
     }
 }
 
-const KINDS: [Kind; 9] = [
+const KINDS: [Kind; 10] = [
     kind(
         "move",
         "[[step]]\nmove = { x = 10.0, y = -7.0, z = 3.0 }\n[[step]]\nmove = { x = 1.0, y = 2.0 }\nspeed = 0.6\n",
@@ -101,6 +101,14 @@ const KINDS: [Kind; 9] = [
         "[[step]]\ngear = { y = { to = \"x\", ratio = 0.5 } }\n[[step]]\nmove = { x = 12.0 }\n[[step]]\nmove = { x = 2.0 }\n",
         true,
         [2.0, 1.0, 0.0],
+    ),
+    kind(
+        "superimposed",
+        "[[step]]\nenable = true\n[[step]]\nparallel = [\n{ step = [{ move = { x = 10.0, y = 4.0 }, speed = 0.4, ramp = 0.4 }] },\n\
+         { step = [{ wait = { x.position = { above = 1.0 } }, timeout = \"none\" }, { superimpose = { x = -0.75 } }] },\n]\n\
+         [[step]]\ngear = { y = { to = \"x\", ratio = 0.5 } }\n[[step]]\nphase = { y = 1.0 }\n",
+        false,
+        [9.25, 5.0, 0.0],
     ),
     kind(
         "velocity",

@@ -238,7 +238,7 @@ impl Axis {
     }
 
     /// Rejects `command` unless the active mode supports it.
-    fn check_control(
+    pub(super) fn check_control(
         &self,
         command: &'static str,
         needs: Mode,

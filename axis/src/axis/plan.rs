@@ -5,8 +5,9 @@ use crate::cia402::{Mode, ModeStatus};
 use crate::position_loop::bounded;
 use crate::setpoint::{
     Goal, Hold, JerkLimited, Motion, MotionLimits, MoveRequest, Ramp, Setpoint, SetpointError,
-    Trapezoid,
+    Source, Trapezoid,
 };
+use crate::status::CommandError;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[allow(
@@ -115,6 +116,37 @@ impl Axis {
         } else {
             Motion::at(self.actual.position())
         }
+    }
+
+    /// Returns the motion in progress as a source, for a motion on top of it.
+    ///
+    /// # Errors
+    /// Fails if the axis commands no position, or may not move.
+    pub fn source(&self) -> Result<Source, CommandError> {
+        self.check_control("a superimposed move", Mode::Csp, |c, _| {
+            c == ControlledQuantity::Position
+        })?;
+        self.check_ready()?;
+        let limits = &self.config.limits;
+        Ok(match self.plan {
+            Plan::Jerk(source) => Source::JerkLimited(source),
+            Plan::Move(trapezoid) => Source::Trapezoid(trapezoid),
+            Plan::Velocity(ramp) => {
+                let request = MoveRequest {
+                    goal: Goal::Velocity(ramp.target),
+                    limits: MotionLimits {
+                        acceleration: ramp.slope,
+                        ..limits.motion()
+                    },
+                    ceiling: limits.motion(),
+                    range: limits.position,
+                };
+                Source::JerkLimited(JerkLimited::new(request, self.motion, self.dt_s)?)
+            }
+            _ => Source::Hold(Hold {
+                acceleration: limits.acceleration,
+            }),
+        })
     }
 
     /// Prepares a position or velocity command after a torque: starts from the actual motion and

@@ -7,13 +7,19 @@
 //! positions.
 
 use super::error::{position, usable};
-use super::{Motion, MotionLimits, SetpointError, braking_velocity};
+use super::{
+    Goal, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint, SetpointError, braking_velocity,
+};
 
 /// Fraction of the acceleration used to plan braking. The rest covers rounding.
 const PLANNED: f64 = 1.0 - 1e-4;
 
-/// Fraction of the acceleration limit for catching up. The rest is for following meanwhile.
+/// Fraction of the acceleration limit for catching up and for shifts. The rest is for following
+/// meanwhile.
 const CATCHING_UP: f64 = 0.5;
+
+/// Least fraction of the velocity limit for a shift.
+const LEAST: f64 = 0.01;
 
 /// The way in which a gear engages.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -63,6 +69,8 @@ pub struct Gear {
     master: Motion,
     /// Ideal position of the follower in the last cycle.
     ideal: f64,
+    /// The way of a shift in progress, and the part that is done.
+    shift: Option<(JerkLimited, Motion)>,
     /// Distance from the ideal position, averaged over the smoothing time.
     behind: f64,
     engaged: bool,
@@ -97,31 +105,83 @@ impl Gear {
             smoothing_s: config.smoothing_s,
             master,
             ideal,
+            shift: None,
             behind: ideal - motion.position,
             engaged: false,
             slips: 0,
         })
     }
 
-    /// Returns true if the follower is at its ideal position; with smoothing, on average.
+    /// Returns true if the follower is at its ideal position, with smoothing on average, and no
+    /// shift is in progress.
     #[must_use]
     pub const fn engaged(&self) -> bool {
-        self.engaged
+        self.engaged && self.shift.is_none()
     }
 
     /// Returns the present offset in the follower's units.
     #[must_use]
-    pub const fn offset(&self) -> f64 {
-        self.offset
+    pub fn offset(&self) -> f64 {
+        self.offset + self.shifted().position
     }
 
-    /// Shifts the follower by `distance` against its master. The follower is engaged again when it
-    /// has caught up. Ignores a distance that leads to no valid offset. RT: O(1).
-    pub fn shift(&mut self, distance: f64) {
-        if position("gear offset", self.offset + distance).is_ok() {
-            self.offset += distance;
-            self.ideal += distance;
-            self.engaged = false;
+    /// Shifts the follower by `distance` against its master. A second shift adds to one in progress.
+    /// The shift is jerk-limited. It uses half of the acceleration limit, and the velocity that the
+    /// master leaves at its start. If the limits do not suffice later, the follower catches up. RT:
+    /// O(1).
+    ///
+    /// # Errors
+    /// Fails if the distance leads to no valid offset; nothing changes.
+    pub fn shift(&mut self, distance: f64, dt_s: f64) -> Result<(), SetpointError> {
+        let target = match &self.shift {
+            Some((plan, _)) => match plan.request().goal {
+                Goal::Position(target) => target,
+                Goal::Velocity(_) => 0.0,
+            },
+            None => 0.0,
+        } + distance;
+        position("gear offset", self.offset + target)?;
+        let done = self.shifted();
+        let limits = self.limits;
+        let follows = (self.ratio * self.master.velocity).abs();
+        let request = MoveRequest::within(
+            Goal::Position(target),
+            MotionLimits {
+                velocity: (limits.velocity - follows).max(limits.velocity * LEAST),
+                acceleration: limits.acceleration * CATCHING_UP,
+                jerk: limits.jerk,
+            },
+        );
+        let plan = match &self.shift {
+            Some((plan, _)) => plan.redirect(request, done, dt_s),
+            None => JerkLimited::new(request, done, dt_s),
+        }?;
+        self.shift = Some((plan, done));
+        Ok(())
+    }
+
+    /// Sets the override of shifts. 0 holds a shift on its way. RT: O(1).
+    pub fn set_rate(&mut self, rate: f64, dt_s: f64) {
+        if let Some((plan, done)) = &mut self.shift {
+            plan.set_rate(rate, *done, dt_s);
+        }
+    }
+
+    /// Returns the motion of the shift in progress.
+    fn shifted(&self) -> Motion {
+        self.shift
+            .as_ref()
+            .map_or(Motion::default(), |(_, done)| *done)
+    }
+
+    fn advance_shift(&mut self, dt_s: f64) {
+        let Some((plan, done)) = &mut self.shift else {
+            return;
+        };
+        *done = plan.advance(*done, dt_s);
+        if plan.finished(*done) {
+            self.offset += done.position;
+            self.shift = None;
         }
     }
 
@@ -142,7 +202,8 @@ impl Gear {
         if master.check().is_ok() {
             self.track(master, dt_s);
         }
-        let ideal = self.ratio * self.master.position + self.offset;
+        self.advance_shift(dt_s);
+        let ideal = self.ratio * self.master.position + self.offset();
         if position("gear position", ideal).is_ok() {
             self.ideal = ideal;
         }
@@ -154,7 +215,8 @@ impl Gear {
         let wanted = if self.smoothing_s > 0.0 {
             // The remaining noise is averaged and not followed.
             let closing = closing.min(left.abs() / self.smoothing_s);
-            self.ratio * self.master.velocity + closing.copysign(left)
+            let follows = self.ratio * self.master.velocity + self.shifted().velocity;
+            follows + closing.copysign(left)
         } else {
             let velocity = (self.ideal - before) / dt_s;
             // Exactly at the ideal position, with a velocity that keeps it there.
@@ -189,7 +251,8 @@ impl Gear {
         // A master that accelerates with the follower's limit is ahead by half of this distance.
         // The smoothed velocity lags by twice the smoothing time.
         let near = self.behind.abs() <= 4.0 * limits.acceleration * self.smoothing_s.powi(2);
-        let relative = (self.ratio * self.master.velocity - next.velocity).abs();
+        let follows = self.ratio * self.master.velocity + self.shifted().velocity;
+        let relative = (follows - next.velocity).abs();
         near && (was_engaged || relative <= limits.acceleration * self.smoothing_s)
     }
 

@@ -216,7 +216,7 @@ proptest! {
     fn gear_keeps_the_limits(
         ratio in prop_oneof![-3.0..-0.1f64, 0.1..3.0f64], absolute in prop::option::of(-30.0..30.0f64), ranged in any::<bool>(),
         smoothing_s in prop::sample::select(vec![0.0, 0.01]),
-        moves in prop::collection::vec((-15.0..15.0f64, 0u32..400, prop::option::weighted(0.1, -5.0..5.0f64)), 1..8),
+        moves in prop::collection::vec((-15.0..15.0f64, 0u32..400, prop::option::weighted(0.1, -5.0..5.0f64), prop::option::weighted(0.3, -5.0..5.0f64)), 1..8),
         velocity in -150.0..150.0f64,
     ) {
         let range = ranged.then_some([-60.0, 60.0]);
@@ -226,8 +226,11 @@ proptest! {
         let start = Motion { velocity, ..Motion::at(5.0) };
         let mut gear = Gear::new(GearConfig { range, smoothing_s, ..config(ratio, engage) }, master, start).unwrap();
         let mut sequence = Sequence::from(start, LIMITS, DT);
-        for (target, cycles, jump) in moves.into_iter().chain([(1.0, 6000, None)]) {
+        for (target, cycles, jump, shift) in moves.into_iter().chain([(1.0, 6000, None, None)]) {
             master.position += jump.unwrap_or(0.0);
+            if let Some(distance) = shift {
+                gear.shift(distance, DT).unwrap();
+            }
             source = source.redirect(MoveRequest::within(Goal::Position(target), LIMITS), master, DT).unwrap();
             for _ in 0..cycles {
                 master = source.advance(master, DT);
@@ -246,14 +249,45 @@ proptest! {
         }
     }
 
+    /// Shifts of a follower of a master at constant velocity: the jerk is bounded, the follower
+    /// stays engaged, and the offset is exact.
+    #[test]
+    fn shifts_are_jerk_limited(
+        velocity in -60.0..60.0f64, shifts in prop::collection::vec((-20.0..20.0f64, 1u32..400), 1..6),
+    ) {
+        let master = |cycle: u32| Motion { velocity, ..Motion::at(velocity * f64::from(cycle) * DT) };
+        let mut gear = Gear::new(config(1.0, GearInMode::Here), master(0), master(0)).unwrap();
+        let mut motion = master(0);
+        let (mut cycle, mut total) = (0, 0.0);
+        for (distance, cycles) in shifts.into_iter().chain([(1.0, 6000)]) {
+            gear.shift(distance, DT).unwrap();
+            total += distance;
+            for _ in 0..cycles {
+                cycle += 1;
+                let next = gear.advance(master(cycle), motion, DT);
+                let jerk = (next.acceleration - motion.acceleration) / DT;
+                prop_assert!(next.velocity.abs() <= LIMITS.velocity * (1.0 + 1e-9));
+                prop_assert!(next.acceleration.abs() <= LIMITS.acceleration * 0.5 * (1.0 + 1e-6));
+                // The rounding of positions.
+                prop_assert!(jerk.abs() <= LIMITS.jerk * (1.0 + 1e-6) + 1e-3, "{}", jerk);
+                motion = next;
+            }
+        }
+        prop_assert!(gear.engaged());
+        prop_assert_eq!(gear.lag_cycles(), 0);
+        prop_assert!((gear.offset() - total).abs() < 1e-9);
+        prop_assert!((motion.position - master(cycle).position - total).abs() < 1e-9);
+    }
+
     #[test]
     fn gear_stays_finite_with_any_number(
-        ratio: f64, offset: f64, smoothing_s in 0.0..1.0f64,
+        ratio: f64, offset: f64, distance: f64, smoothing_s in 0.0..1.0f64,
         cycles in prop::collection::vec((any::<f64>(), any::<f64>(), any::<f64>()), 1..20),
     ) {
         let config = GearConfig { smoothing_s, ..config(ratio, GearInMode::At { offset }) };
         if let Ok(mut gear) = Gear::new(config, Motion::at(0.0), Motion::at(0.0)) {
             let mut motion = Motion::at(0.0);
+            let _ = gear.shift(distance, DT);
             for (position, velocity, dt) in cycles {
                 let master = Motion { position, velocity, acceleration: 0.0 };
                 motion = gear.advance(master, motion, dt.abs().min(0.1));

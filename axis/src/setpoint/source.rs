@@ -46,6 +46,25 @@ impl Source {
             Self::Wave(wave) => wave.limits().acceleration,
         }
     }
+
+    /// Advances one cycle at a rate, as an override does. RT: O(1).
+    #[must_use]
+    pub fn advance_at(&mut self, rate: f64, motion: Motion, dt_s: f64) -> Motion {
+        match self {
+            Self::JerkLimited(source) => source.set_rate(rate, motion, dt_s),
+            Self::Line(along) => along.set_rate(rate, dt_s),
+            Self::Wave(wave) => wave.set_rate(rate),
+            Self::Trapezoid(trapezoid) => {
+                let slower = Trapezoid {
+                    velocity: trapezoid.velocity * rate,
+                    ..*trapezoid
+                };
+                return slower.advance(motion, dt_s);
+            }
+            Self::Hold(_) => {}
+        }
+        self.advance(motion, dt_s)
+    }
 }
 
 impl Setpoint for Source {

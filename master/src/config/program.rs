@@ -116,6 +116,10 @@ pub enum Action {
     Phase {
         targets: Vec<(AxisIndex, f64)>,
     },
+    /// Add moves to the motions of the axes.
+    Superimpose {
+        targets: Vec<(AxisIndex, f64)>,
+    },
     /// Reach the velocities and keep moving.
     Velocity {
         targets: Vec<(AxisIndex, f64)>,
@@ -217,6 +221,7 @@ impl Action {
             | Self::Line { targets, .. }
             | Self::Velocity { targets, .. }
             | Self::Phase { targets }
+            | Self::Superimpose { targets }
             | Self::Torque { targets, .. } => targets.iter().map(|&(axis, _)| axis).collect(),
             Self::Table { tables, .. } => tables.iter().map(|&(axis, _)| axis).collect(),
             Self::Mode { targets } => targets.iter().map(|&(axis, _)| axis).collect(),

@@ -339,6 +339,9 @@ impl ProgramChecker<'_> {
             RawAction::Phase(targets) => Action::Phase {
                 targets: self.targets(targets, TargetKind::Way, p)?,
             },
+            RawAction::Superimpose(targets) => Action::Superimpose {
+                targets: self.targets(targets, TargetKind::Shift, p)?,
+            },
             RawAction::Velocity(targets) => {
                 let at = ramp.place();
                 let ramp = self.fraction(&ramp, NumberPlace::Ramp, p);

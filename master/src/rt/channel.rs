@@ -44,6 +44,8 @@ pub enum RtCommand {
     Shift {
         axis: AxisIndex,
         distance: f64,
+        /// Adds the distance to any motion instead.
+        superimpose: bool,
     },
     /// Couples the halves of a gantry, or decouples them.
     Couple {

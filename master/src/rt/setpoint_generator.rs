@@ -7,10 +7,10 @@
 
 use ecaxis_axis::group::LinePath;
 use ecaxis_axis::setpoint::{
-    Cam, Gear, GearConfig, JerkLimited, Motion, Playback, PositionWave, RateCourse, Setpoint,
-    SetpointError, Table,
+    self, Cam, Gear, GearConfig, GearInMode, Goal, JerkLimited, Motion, Playback, PositionWave,
+    RateCourse, Setpoint, SetpointError, Table,
 };
-use ecaxis_axis::{Axis, AxisStatus, CommandError, HomingStatus};
+use ecaxis_axis::{Axis, AxisStatus, Command, CommandError, HomingStatus};
 use ecaxis_ecat::index::AxisIndex;
 
 use super::overrides::Rates;
@@ -61,12 +61,11 @@ impl CamRef {
 /// The source that an axis follows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Source {
-    Line {
-        along: LinePath,
-        first: AxisIndex,
+    /// A source that needs only the motion of the axis. `line`: the first axis of its line.
+    Single {
+        source: setpoint::Source,
+        line: Option<AxisIndex>,
     },
-    Move(JerkLimited),
-    Wave(PositionWave),
     Table {
         table: usize,
         playback: Playback,
@@ -77,6 +76,15 @@ enum Source {
         cam: Option<CamRef>,
         gear: Gear,
     },
+}
+
+/// A move on top of another motion.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Superimposed {
+    /// Follows the motion with ratio 1, shifted by the move.
+    gear: Gear,
+    /// The motion without the move.
+    below: Motion,
 }
 
 /// Smaller differences between two velocities are rounding; a stop by lost frames exceeds this.
@@ -124,10 +132,19 @@ pub enum GeneratorState {
     Failed(GeneratorError),
 }
 
+impl GeneratorState {
+    /// True while the axis follows a source.
+    #[must_use]
+    pub const fn runs(self) -> bool {
+        matches!(self, Self::Running | Self::Engaged)
+    }
+}
+
 /// The set-point generator of one axis.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SetpointGenerator {
     source: Option<Source>,
+    superimposed: Option<Superimposed>,
     state: GeneratorState,
     /// The last motion that the source gave.
     given: Option<Motion>,
@@ -194,10 +211,19 @@ impl SetpointGenerator {
             return;
         }
         let source = match start {
-            GeneratorRequest::Line { along, first } => Ok(Source::Line { along, first }),
+            GeneratorRequest::Line { along, first } => Ok(Source::Single {
+                source: setpoint::Source::Line(along),
+                line: Some(first),
+            }),
             // From rest, slower moves of the same duration still arrive together.
-            GeneratorRequest::Move(planned) => Ok(Source::Move(planned.slowed(rate))),
-            GeneratorRequest::Wave(wave) => Ok(Source::Wave(wave)),
+            GeneratorRequest::Move(planned) => Ok(Source::Single {
+                source: setpoint::Source::JerkLimited(planned.slowed(rate)),
+                line: None,
+            }),
+            GeneratorRequest::Wave(wave) => Ok(Source::Single {
+                source: setpoint::Source::Wave(wave),
+                line: None,
+            }),
             GeneratorRequest::Table { table, playback } => Ok(Source::Table { table, playback }),
             GeneratorRequest::Gear {
                 master: index,
@@ -213,6 +239,7 @@ impl SetpointGenerator {
                 }
             }),
         };
+        self.superimposed = None;
         self.given = match &source {
             Ok(Source::Table { playback, .. }) => Some(playback.motion()),
             _ => None,
@@ -230,7 +257,7 @@ impl SetpointGenerator {
     #[must_use]
     pub fn line(&self) -> Option<AxisIndex> {
         match self.source {
-            Some(Source::Line { first, .. }) => Some(first),
+            Some(Source::Single { line, .. }) => line,
             _ => None,
         }
     }
@@ -273,11 +300,13 @@ impl SetpointGenerator {
     }
 
     fn fail(&mut self, error: GeneratorError) {
-        (self.source, self.state) = (None, GeneratorState::Failed(error));
+        (self.source, self.superimposed) = (None, None);
+        self.state = GeneratorState::Failed(error);
     }
 
     /// Ends the source because the axis received another command.
     pub fn end(&mut self) {
+        self.superimposed = None;
         if self.source.take().is_some() {
             self.state = GeneratorState::None;
         }
@@ -300,14 +329,78 @@ impl SetpointGenerator {
         }
     }
 
-    /// Shifts a follower against its master. Returns false if the axis follows none. RT: O(1).
-    pub(super) fn shift(&mut self, distance: f64) -> bool {
+    /// Shifts a follower against its master. RT: O(1).
+    ///
+    /// # Errors
+    /// Fails if the axis follows none, or the distance is invalid.
+    pub(super) fn shift(&mut self, distance: f64, dt_s: f64) -> Result<(), CommandError> {
         let Some(Source::Gear { gear, .. }) = &mut self.source else {
-            return false;
+            return Err(CommandError::NotFollowing);
         };
-        gear.shift(distance);
+        gear.shift(distance, dt_s)?;
         (self.state, self.slipping_s) = (GeneratorState::Running, 0.0);
-        true
+        Ok(())
+    }
+
+    /// Adds a move to any motion of the axis. RT: O(1).
+    ///
+    /// # Errors
+    /// Fails if the axis commands no position, may not move, or the distance is invalid.
+    pub(super) fn superimpose(
+        &mut self,
+        axis: &Axis,
+        distance: f64,
+        dt_s: f64,
+    ) -> Result<(), CommandError> {
+        if self.master().is_some() {
+            return self.shift(distance, dt_s);
+        }
+        let source = match self.source {
+            Some(source) => source,
+            None => Source::Single {
+                source: axis.source()?,
+                line: None,
+            },
+        };
+        let mut superimposed = match self.superimposed {
+            Some(superimposed) => superimposed,
+            None => {
+                let limits = &axis.config().limits;
+                let config = GearConfig {
+                    ratio: 1.0,
+                    engage: GearInMode::Here,
+                    smoothing_s: 0.0,
+                    limits: limits.motion(),
+                    range: limits.position,
+                };
+                let below = commanded(&axis.status());
+                let gear = Gear::new(config, below, below)?;
+                Superimposed { gear, below }
+            }
+        };
+        superimposed.gear.shift(distance, dt_s)?;
+        if self.source.is_none() {
+            self.given = None;
+        }
+        (self.source, self.superimposed) = (Some(source), Some(superimposed));
+        self.state = GeneratorState::Running;
+        Ok(())
+    }
+
+    /// Returns velocity and acceleration with which the axis continues by itself after a
+    /// superimposed move.
+    fn continues_at(&self) -> Option<[f64; 2]> {
+        let over = self.superimposed?.gear.engaged();
+        match self.source? {
+            Source::Single {
+                source: setpoint::Source::JerkLimited(plan),
+                ..
+            } if over => match plan.request().goal {
+                Goal::Velocity(velocity) => Some([velocity, plan.request().limits.acceleration]),
+                Goal::Position(_) => None,
+            },
+            _ => None,
+        }
     }
 
     /// Returns where the source left the axis, if it is still there. The axis computes its velocity
@@ -341,32 +434,40 @@ impl SetpointGenerator {
             self.fail(GeneratorError::NoMaster);
             return true;
         }
+        if let Some([velocity, acceleration]) = self.continues_at() {
+            self.end();
+            let ramp = (acceleration / axis.config().limits.acceleration).min(1.0);
+            if let Err(reason) = axis.command(Command::Velocity { velocity, ramp }) {
+                self.fail(GeneratorError::Refused(reason));
+                return true;
+            }
+            return false;
+        }
         let before = self.resume_motion(axis, dt_s);
-        let mut interrupted = false;
-        let (next, finished, state) = match &mut source {
-            Source::Line { along, .. } => {
-                along.set_rate(rates.line, dt_s);
-                let next = along.advance(before, dt_s);
-                (next, along.finished(next), GeneratorState::Running)
-            }
-            Source::Move(planned) => {
-                planned.set_rate(rates.own.min(1.0), before, dt_s);
-                let next = planned.advance(before, dt_s);
-                (next, planned.finished(next), GeneratorState::Running)
-            }
-            Source::Wave(wave) => {
-                wave.set_rate(rates.own);
-                let next = wave.advance(before, dt_s);
-                interrupted = wave.interrupted();
-                (next, wave.finished(next), GeneratorState::Running)
+        let disturbed = self.given.is_some_and(|given| given != before);
+        let mut superimposed = self.superimposed;
+        let mut interrupted = superimposed.is_some() && disturbed;
+        let below = superimposed.map_or(before, |superimposed| superimposed.below);
+        let (mut next, mut finished, mut state) = match &mut source {
+            Source::Single { source, line } => {
+                let rate = match line {
+                    Some(_) => rates.line,
+                    None => rates.own.min(1.0),
+                };
+                let next = source.advance_at(rate, below, dt_s);
+                if let setpoint::Source::Wave(wave) = source {
+                    interrupted |= wave.interrupted();
+                }
+                (next, source.finished(next), GeneratorState::Running)
             }
             Source::Table { playback, .. } => {
-                interrupted = self.given != Some(before);
+                interrupted |= disturbed;
                 let position = playback.motion().position;
-                let next = before.then(position, (position - before.position) / dt_s, dt_s);
+                let next = below.then(position, (position - below.position) / dt_s, dt_s);
                 (next, playback.finished(next), GeneratorState::Running)
             }
             Source::Gear { gear, .. } => {
+                gear.set_rate(rates.own.min(1.0), dt_s);
                 let next = gear.advance(master.unwrap_or_default(), before, dt_s);
                 let state = if gear.engaged() {
                     GeneratorState::Engaged
@@ -383,6 +484,15 @@ impl SetpointGenerator {
                 (next, false, state)
             }
         };
+        if let Some(Superimposed { gear, below }) = &mut superimposed {
+            *below = next;
+            gear.set_rate(rates.own.min(1.0), dt_s);
+            next = gear.advance(next, before, dt_s);
+            finished &= gear.engaged() && next.velocity == 0.0;
+            if gear.engaged() {
+                state = GeneratorState::Engaged;
+            }
+        }
         let timeout = match source {
             Source::Gear { actual: true, .. } => SLIP_ACTUAL_S,
             _ => SLIP_S,
@@ -396,9 +506,13 @@ impl SetpointGenerator {
             return true;
         }
         match axis.set_point(next.position) {
-            Ok(()) if finished => (self.source, self.state) = (None, GeneratorState::Finished),
+            Ok(()) if finished => {
+                (self.source, self.superimposed) = (None, None);
+                self.state = GeneratorState::Finished;
+            }
             Ok(()) => {
-                (self.source, self.state) = (Some(source), state);
+                (self.source, self.superimposed) = (Some(source), superimposed);
+                self.state = state;
                 self.given = Some(next);
             }
             // The axis waits, and so does its source. Only the time of a table passes.

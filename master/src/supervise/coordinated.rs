@@ -211,16 +211,20 @@ impl Turn<'_, '_> {
             .await
     }
 
-    /// Shifts followers against their masters. Waits until they are engaged again.
+    /// Shifts followers against their masters, or axes on top of any motion. Waits until the shift
+    /// is done.
     pub(super) async fn shift(
         &mut self,
         step: &Step,
         start: Nanos,
         targets: &[(AxisIndex, f64)],
+        superimpose: bool,
     ) -> Result<(), Error> {
-        let commands = targets
-            .iter()
-            .map(|&(axis, distance)| RtCommand::Shift { axis, distance });
+        let commands = targets.iter().map(|&(axis, distance)| RtCommand::Shift {
+            axis,
+            distance,
+            superimpose,
+        });
         let commands: Vec<_> = commands.collect();
         let axes: Vec<_> = targets.iter().map(|&(axis, _)| axis).collect();
         self.send_and_follow(step, start, &commands, &axes, GeneratorState::Engaged)
@@ -246,6 +250,8 @@ impl Turn<'_, '_> {
                     GeneratorState::Failed(error) => return Err(this.refusal(step, axis, &error)),
                     // Another command has taken over the axis.
                     GeneratorState::None => {}
+                    // A shifted motion may end together with its shift.
+                    GeneratorState::Finished if until == GeneratorState::Engaged => {}
                     state => done &= state == until,
                 }
                 if until == GeneratorState::Finished && !snapshot.axes[axis].in_target {

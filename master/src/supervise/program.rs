@@ -366,7 +366,8 @@ impl Turn<'_, '_> {
                 self.gear(step, start, [*axis, *master], (*actual, cam), config)
                     .await
             }
-            Action::Phase { targets } => self.shift(step, start, targets).await,
+            Action::Phase { targets } => self.shift(step, start, targets, false).await,
+            Action::Superimpose { targets } => self.shift(step, start, targets, true).await,
             Action::Velocity { targets, ramp } => {
                 self.move_and_wait(step, start, TargetKind::Velocity, targets, |velocity| {
                     Command::Velocity {

@@ -130,6 +130,9 @@ impl Machine {
                     .map_or_else(String::new, |cam| format!(", by the cam {}", cam.name)),
             ),
             Action::Phase { targets } => format!("shift {}", self.targets(targets, "by", "")),
+            Action::Superimpose { targets } => {
+                format!("superimpose {}", self.targets(targets, "by", ""))
+            }
             Action::Velocity { targets, ramp } => format!(
                 "turn {} at {} % of the acceleration limit",
                 self.targets(targets, "→", "/s"),

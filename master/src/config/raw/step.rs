@@ -60,6 +60,7 @@ pub(crate) enum RawAction {
     Path(Spanned<String>),
     Gear(Spanned<String>, RawGear),
     Phase(Named<RawNumber>),
+    Superimpose(Named<RawNumber>),
     Velocity(Named<RawNumber>),
     Torque {
         targets: Named<RawNumber>,
@@ -168,7 +169,7 @@ table! { "a probe",
 /// The verbs, each with an example and the keys that go with it. The key of a step that is a verb
 /// defines the action.
 #[rustfmt::skip] // one row per verb
-const VERBS: [(&str, &str, &[&str]); 34] = [
+const VERBS: [(&str, &str, &[&str]); 35] = [
     ("enable", "enable = [\"x\"]", &[]),
     ("disable", "disable = true", &[]),
     ("reset", "reset = [\"x\"]", &[]),
@@ -187,6 +188,7 @@ const VERBS: [(&str, &str, &[&str]); 34] = [
     ("path", "path = \"outline\"", &["speed", "ramp"]),
     ("gear", "gear = { y = { to = \"x\", ratio = 2.0 } }", &[]),
     ("phase", "phase = { y = 5.0 }", &[]),
+    ("superimpose", "superimpose = { x = 0.5 }", &[]),
     ("velocity", "velocity = { v = 100.0 }", &["ramp"]),
     ("torque", "torque = { t = 10.0 }", &["ramp"]),
     ("mode", "mode = { x = \"csv\" }", &[]),
@@ -351,6 +353,7 @@ impl<'d> Step<'_, 'd> {
                 RawAction::Gear(axis, gear)
             }
             "phase" => RawAction::Phase(self.named(value, p)?),
+            "superimpose" => RawAction::Superimpose(self.named(value, p)?),
             "velocity" => RawAction::Velocity(self.named(value, p)?),
             "torque" => RawAction::Torque {
                 ramp: self.table.read("ramp", p),

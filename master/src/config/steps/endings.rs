@@ -174,8 +174,15 @@ fn assigned(steps: &[Step]) -> BTreeSet<usize> {
 /// Collects the axes that steps command, each with the first of its steps.
 fn moving<'s>(steps: &'s [Step], all: &mut BTreeMap<AxisIndex, &'s Step>) {
     for step in steps {
+        // These act on a motion that another branch may command.
+        let on_top = matches!(
+            step.action,
+            Action::Phase { .. } | Action::Superimpose { .. }
+        );
         for axis in step.action.commanded() {
-            all.entry(axis).or_insert(step);
+            if !on_top {
+                all.entry(axis).or_insert(step);
+            }
         }
         for steps in step.action.lists() {
             moving(steps, all);

@@ -297,6 +297,7 @@ impl ProgramState<'_, '_, '_, '_> {
             | Action::Set { .. }
             | Action::Couple { .. }
             | Action::Phase { .. }
+            | Action::Superimpose { .. }
             | Action::Override(_)
             | Action::Assign { .. }
             | Action::Message { .. }

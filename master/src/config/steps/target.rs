@@ -80,6 +80,8 @@ pub(super) enum TargetKind {
     SetPoint,
     /// A distance from the present position.
     Way,
+    /// A distance from the motion of the axis.
+    Shift,
     Velocity,
     Torque,
 }
@@ -93,6 +95,7 @@ impl TargetKind {
         match self {
             Self::Position | Self::SetPoint => "move",
             Self::Way => "move_by",
+            Self::Shift => "superimpose",
             Self::Velocity => "velocity",
             Self::Torque => "torque",
         }
@@ -109,7 +112,7 @@ impl TargetKind {
         };
         match self {
             Self::Position | Self::Way => position,
-            Self::SetPoint => position && mode != Mode::Pp,
+            Self::SetPoint | Self::Shift => position && mode != Mode::Pp,
             Self::Velocity => position && mode != Mode::Pp || matches!(mode, Mode::Csv | Mode::Pv),
             Self::Torque => mode == Mode::Cst,
         }
@@ -146,7 +149,9 @@ pub(super) fn within(
     let (low, high, unit) = match what {
         TargetKind::Position | TargetKind::SetPoint => (range[0], range[1], unit.clone()),
         // The end position is only known at run time, but the distance cannot exceed the range.
-        TargetKind::Way => (range[0] - range[1], range[1] - range[0], unit.clone()),
+        TargetKind::Way | TargetKind::Shift => {
+            (range[0] - range[1], range[1] - range[0], unit.clone())
+        }
         TargetKind::Velocity => (-limits.velocity, limits.velocity, format!("{unit}/s")),
         TargetKind::Torque => {
             let limit = axis.torque.shown(limits.torque);
@@ -164,7 +169,7 @@ pub(super) fn within(
         return true;
     }
     let message = match what {
-        TargetKind::Way => format!(
+        TargetKind::Way | TargetKind::Shift => format!(
             "a way of {n} {unit} is longer than the axis' range, {} to {} {unit}",
             range[0], range[1]
         ),

@@ -59,7 +59,11 @@ impl Engine {
                     signal.set(self.exchange.outputs_mut(), value);
                 }
             }
-            RtCommand::Shift { axis, distance } => self.shift(axis, distance),
+            RtCommand::Shift {
+                axis,
+                distance,
+                superimpose,
+            } => self.shift(axis, distance, superimpose),
             RtCommand::Couple { gantry, coupled } => self.couple(gantry, coupled),
             RtCommand::Override { group, factor } => self.overrides.set_factor(group, factor),
             RtCommand::Hold { group, held } => self.overrides.set_hold(group, held),
@@ -84,13 +88,17 @@ impl Engine {
         }
     }
 
-    fn shift(&mut self, axis: AxisIndex, distance: f64) {
+    fn shift(&mut self, axis: AxisIndex, distance: f64, superimpose: bool) {
         let Some(slot) = self.axes.get_mut(axis) else {
             return;
         };
-        if !slot.generator.shift(distance) {
+        let dt_s = slot.dt_s(self.config.cycle_ns);
+        let done = match superimpose {
+            true => slot.generator.superimpose(&slot.axis, distance, dt_s),
+            false => slot.generator.shift(distance, dt_s),
+        };
+        if let Err(reason) = done {
             let cycle = self.stats.counters.cycles;
-            let reason = CommandError::NotFollowing;
             self.report(Event::Refused {
                 cycle,
                 axis,

@@ -99,11 +99,16 @@ impl Turn<'_, '_> {
         let mut settling = Settling::default();
         self.wait_until(step, start, |this, snapshot| {
             let status = |axis: AxisIndex| &snapshot.axes[axis];
-            let late = targets.iter().find(|(axis, _)| !status(*axis).in_target);
+            // A superimposed move lets the axis follow a generator.
+            let follows = |axis: AxisIndex| snapshot.generators[axis].runs();
+            let arrived = |axis: AxisIndex| status(axis).in_target && !follows(axis);
+            let late = targets.iter().find(|(axis, _)| !arrived(*axis));
             let Some(&(axis, target)) = late else {
                 return Ok(true);
             };
-            let on_its_way = |axis: AxisIndex| status(axis).moving && !status(axis).held_by_range;
+            let on_its_way = |axis: AxisIndex| {
+                follows(axis) || status(axis).moving && !status(axis).held_by_range
+            };
             if targets.iter().any(|&(axis, _)| on_its_way(axis)) {
                 settling = Settling::default();
                 return Ok(false);

@@ -66,9 +66,8 @@ fn argument(verb: &str) -> Json {
             String::schema(),
             json!({ "type": "array", "items": { "type": "string" }, "minItems": 1 }),
         ]),
-        "move" | "move_by" | "line" | "line_by" | "phase" | "velocity" | "torque" => {
-            named(RawNumber::<f64>::schema())
-        }
+        "move" | "move_by" | "line" | "line_by" | "phase" | "superimpose" | "velocity"
+        | "torque" => named(RawNumber::<f64>::schema()),
         "sine" | "square" => only(RawWave::schema()),
         "probe" => {
             let mut probe = RawProbe::schema();
