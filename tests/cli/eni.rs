@@ -273,6 +273,51 @@ fn compare_takes_an_eni_as_the_expected_bus() {
     compare(&["--sim", "configs/demo.toml", "--apply"]).fails(2, &["is an ENI file", "eni import"]);
 }
 
+/// `scan --write` takes an ENI as the expected bus and writes its machine.
+#[test]
+fn scan_writes_the_machine_of_an_eni() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let (bus, machine) = (path("bus.xml"), path("machine.toml"));
+    eni(&["configs/demo.toml", "-o", &bus]).exits(0);
+    let scan = |sim: &str, more: &[&str]| {
+        let arguments = [
+            "scan",
+            "--sim",
+            sim,
+            "--write",
+            &machine,
+            "--esi",
+            "configs/esi",
+        ];
+        program::run([&arguments, more].concat())
+    };
+    scan("configs/copy.toml", &["--eni", &bus])
+        .fails(1, &["the bus is not as in", "export the file again"]);
+    assert!(!folder.path().join("machine.toml").exists());
+    scan("configs/demo.toml", &["--eni", &bus]).exits(0);
+    program::run(["run", &machine, "--sim", "--virtual", "--for", "200ms"]).exits(0);
+    scan("configs/demo.toml", &["--eni", &bus]).fails(2, &["is there already"]);
+    scan("configs/demo.toml", &["--force", "--eni", &machine]).fails(2, &["is not an ENI file"]);
+}
+
+/// The machine of a foreign ENI runs on the simulated bus.
+#[test]
+fn foreign_eni_runs_on_the_simulated_bus() {
+    let (Some(bus), Some(esi)) = (
+        fixture("eni/CherryECAT_CIA402_ENI.xml"),
+        fixture("esi/hpmicro/ECAT_CIA402.xml"),
+    ) else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let machine = folder.path().join("machine.toml");
+    let machine = machine.to_str().unwrap();
+    let [bus, esi] = [&bus, &esi].map(|path| path.to_str().unwrap());
+    eni(&["import", bus, "--esi", esi, "-o", machine]).exits(0);
+    program::run(["run", machine, "--sim", "--virtual", "--for", "500ms"]).exits(0);
+}
+
 /// Help texts and the list of commands match the reviewed snapshots.
 #[test]
 fn eni_output_matches_the_snapshots() {

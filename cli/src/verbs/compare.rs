@@ -162,6 +162,18 @@ fn load(file: &Path) -> Result<Machine, Failure> {
     config::load(file).map_err(|e| hints::config(file, &e))
 }
 
+/// Fails with all differences if the bus is not as an ENI file says.
+pub(crate) fn require(machine: &Machine, scan: &Scan, eni: &Path) -> Result<(), Failure> {
+    let comparison = compare::compare(machine, scan);
+    if comparison.differences.is_empty() {
+        return Ok(());
+    }
+    for difference in &comparison.differences {
+        note(&difference.display(machine, scan).to_string());
+    }
+    Err(differs(eni, comparison.differences.len(), true))
+}
+
 fn differs(file: &Path, count: usize, is_eni: bool) -> Failure {
     let (file, count) = (file.display(), pluralize(count, "difference"));
     let message = format!("the bus is not as in {file}: {count}");

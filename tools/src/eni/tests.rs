@@ -22,7 +22,7 @@ fn import_with(bytes: &[u8], esi: &Path) -> Import {
     };
     let library = library.expect("a library");
     let path = root().join("configs/imported.toml");
-    import(bytes, Some(&library), &path).unwrap_or_else(|e| panic!("{e}"))
+    import(bytes, Some(&library), &path, "sim").unwrap_or_else(|e| panic!("{e}"))
 }
 
 /// Object, first bit and length.
@@ -168,7 +168,7 @@ fn eni_without_esi_names_what_is_missing() {
         return;
     };
     let bytes = std::fs::read(eni).expect("read");
-    let back = import(&bytes, None, Path::new("machine.toml")).expect("an ENI");
+    let back = import(&bytes, None, Path::new("machine.toml"), "sim").expect("an ENI");
     assert_eq!(back.without_esi, 2);
     assert!(back.machine.is_err());
     assert_eq!(back.unsent.len(), 5, "{:?}", back.unsent);
@@ -260,7 +260,7 @@ fn damaged_files_have_a_position_and_a_remedy() {
         ),
     ] {
         let head: String = text.chars().take(60).collect();
-        let error = import(text.as_bytes(), None, Path::new("m.toml")).expect_err(&head);
+        let error = import(text.as_bytes(), None, Path::new("m.toml"), "sim").expect_err(&head);
         assert!(error.message.contains(message), "{head}: {error}");
         let found = (error.position.line, error.position.column);
         assert_eq!(found, position, "{head}: {error}");
@@ -293,7 +293,7 @@ proptest! {
             }
         }
         let path = root().join("configs/imported.toml");
-        match import(&bytes, Some(&LIBRARY), &path) {
+        match import(&bytes, Some(&LIBRARY), &path, "sim") {
             Ok(back) => prop_assert!(back.text.len() < 100_000),
             Err(error) => prop_assert!(error.position.line > 0),
         }

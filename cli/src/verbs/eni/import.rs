@@ -64,7 +64,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
         None => find_library([args.output.as_deref(), Some(&*args.bus)])?,
     };
     let path = args.output.clone().unwrap_or(PathBuf::from("machine.toml"));
-    let imported = eni::import(&bytes, library.as_ref(), &path);
+    let imported = eni::import(&bytes, library.as_ref(), &path, "sim");
     let imported = imported.map_err(|error| refused(&args.bus, &error))?;
     for error in &imported.unreadable {
         note(&format!("warning: {error}"));
@@ -83,6 +83,19 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
 
 /// Returns the machine of an ENI file, or `None` if the file is not XML.
 pub(crate) fn machine_of(path: &Path, esi: Option<&Path>) -> Result<Option<Machine>, Failure> {
+    let near = path.with_file_name("machine.toml");
+    let imported = expected(path, esi, &near, "sim")?;
+    Ok(imported.map(|(machine, _)| machine))
+}
+
+/// Returns the machine of an ENI file as [`eni::import`] does, with the text of its machine file;
+/// `None` if the file is not XML.
+pub(crate) fn expected(
+    path: &Path,
+    esi: Option<&Path>,
+    machine: &Path,
+    nic: &str,
+) -> Result<Option<(Machine, String)>, Failure> {
     let Ok(bytes) = file::read(path, eni::MAX_BYTES) else {
         return Ok(None);
     };
@@ -94,8 +107,7 @@ pub(crate) fn machine_of(path: &Path, esi: Option<&Path>) -> Result<Option<Machi
         Some(esi) => Some(open(esi)?),
         None => find_library([Some(path), None])?,
     };
-    let near = path.with_file_name("machine.toml");
-    let imported = eni::import(&bytes, library.as_ref(), &near);
+    let imported = eni::import(&bytes, library.as_ref(), machine, nic);
     let imported = imported.map_err(|error| refused(path, &error))?;
     let machine = imported.machine.map_err(|error| {
         let message = match imported.without_esi {
@@ -107,7 +119,7 @@ pub(crate) fn machine_of(path: &Path, esi: Option<&Path>) -> Result<Option<Machi
         };
         Failure::new(hints::WRONG, message).hint("name the folder of ESI files with `--esi`")
     })?;
-    Ok(Some(*machine))
+    Ok(Some((*machine, imported.text)))
 }
 
 fn refused(path: &Path, error: &EniError) -> Failure {

@@ -12,7 +12,7 @@ use crate::render::{note, result};
 
 mod import;
 
-pub(crate) use import::machine_of;
+pub(crate) use import::{expected, machine_of};
 
 const EXAMPLES: &str = "\
 Examples:

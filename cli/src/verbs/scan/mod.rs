@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use ecaxis_master::config::{self, Nic};
+use ecaxis_master::config::{self, Machine, Nic};
 use ecaxis_master::esi_library::{self, Library};
 use ecaxis_tools::compare;
 use ecaxis_tools::scan::{self, EsiMatch, MainDeviceEvidence, Scan, esi_match};
@@ -21,6 +21,7 @@ Examples:
   ecaxis scan enp3s0                        list the devices
   ecaxis scan enp3s0 --tree                 draw the topology
   ecaxis scan enp3s0 --write machine.toml   generate a machine file
+  ecaxis scan enp3s0 --write machine.toml --eni bus.xml   from an ENI file
   ecaxis scan --sim configs/demo.toml       the simulated bus of a machine file";
 
 /// Show the devices of a bus: position, identity, state, ports, clocks, mailboxes, and matching ESI
@@ -53,6 +54,9 @@ pub(crate) struct Args {
     /// Write a machine file; implies `--ask`
     #[arg(long, value_name = "FILE", conflicts_with_all = ["json", "tree"])]
     write: Option<PathBuf>,
+    /// With `--write`: the machine of this ENI file, if the bus is as it says
+    #[arg(long, value_name = "FILE", requires = "write")]
+    eni: Option<PathBuf>,
     /// Overwrite the file and the EEPROM images that it names
     #[arg(long, requires = "write")]
     force: bool,
@@ -85,7 +89,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         }
     };
     let nic = bus.nic();
-    let identify = simulated.as_ref().is_some_and(scan::needs_identification);
+    let expected = args.expected(&nic)?;
+    let identify = simulated.as_ref().is_some_and(scan::needs_identification)
+        || matches!(&expected, Some((_, machine, _)) if scan::needs_identification(machine));
     let options = scan::Options {
         ask: args.ask || args.write.is_some(),
         intrude: args.intrude,
@@ -106,6 +112,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             "note: no folder `esi` here: put the vendors' ESI files there, or name it with `--esi`",
         );
     }
+    if let (Some(path), Some((eni, machine, text))) = (&args.write, &expected) {
+        verbs::compare::require(machine, &seen.scan, eni)?;
+        return write::imported(path, text, args.force);
+    }
     if let Some(path) = &args.write {
         return write::machine_file(&seen, path, library.is_some(), args.force);
     }
@@ -115,6 +125,27 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         shown(&text::tree(&seen))
     } else {
         print_page(&text::document(&seen))
+    }
+}
+
+impl Args {
+    /// Returns the ENI file, its machine, and the text of the machine file.
+    fn expected(&self, nic: &Nic) -> Result<Option<(&Path, Machine, String)>, Failure> {
+        let (Some(eni), Some(path)) = (&self.eni, &self.write) else {
+            return Ok(None);
+        };
+        let nic = match nic {
+            Nic::Sim => "sim",
+            Nic::Interface(nic) => nic,
+        };
+        match verbs::eni::expected(eni, self.esi.as_deref(), path, nic)? {
+            Some((machine, text)) => Ok(Some((eni, machine, text))),
+            None => {
+                let message = format!("{} is not an ENI file", eni.display());
+                Err(Failure::new(hints::WRONG, message)
+                    .hint("name the XML file of the configuration tool"))
+            }
+        }
     }
 }
 

@@ -28,6 +28,26 @@ pub(super) fn refuse(path: &Path, force: bool) -> Result<(), Failure> {
     Err(Failure::new(hints::WRONG, message).hint(hint))
 }
 
+/// Writes the machine file of an ENI file.
+pub(super) fn imported(path: &Path, text: &str, force: bool) -> Result<(), Failure> {
+    write_with_schema(path, text, force)?;
+    let file = path.display();
+    result(&format!(
+        "{file}: the machine of the ENI file; the bus is as it says\n\
+         next: add axes, `ecaxis check {file}`; `ecaxis eni import` lists what is not sent\n"
+    ))
+}
+
+fn write_with_schema(path: &Path, text: &str, force: bool) -> Result<(), Failure> {
+    replace(path, starter::with_schema(text).as_bytes())?;
+    // A schema that is there may be of a newer version.
+    let schema = path.with_file_name(SCHEMA);
+    if force || !schema.exists() {
+        replace(&schema, starter::schema().as_bytes())?;
+    }
+    Ok(())
+}
+
 pub(super) fn machine_file(
     seen: &ScanResult,
     path: &Path,
@@ -49,12 +69,7 @@ pub(super) fn machine_file(
     for (image, bytes) in &images {
         replace(image, bytes)?;
     }
-    replace(path, starter::with_schema(&text).as_bytes())?;
-    // A schema that is there may be of a newer version.
-    let schema = path.with_file_name(SCHEMA);
-    if force || !schema.exists() {
-        replace(&schema, starter::schema().as_bytes())?;
-    }
+    write_with_schema(path, &text, force)?;
     let devices = seen.scan.devices.len();
     let axes = text.matches("[device.axis]").count();
     let of_them = if axes == 1 { "an axis" } else { "axes" };

@@ -16,6 +16,7 @@ use ecaxis_ecat::registers;
 use ecaxis_esi::Position;
 use ecaxis_master::config::{self, ConfigError, Machine, duration};
 use ecaxis_master::esi_library::{Library, LoadError};
+use ecaxis_master::text::quoted;
 
 use super::command::{EcatCommand, Payload};
 use super::export::device_commands;
@@ -54,11 +55,17 @@ pub struct Unsent {
 /// The cycle of an ENI without one.
 const DEFAULT_CYCLE_US: u32 = 1000;
 
-/// Reads an ENI. `path`: the machine file, whose folder is the base of its paths.
+/// Reads an ENI. `path`: the machine file, whose folder is the base of its paths. `nic`: the
+/// interface that it names.
 ///
 /// # Errors
 /// Returns the first mistake of the file.
-pub fn import(bytes: &[u8], library: Option<&Library>, path: &Path) -> Result<Import, EniError> {
+pub fn import(
+    bytes: &[u8],
+    library: Option<&Library>,
+    path: &Path,
+    nic: &str,
+) -> Result<Import, EniError> {
     let network = Network::parse(bytes)?;
     let identities: Vec<_> = network.devices.iter().map(|d| Some(d.identity)).collect();
     let (described, unreadable) = match library {
@@ -78,7 +85,7 @@ pub fn import(bytes: &[u8], library: Option<&Library>, path: &Path) -> Result<Im
         })
         .collect();
     let mut unsent: Vec<Unsent> = Vec::new();
-    let mut text = head(&network, cycle_ns);
+    let mut text = head(&network, cycle_ns, nic);
     let folder = path.parent().unwrap_or(Path::new(""));
     for device in &devices {
         text += "\n";
@@ -118,14 +125,18 @@ pub fn import(bytes: &[u8], library: Option<&Library>, path: &Path) -> Result<Im
     })
 }
 
-fn head(network: &Network, cycle_ns: u64) -> String {
+fn head(network: &Network, cycle_ns: u64, nic: &str) -> String {
     let text = format!(
         "# Written by `ecaxis eni import`. Lines with \"{MARK}\" need a check.\n\
          # No device has an axis yet: add `mode` and [device.axis] to the drives.\n\n",
     );
     let mut lines = TomlWriter::default();
     lines.header("[bus]");
-    lines.add("nic", "\"sim\"", "or a network interface, \"enp3s0\"");
+    let comment = match nic {
+        "sim" => "or a network interface, \"enp3s0\"",
+        _ => "",
+    };
+    lines.add("nic", &quoted(nic), comment);
     let cycle = format!("\"{}\"", duration::show(cycle_ns).replace(' ', ""));
     let comment = match network.cycle_us {
         Some(_) => String::new(),
