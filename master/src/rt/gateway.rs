@@ -92,6 +92,8 @@ impl std::fmt::Display for NodeState {
 
 const TOGGLE: u8 = 0x80;
 const COMMAND: u8 = 0x70;
+const EXTENSION: u8 = 0x0f;
+const SET_STATE: u8 = 0x00;
 /// Set NMT state OPERATIONAL, of the gateway itself. It then starts its nodes.
 const START: [u8; 2] = [0x01, 0];
 /// Set NMT state PRE-OPERATIONAL, of all nodes and the gateway.
@@ -280,13 +282,17 @@ impl Gateway {
         match (self.command, self.stage) {
             (_, Stage::Ended) => return,
             (None, _) => self.issue(START, status),
-            (Some([byte, node]), _) if (byte ^ status) & (TOGGLE | COMMAND) == 0 => {
+            (Some([byte, node]), _) if acknowledges(byte, status) => {
                 self.take_answer([byte & COMMAND, node], status);
             }
             (Some(_), Stage::Running) if self.waiting > self.config.timeout_cycles => {
                 self.lose_all();
             }
-            (Some(_), Stage::Ending) if self.waiting > self.config.timeout_cycles => {
+            // The status word may acknowledge the command before: then the gateway has ignored this
+            // one, because its toggle bit is not new.
+            (Some([byte, _]), Stage::Ending)
+                if (byte ^ status) & TOGGLE == 0 || self.waiting > self.config.timeout_cycles =>
+            {
                 self.issue(END, status);
             }
             (Some(_), _) => {}
@@ -305,7 +311,7 @@ impl Gateway {
 
     /// Takes an acknowledged command and issues the next one.
     fn take_answer(&mut self, [command, of]: [u8; 2], status: u8) {
-        let code = status & 0x0f;
+        let code = status & EXTENSION;
         let state = NodeState::from_code(code);
         let waits = matches!(state, NodeState::PreOperational | NodeState::Stopped);
         let mut start = None;
@@ -382,6 +388,16 @@ impl Gateway {
             *to = command;
         }
     }
+}
+
+/// Returns true if the status word acknowledges a control word with this first byte. The answer to
+/// "Set NMT state" also repeats the extension (manual §6.2.2).
+const fn acknowledges(byte: u8, status: u8) -> bool {
+    let extension = match byte & COMMAND {
+        SET_STATE => EXTENSION,
+        _ => 0,
+    };
+    (byte ^ status) & (TOGGLE | COMMAND | extension) == 0
 }
 
 /// The phase of SYNC in the cycle, seen from the inputs that change after it.

@@ -245,6 +245,42 @@ fn a_gateway_without_acknowledgement_receives_the_end() {
     assert_eq!((image[4] & 0x7f, image[5]), (0x00, 128));
 }
 
+/// START and the end differ in the extension only. The acknowledgement of START arrives after the
+/// end has replaced it, so the gateway has not seen the end yet.
+#[test]
+fn a_late_acknowledgement_of_start_is_not_that_of_the_end() {
+    for late in [1, 2, 5] {
+        let (mut gateway, mut peer) = (gateway(), Peer::new());
+        peer.own = 0;
+        let mut image = [0; 12];
+        while image[4] & 0x7f != 0x01 || image[5] != 0 || peer.commands.is_empty() {
+            peer.cycle(&mut gateway);
+            gateway.write(&mut image);
+        }
+        let start = image[4];
+        peer.silent = true;
+        gateway.end();
+        while image[5] != 128 {
+            peer.cycle(&mut gateway);
+            gateway.write(&mut image);
+        }
+        assert_eq!(image[4] & 0x80, start & 0x80, "the toggle bit of START");
+        for _ in 1..late {
+            peer.cycle(&mut gateway);
+        }
+        peer.commands.clear();
+        peer.status = start;
+        peer.silent = false;
+        peer.cycle(&mut gateway);
+        assert!(!gateway.has_ended());
+        for _ in 0..3 {
+            peer.cycle(&mut gateway);
+        }
+        assert!(gateway.has_ended());
+        assert_eq!(peer.commands, [[0x00, 128]]);
+    }
+}
+
 #[test]
 fn control_word_stays_untouched_outside_op() {
     let mut gateway = gateway();
