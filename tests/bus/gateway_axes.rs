@@ -5,6 +5,7 @@ use ecaxis_ecat::index::DeviceIndex;
 use ecaxis_master::config::Machine;
 use ecaxis_master::rt::image;
 use ecaxis_master::session::Options;
+use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::recordings::process_images;
 use ecaxis_test_support::{
     assert_contains, faults, load, machine, recorded, root, run_badly, run_well, virtual_time,
@@ -54,8 +55,12 @@ fn number(bytes: &[u8]) -> i32 {
 
 /// Returns the gateway's process data of every cycle of a recording.
 fn cycles(machine: &Machine, recording: &std::path::Path) -> Vec<Cycle> {
+    cycles_of(machine, recording, GATEWAY)
+}
+
+fn cycles_of(machine: &Machine, recording: &std::path::Path, device: DeviceIndex) -> Vec<Cycle> {
     let plan = image::of(&machine.rt_config()).expect("fits");
-    let region = plan.regions[GATEWAY].expect("process data");
+    let region = plan.regions[device].expect("process data");
     let images = process_images(recording).into_iter();
     let images = images.filter(|(sent, _)| sent.len() >= region.offset + region.out_len);
     images
@@ -345,5 +350,71 @@ fn a_path_has_axes_of_one_network() {
         .filter(|axis| ["feed", "lift"].contains(&axis.name.as_str()))
     {
         assert_eq!(axis.target_position, 5.0, "{}", axis.name);
+    }
+}
+
+/// The nodes of two gateways step in cycles of their own, so that no cycle may see both. A hold acts
+/// on their tables, which keep their common time.
+#[test]
+fn a_hold_acts_on_tables_behind_two_gateways() {
+    for syncs in [["4ms", "4ms"], ["3ms", "7ms"]] {
+        let bench = Bench::new();
+        bench.write("points.csv", "0, 0, 0\n0.5, 6, 20\n2.5, 46, 20\n3, 52, 0\n");
+        let text = mixed();
+        let at = text
+            .find("[[device]]\nname     = \"gateway\"")
+            .expect("a gateway");
+        let end = text
+            .find("[[device.node]]\nid      = 2")
+            .expect("a second node");
+        let gateway = text[at..end].replace("\"4ms\"", &format!("\"{}\"", syncs[0]));
+        let other = gateway
+            .replace("\"gateway\"", "\"other\"")
+            .replace("position = 2", "position = 3")
+            .replace("\"feed\"", "\"second\"")
+            .replace(syncs[0], syncs[1]);
+        let terminal = "[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 4\n";
+        let override_ = "[override]\nhold = { io.\"Input 1\" = true }\n[sim]\ninputs = [\n\
+            { at = \"2s\", set = { io.\"Input 1\" = true } }, { at = \"4s\", set = { io.\"Input 1\" = false } }]\n";
+        let steps = "[[step]]\nenable = true\n[[step]]\nparallel = [{ step = [{ table = { feed = \"points.csv\" } }] }, { step = [{ table = { second = \"points.csv\" } }] }]\n";
+        let machine = bench.machine(&format!(
+            "{}{override_}{gateway}{other}{terminal}{steps}",
+            &text[..at]
+        ));
+        let (options, path) = recorded(virtual_time(), bench.path());
+        let summary = run_well(machine.clone(), options);
+        for axis in summary
+            .axes
+            .iter()
+            .filter(|axis| axis.name != "x" && axis.name != "y")
+        {
+            assert_eq!(axis.target_position, 52.0, "{}", axis.name);
+        }
+        let targets = [GATEWAY, DeviceIndex(3)].map(|device| {
+            let cycles = cycles_of(&machine, &path, device).into_iter();
+            let powered = cycles.filter(|cycle| cycle.controlwords(0) == [0x0f, 0x0f]);
+            powered.map(|cycle| cycle.target(0)).collect::<Vec<_>>()
+        });
+        for targets in &targets {
+            let stays = targets.chunk_by(|a, b| a == b).map(<[i32]>::len);
+            let inner = targets
+                .chunk_by(|a, b| a == b)
+                .filter(|stay| stay.len() > 1000);
+            let held: Vec<_> = inner.map(|stay| stay[0]).collect();
+            println!("{syncs:?}: held at {held:?}, {:?}", stays.max());
+            let held = held.iter().any(|at| (400 * 6..400 * 46).contains(at));
+            assert!(held, "{syncs:?}: no hold on the way");
+        }
+        // 20 counts in 1 ms: both are at the same place within a step of either.
+        let ends = targets.map(|targets| {
+            let held = targets.chunk_by(|a, b| a == b);
+            held.filter(|stay| stay.len() > 1000 && stay[0] != 0)
+                .map(|stay| stay[0])
+                .min()
+        });
+        let [Some(first), Some(second)] = ends else {
+            panic!("{ends:?}")
+        };
+        assert!((first - second).abs() <= 7 * 8, "{first} {second}");
     }
 }
