@@ -37,6 +37,19 @@ def test_motions_end_together_and_errors_say_why():
     asyncio.run(program())
 
 
+def test_inputs_of_the_simulation_are_switched():
+    async def program():
+        async with ecaxis.aio.open(ROOT / "configs/pick-and-place.toml", virtual=True) as machine:
+            for value in (True, False):
+                await machine.set_input("start", value)
+                await machine.sleep(0.05)
+                assert await machine.input("io", "Input 5") == value
+            with pytest.raises(ecaxis.EcaxisError, match="Output 8"):
+                await machine.set_input("lamp")
+
+    asyncio.run(program())
+
+
 def test_a_command_that_replaces_another_ends_it():
     async def program():
         async with ecaxis.aio.open(DEMO, sim=True) as machine:

@@ -98,6 +98,19 @@ def test_outputs_are_set_and_inputs_read(ecaxis_open):
         machine.input("io", "Input 9")
 
 
+def test_inputs_of_the_simulation_are_switched(ecaxis_open):
+    machine = ecaxis_open(ROOT / "configs/pick-and-place.toml")
+    for name in ("start", "io.Input 5"):
+        for value in (True, False):
+            machine.set_input(name, value)
+            machine.sleep(0.05)
+            assert machine.input("io", "Input 5") == value
+    with pytest.raises(ecaxis.EcaxisError, match="Output 8"):
+        machine.set_input("lamp")
+    with pytest.raises(ecaxis.EcaxisError, match="2 is not a value"):
+        machine.set_input("start", 2)
+
+
 def test_a_fault_is_reset(ecaxis_open, tmp_path):
     script = tmp_path / "faults.toml"
     script.write_text('[[fault]]\nkind = "drive-fault"\ndevice = 0\nat = "2s"\ncode = 0x4210\n')

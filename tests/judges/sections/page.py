@@ -104,11 +104,11 @@ class Observer:
 class Server:
     """`ecaxis serve` of the demo machine on the simulated bus."""
 
-    def __init__(self, program, folder, *options, port=0):
+    def __init__(self, program, folder, *options, port=0, config=CONFIG):
         self.folder, self.path = Path(folder), Path(folder) / "control.sock"
         self.path.unlink(missing_ok=True)
         self.output = self.folder / "output"
-        command = [str(program), "serve", str(CONFIG), "--sim", "--socket", str(self.path), "--http", f"127.0.0.1:{port}", *options]
+        command = [str(program), "serve", str(config), "--sim", "--socket", str(self.path), "--http", f"127.0.0.1:{port}", *options]
         self.stack = contextlib.ExitStack()
         output = self.stack.enter_context(self.output.open("w"))
         self.child = self.stack.enter_context(rig.process(command, stdout=output, stderr=output))
@@ -241,6 +241,7 @@ def page(bench):
             port = server.port
             tab = Tab(browser, server)
         restarts(bench, folder, token, tab, port)
+        presses(bench, browser, folder)
         reads_only(bench, browser, folder)
         hour(bench, browser, folder)
 
@@ -601,6 +602,31 @@ def restarts(bench, folder, token, tab, port):
         errors = [complaint for complaint in tab.complaints if complaint[0] != "console"]
         report.equal("no error and no foreign request meanwhile", errors, [])
     tab.close()
+
+
+def presses(bench, browser, folder):
+    """Inputs of the simulated bus, by the names that the machine file gives them."""
+    report = bench.report
+    with Server(bench.program, folder, "--control", config=rig.ROOT / "configs/pick-and-place.toml") as server:
+        observer = server.observer
+
+        def level():
+            return next(line["value"] for line in observer.do("state")["inputs"] if line["name"] == "Input 5")
+
+        tab = Tab(browser, server)
+        tab.page.click("#tab-bus")
+        switch = '[data-switch="start"]'
+        tab.page.wait_for_selector(switch)
+        names = tab.page.locator("[data-switch]").evaluate_all("all => all.map(each => each.dataset.switch)")
+        report.equal("the page has a switch for each named input", names, ["closed", "hold", "start", "stop"])
+        # Inputs belong to nobody: no lease is needed.
+        for text, value in (("Press", 1), ("Release", 0)):
+            wait_for(f"the button {text}", lambda: tab.page.inner_text(switch) == text)
+            tab.page.click(switch)
+            wait_for(f"the input is {value}", lambda: level() == value)
+            report.equal(f"{text} switches the input", level(), value)
+        report.equal("no console message, failed or foreign request (inputs)", tab.complaints, [])
+        tab.close()
 
 
 def reads_only(bench, browser, folder):
