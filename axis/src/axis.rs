@@ -307,7 +307,7 @@ impl Axis {
         if fresh {
             self.update_active();
         }
-        let (sent, play) = (self.sent, self.correction.play.position);
+        let (sent, play) = (self.sent, self.play_state());
         if !self.active {
             self.track_actual();
         } else if self.setpoint_frozen() {
@@ -322,7 +322,7 @@ impl Axis {
         self.external_setpoint = None;
         self.led = false;
         self.previous_target = sent;
-        self.correction.previous_play = play;
+        self.keep_play(play);
         self.update_settling_times(dt_s);
         let outputs = self.outputs();
         self.torque_feedforward = 0.0;

@@ -12,15 +12,17 @@
 //! backlash on the other one.
 
 use crate::limits::Limits;
+use crate::setpoint::MotionLimits;
 
 /// The largest change of the error per unit of position. A larger one is a wrong scale.
 pub const MAX_SLOPE: f64 = 0.05;
 /// The largest number of points of a table.
 pub const MAX_POINTS: usize = 100_000;
 
-/// The share of the velocity and of the acceleration limit with which backlash is taken up.
+/// The shares of the limits with which backlash is taken up.
 const TAKE_UP_VELOCITY: f64 = 0.05;
 const TAKE_UP_ACCELERATION: f64 = 0.1;
+const TAKE_UP_JERK: f64 = 0.2;
 /// The share of the acceleration limit for the corners of the table.
 const CORNER_ACCELERATION: f64 = 0.1;
 /// Each step reduces the error of the inverse to [`MAX_SLOPE`] of it: the rest is below rounding.
@@ -105,13 +107,6 @@ struct Corner {
     rounding: f64,
 }
 
-/// The motion that takes up backlash: limits in user units per second and second².
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct TakeUp {
-    pub velocity: f64,
-    pub acceleration: f64,
-}
-
 /// The correction of an axis. The default corrects nothing.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Compensation {
@@ -121,7 +116,8 @@ pub struct Compensation {
     period: Option<f64>,
     /// The play on the other flank; negative if that is in the negative direction.
     play: f64,
-    take_up: Option<TakeUp>,
+    /// The limits of the motion that takes up backlash.
+    take_up: Option<MotionLimits>,
     limits: Option<[Limits; 2]>,
 }
 
@@ -145,6 +141,7 @@ impl Compensation {
         let mut made = Self::default();
         let mut velocity = limits.velocity;
         let mut acceleration = limits.acceleration;
+        let mut jerk = limits.jerk();
         if let Some(backlash) = mechanics.backlash {
             if !(backlash.is_finite() && backlash > 0.0) {
                 return Err(CompensationError::Backlash(backlash));
@@ -153,12 +150,15 @@ impl Compensation {
                 ReferenceFlank::Positive => -backlash,
                 ReferenceFlank::Negative => backlash,
             };
-            made.take_up = Some(TakeUp {
+            let own = MotionLimits {
                 velocity: limits.velocity * TAKE_UP_VELOCITY,
                 acceleration: limits.acceleration * TAKE_UP_ACCELERATION,
-            });
-            velocity -= limits.velocity * TAKE_UP_VELOCITY;
-            acceleration -= limits.acceleration * TAKE_UP_ACCELERATION;
+                jerk: jerk * TAKE_UP_JERK,
+            };
+            made.take_up = Some(own);
+            velocity -= own.velocity;
+            acceleration -= own.acceleration;
+            jerk -= own.jerk;
         }
         if !mechanics.errors.is_empty() {
             made.period = mechanics.period;
@@ -168,6 +168,7 @@ impl Compensation {
             let corners = limits.acceleration * CORNER_ACCELERATION;
             velocity /= 1.0 + steepest;
             acceleration = (acceleration - corners) / (1.0 + steepest);
+            jerk /= 1.0 + steepest;
             made.add_corners(
                 mechanics.errors,
                 &slopes,
@@ -178,6 +179,7 @@ impl Compensation {
             let load = Limits {
                 velocity,
                 acceleration,
+                jerk: Some(jerk),
                 ..*limits
             };
             made.limits = Some([load, *limits]);
@@ -241,6 +243,7 @@ impl Compensation {
             Some([load, _]) => Limits {
                 velocity: load.velocity,
                 acceleration: load.acceleration,
+                jerk: load.jerk,
                 ..*limits
             },
         }
@@ -257,6 +260,7 @@ impl Compensation {
         Limits {
             velocity: drive.velocity,
             acceleration: drive.acceleration,
+            jerk: drive.jerk,
             position: load.position.map(range),
             ..*load
         }
@@ -269,7 +273,7 @@ impl Compensation {
         })
     }
 
-    pub(crate) const fn take_up(&self) -> Option<TakeUp> {
+    pub(crate) const fn take_up(&self) -> Option<MotionLimits> {
         self.take_up
     }
 

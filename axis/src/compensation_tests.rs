@@ -118,6 +118,7 @@ fn the_load_leaves_shares_of_the_limits_to_the_correction() {
     let made = Compensation::new(&mechanics, &LIMITS).expect("a correction");
     let load = made.load_limits(&LIMITS);
     assert!((load.velocity - 190.0 / 1.0008).abs() < 1e-9, "{load:?}");
+    assert!((load.jerk() - 32_000.0 / 1.0008).abs() < 1e-6, "{load:?}");
     assert!(
         (load.acceleration - 1600.0 / 1.0008).abs() < 1e-9,
         "{load:?}"

@@ -24,3 +24,4 @@ mod stop_room;
 mod stops;
 mod supervision;
 mod sweep;
+mod take_up;

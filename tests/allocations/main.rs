@@ -37,6 +37,8 @@ use ecaxis_server::external::{
 use ecaxis_sim::SecondPort;
 use ecaxis_test_support::{axes, faults, load, machine, virtual_time};
 
+mod corrections;
+
 /// The machine time whose samples are kept.
 const SAMPLES_NS: u64 = 1_000_000_000;
 

@@ -3,27 +3,46 @@
 //! Set-points and limits are of the load. Targets and following errors are of the drive. Reports say
 //! where the load is: it moves with the drive once the drive has passed the play.
 //!
-//! While the set-point of the load reverses, the play changes by a ramp with limits of its own. A
-//! move ends after this ramp. A stop, a hold or a lost frame ends the ramp where it is; nothing
-//! moves before the next motion.
+//! When the set-point of the load has reversed, the play changes by a ramp with limits of its own,
+//! not faster than the motion is asked to be. A motion ends after this ramp. A stop, a hold or a
+//! lost frame ends the ramp where it is; nothing moves before the next motion.
 
 use super::stop::PowerGoal;
 use super::{Axis, ControlledQuantity, Plan};
-use crate::setpoint::{Goal, Hold, Motion, Trapezoid};
+use crate::setpoint::{
+    Goal, Hold, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint, Trapezoid,
+};
 use crate::units::{Counts, UserUnits};
 
 /// The play of the set-point.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Correction {
-    pub(super) play: Motion,
-    /// The play of the cycle before.
-    pub(super) previous_play: f64,
-    /// The direction of the load's set-point: 1, −1, or 0 before its first motion.
+    play: Motion,
+    /// The plan of the play of a jerk-limited axis, while it moves.
+    plan: Option<JerkLimited>,
+    reversal: Reversal,
+    /// The state in the cycle before.
+    before: PlayState,
+    /// The leader of this axis takes up its backlash.
+    pub(super) led: bool,
+    /// The source of the set-point has ended at rest, and its play still moves.
+    pub(super) completes: bool,
+}
+
+/// The last reversal of the load's set-point.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Reversal {
+    /// The direction since then: 1, −1, or 0 before the first motion.
     direction: f64,
     /// The farthest position in this direction.
     turn: f64,
-    /// The leader of this axis takes up its backlash.
-    pub(super) led: bool,
+}
+
+/// What a cycle changes.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct PlayState {
+    play: f64,
+    reversal: Reversal,
 }
 
 impl Axis {
@@ -73,88 +92,164 @@ impl Axis {
     pub(super) fn track_play(&mut self) {
         self.correction = Correction {
             play: Motion::at(self.actual.play()),
-            previous_play: self.correction.previous_play,
-            turn: self.motion.position,
+            before: self.correction.before,
+            reversal: Reversal {
+                direction: 0.0,
+                turn: self.motion.position,
+            },
             ..Correction::default()
         };
+    }
+
+    pub(super) const fn play_state(&self) -> PlayState {
+        PlayState {
+            play: self.correction.play.position,
+            reversal: self.correction.reversal,
+        }
+    }
+
+    /// Keeps the state before the cycle that ends, for a target that is not sent.
+    pub(super) const fn keep_play(&mut self, before: PlayState) {
+        self.correction.before = before;
+    }
+
+    /// Goes back to the cycle before, to the target `sent`.
+    pub(super) fn restore_play(&mut self, sent: Counts) {
+        let PlayState { play, reversal } = self.correction.before;
+        self.correction.play.position = play;
+        self.correction.reversal = reversal;
+        self.motion.position = self.load_position(sent, play);
     }
 
     /// Ends the motion of the play at once: the drive stands at its last target.
     pub(super) const fn freeze_play(&mut self) {
         self.correction.play = Motion::at(self.correction.play.position);
+        self.correction.plan = None;
     }
 
-    /// True while the plan is a move that also ends on its flank.
+    /// True while the plan is a motion that also ends on its flank.
     pub(super) fn takes_up(&self) -> bool {
-        let moves = match &self.plan {
+        let ends = match &self.plan {
             Plan::Move(_) => true,
             Plan::Jerk(source) => matches!(source.request().goal, Goal::Position(_)),
-            Plan::External => self.led && self.correction.led,
+            Plan::External => !self.led || self.correction.led,
+            Plan::Hold(_) => self.correction.completes,
             _ => false,
         };
-        moves && self.may_take_up()
+        ends && self.may_take_up()
     }
 
     fn may_take_up(&self) -> bool {
         let held = self.rate == 0.0 && !matches!(self.plan, Plan::External);
         let stops = match &self.plan {
-            Plan::Hold(_) => true,
+            Plan::Hold(_) => !self.correction.completes,
             Plan::Jerk(source) => source.request().goal == Goal::Velocity(0.0),
+            Plan::Velocity(ramp) => ramp.target == 0.0,
             _ => false,
         };
         self.active && self.goal == PowerGoal::On && self.switch.is_none() && !held && !stops
     }
 
+    /// Returns the velocity of the motion as it is asked for, which the play does not exceed.
+    fn asked_velocity(&self) -> f64 {
+        let velocity = match &self.plan {
+            Plan::Move(trapezoid) => trapezoid.velocity,
+            Plan::Jerk(source) => source.request().limits.velocity,
+            Plan::Velocity(ramp) => ramp.target.abs(),
+            // The source knows its velocity, and obeys a hold itself.
+            Plan::External => return f64::INFINITY,
+            _ => f64::INFINITY,
+        };
+        velocity * self.rate
+    }
+
     /// Advances the play after the set-point of the load has moved from `before`. `may`: false while
     /// answers are late.
     pub(super) fn take_up(&mut self, before: Motion, may: bool, dt_s: f64) {
-        let Some(limits) = self.compensation.take_up() else {
+        let Some(share) = self.compensation.take_up() else {
             return;
         };
-        let to = self.motion.position;
-        let way = to - self.correction.turn;
-        if way * self.correction.direction > 0.0 {
-            self.correction.turn = to;
-        } else if way.abs() > self.config.scale.units_of_counts(1.0) {
-            self.correction.direction = way.signum();
-            self.correction.turn = to;
-        }
-        let moved = to != before.position;
+        self.note_reversal();
+        let moved = self.motion.position != before.position;
         let play = self.correction.play;
-        let towards = self.correction.direction;
-        let goes = may && towards != 0.0 && (self.takes_up() || (moved && self.may_take_up()));
-        self.correction.play = if goes {
-            Trapezoid {
-                target: self.compensation.play_towards(towards),
-                velocity: limits.velocity,
-                acceleration: limits.acceleration,
-                braking: limits.acceleration,
-            }
-            .advance(play, dt_s)
-        } else if play.velocity == 0.0 {
-            Motion::at(play.position)
+        let direction = self.correction.reversal.direction;
+        let goes = may && direction != 0.0 && (self.takes_up() || (moved && self.may_take_up()));
+        let flank = self.compensation.play_towards(direction);
+        if play.velocity == 0.0 && (!goes || play.position == flank) {
+            self.freeze_play();
+            return;
+        }
+        let (goal, limits) = if goes {
+            let velocity = share.velocity.min(self.asked_velocity());
+            let limits = MotionLimits { velocity, ..share };
+            (Goal::Position(flank), limits)
+        } else if self.motion.velocity == 0.0 && before.velocity == 0.0 {
+            // The load at rest leaves its share.
+            (Goal::Velocity(0.0), self.config.limits.motion())
         } else {
-            // The load at rest leaves its share of the acceleration.
-            let rests = self.motion.velocity == 0.0 && before.velocity == 0.0;
-            let acceleration = match rests {
-                true => self.config.limits.acceleration,
-                false => limits.acceleration,
-            };
-            Hold { acceleration }.advance(play, dt_s)
+            (Goal::Velocity(0.0), share)
         };
+        self.correction.play = self.advance_play(goal, limits, dt_s);
+    }
+
+    fn note_reversal(&mut self) {
+        let to = self.motion.position;
+        let Reversal { direction, turn } = self.correction.reversal;
+        let way = to - turn;
+        if way * direction > 0.0 {
+            self.correction.reversal.turn = to;
+        } else if way.abs() > self.config.scale.units_of_counts(1.0) {
+            self.correction.reversal = Reversal {
+                direction: way.signum(),
+                turn: to,
+            };
+        }
+    }
+
+    fn advance_play(&mut self, goal: Goal, limits: MotionLimits, dt_s: f64) -> Motion {
+        let play = self.correction.play;
+        if self.config.jerk_limited {
+            let request = MoveRequest::within(goal, limits);
+            let plan = match self.correction.plan {
+                Some(plan) if *plan.request() == request => Ok(plan),
+                Some(plan) => plan.redirect(request, play, dt_s),
+                None => JerkLimited::new(request, play, dt_s),
+            };
+            self.correction.plan = plan.ok();
+            if let Some(plan) = &mut self.correction.plan {
+                return plan.advance(play, dt_s);
+            }
+        }
+        let acceleration = limits.acceleration;
+        match goal {
+            Goal::Position(target) => Trapezoid {
+                target,
+                velocity: limits.velocity,
+                acceleration,
+                braking: acceleration,
+            }
+            .advance(play, dt_s),
+            Goal::Velocity(_) => Hold { acceleration }.advance(play, dt_s),
+        }
     }
 
     /// True if the play has arrived on the flank of the motion.
     pub(super) fn play_arrived(&self) -> bool {
-        let Correction {
-            play, direction, ..
-        } = self.correction;
+        let direction = self.correction.reversal.direction;
         let flank = self.compensation.play_towards(direction);
-        direction == 0.0 || play.stands_at(flank)
+        direction == 0.0 || self.correction.play.stands_at(flank)
     }
 
     pub(super) fn play_rests(&self) -> bool {
         self.correction.play.velocity == 0.0
+    }
+
+    /// True if the play has ended with the motion.
+    pub(super) fn play_ended(&self) -> bool {
+        match self.takes_up() {
+            true => self.play_arrived(),
+            false => self.play_rests(),
+        }
     }
 
     /// Updates the drive's target of a commanded position, or the play of a position that is not

@@ -129,6 +129,13 @@ impl Actual {
         self.counts
     }
 
+    /// Returns the velocity of the load: 0 while the drive passes the play.
+    pub(super) fn load_velocity(&self, compensation: &Compensation) -> f64 {
+        let [low, high] = compensation.range_of_play();
+        let passes = self.play > low && self.play < high;
+        if passes { 0.0 } else { self.velocity }
+    }
+
     /// Returns the position of the load.
     pub(super) const fn position(&self) -> f64 {
         self.position
@@ -148,6 +155,7 @@ impl Actual {
         self.play
     }
 
+    /// Returns the velocity of the drive as that of its load without play.
     pub(super) const fn velocity(&self) -> f64 {
         self.velocity
     }

@@ -57,8 +57,7 @@ impl Axis {
         let moves = self.motion.velocity != 0.0 || !self.play_rests();
         if self.mode == Mode::Csp && !self.left_csp() && moves {
             self.sent = self.previous_target;
-            self.correction.play.position = self.correction.previous_play;
-            self.motion.position = self.load_position(self.sent, self.correction.previous_play);
+            self.restore_play(self.sent);
         }
     }
 

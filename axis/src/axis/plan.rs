@@ -154,6 +154,7 @@ impl Axis {
     pub(super) fn engage(&mut self) {
         if self.active && self.controlled_quantity() == ControlledQuantity::Torque {
             self.motion = self.motion_at_actual(self.held_velocity());
+            self.track_play();
             self.loop_state.take_over();
         }
     }
@@ -198,6 +199,7 @@ impl Axis {
     /// Decelerates to rest, with any active plan.
     pub(super) fn brake(&mut self) {
         self.home.abort();
+        self.correction.completes = false;
         let braking = Plan::braking(&self.config, self.mode);
         if braking == Plan::DriveProfile {
             self.profile.halt();
@@ -264,6 +266,8 @@ impl Axis {
             Plan::External => match self.external_setpoint {
                 Some(motion) => self.motion = motion,
                 None => {
+                    // The source has ended, or has lost its way.
+                    self.correction.completes = before.velocity == 0.0;
                     let hold = Hold {
                         acceleration: self.config.limits.acceleration,
                     };
@@ -363,7 +367,7 @@ impl Axis {
     /// Returns true if the set-point has reached its goal.
     pub(super) fn setpoint_arrived(&self) -> bool {
         match self.plan {
-            Plan::Hold(hold) => hold.finished(self.motion) && self.play_rests(),
+            Plan::Hold(hold) => hold.finished(self.motion) && self.play_ended(),
             Plan::Move(trapezoid) => trapezoid.finished(self.motion) && self.play_arrived(),
             Plan::Jerk(ref source) => {
                 let moves = matches!(source.request().goal, Goal::Position(_));
@@ -379,7 +383,7 @@ impl Axis {
             }
             Plan::Torque(ramp) => self.loop_state.torque == ramp.target,
             Plan::DriveProfile => self.profile_arrived(),
-            Plan::External => self.motion.velocity == 0.0 && self.play_rests(),
+            Plan::External => self.motion.velocity == 0.0 && self.play_ended(),
         }
     }
 }

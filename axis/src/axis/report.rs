@@ -43,7 +43,7 @@ impl Axis {
                 && self.settled_s >= self.config.supervision.target_dwell_s,
             at_rest: self.rests() && self.rested_s >= self.config.supervision.standstill_dwell_s,
             position: self.actual.position(),
-            velocity: self.actual.velocity(),
+            velocity: self.actual.load_velocity(&self.compensation),
             torque: self.actual.torque(),
             target_position: goal_position.unwrap_or(self.motion.position),
             target_velocity: goal_velocity.unwrap_or(self.motion.velocity),
@@ -139,7 +139,8 @@ impl Axis {
                 _ => true,
             },
             Plan::Hold(_) | Plan::Move(_) | Plan::Jerk(_) | Plan::External => {
-                let error = self.motion.position - self.actual.position();
+                // Of the drive: a stop may leave the load within its play.
+                let error = self.drive_motion().position - self.actual.drive();
                 error.abs() <= self.config.target_window
             }
         }

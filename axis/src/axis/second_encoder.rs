@@ -13,6 +13,18 @@ pub struct SecondEncoder {
     pub max_difference: f64,
     /// The position of the axis at count 0. `None`: the difference is 0 when home is found.
     pub offset: Option<f64>,
+    /// True if its counts begin at 0 (UDINT), false if half of them are negative (DINT).
+    pub unsigned: bool,
+}
+
+impl SecondEncoder {
+    /// Returns the counts of the first reading.
+    fn first(&self, raw: i32) -> Counts {
+        Counts(match self.unsigned {
+            true => i64::from(raw.cast_unsigned()),
+            false => i64::from(raw),
+        })
+    }
 }
 
 /// What the second encoder has shown.
@@ -38,7 +50,7 @@ impl Axis {
         let second = &mut self.second;
         let counts = second
             .counts
-            .map_or(Counts(i64::from(raw)), |counts| counts.unwrap_next(raw));
+            .map_or_else(|| encoder.first(raw), |counts| counts.unwrap_next(raw));
         second.counts = Some(counts);
         if second.waits_for_home || !self.home.homed || self.actual.counts().is_none() {
             second.offset = None;

@@ -65,6 +65,7 @@ pub(crate) fn check(
                 counts_per_unit,
                 max_difference,
                 offset: raw.offset.value(),
+                unsigned: kind == Some(Kind::Unsigned),
             },
             input,
             place: text.span(),
