@@ -154,7 +154,7 @@ int ecaxis_cyclic_wait(ecaxis_cyclic *cyclic);
 int ecaxis_cyclic_poll(ecaxis_cyclic *cyclic);
 /* Returns the number of a signal such as "x.position" or "io.Input 1", or -1. The signals of an axis
  * are position, velocity, torque, target_position, target_velocity, target_torque,
- * following_error, statusword, controlword, mode. */
+ * following_error, statusword, controlword, mode, encoder_difference. */
 int ecaxis_cyclic_signal(const ecaxis_cyclic *cyclic, const char *name);
 /* Returns the value of a signal in the last cycle; NAN: none. */
 double ecaxis_cyclic_value(const ecaxis_cyclic *cyclic, int signal);

@@ -78,6 +78,8 @@ pub const AXIS: Schema = Schema {
         "float64 target_velocity\n",
         "float64 target_torque\n",
         "float64 following_error\n",
+        "# The position minus that of the second encoder.\n",
+        "float64 encoder_difference\n",
         "uint16 statusword\n",
         "uint16 controlword\n",
         "# Modes of operation (0x6060).\n",

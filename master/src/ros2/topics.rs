@@ -273,7 +273,7 @@ fn axis(
     values: [f64; AXIS_COLUMNS.len()],
     bytes: &mut Vec<u8>,
 ) {
-    let [numbers @ .., statusword, controlword, mode] = values;
+    let [numbers @ .., statusword, controlword, mode, difference] = values;
     let state = match statusword.is_nan() {
         true => u8::MAX,
         false => state_code(State::from_statusword(Statusword::from_bits_retain(
@@ -283,7 +283,7 @@ fn axis(
     let mut to = CdrEncoder::new(bytes);
     header(&mut to, time, name);
     to.u64(number);
-    for value in numbers {
+    for value in numbers.into_iter().chain([difference]) {
         to.f64(value);
     }
     // `as` saturates, and maps NaN to 0.

@@ -48,8 +48,9 @@ pub const CYCLE_COLUMNS: [(&str, &str); 4] = [
     ("phase_error", "s"),
     ("work", "s"),
 ];
-/// The numbers of an axis (f64); units `""` are those of the axis, `/s` and `%` as written.
-pub const AXIS_COLUMNS: [(&str, &str); 10] = [
+/// The numbers of an axis (f64); units `""` are those of the axis, `/s` and `%` as written. NaN: no
+/// value in this cycle.
+pub const AXIS_COLUMNS: [(&str, &str); 11] = [
     ("position", ""),
     ("velocity", "/s"),
     ("torque", "%"),
@@ -60,6 +61,7 @@ pub const AXIS_COLUMNS: [(&str, &str); 10] = [
     ("statusword", "bits"),
     ("controlword", "bits"),
     ("mode", "code"),
+    ("encoder_difference", ""),
 ];
 
 /// Bits of the flags.
@@ -198,6 +200,7 @@ fn axis_values(axis: &AxisStatus) -> [f64; AXIS_COLUMNS.len()] {
         f64::from(axis.statusword),
         f64::from(axis.controlword),
         f64::from(axis.mode.code()),
+        axis.encoder_difference.unwrap_or(f64::NAN),
     ]
 }
 

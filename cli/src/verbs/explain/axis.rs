@@ -110,17 +110,31 @@ fn limits(axis: &AxisSetup, table: &mut Table) {
         None => "endless".to_owned(),
     };
     table.row(cells!["limits", position, "`limits.position`"]);
+    // Those of the file are the drive's; a correction takes its share.
+    let drive = axis.compensation.drive_limits(limits);
+    let show = |load: f64, drive: f64, from: &str| {
+        let load_text = rounded(load).to_string();
+        match load == drive {
+            true => (load_text, from.to_owned()),
+            false => (
+                format!("{load_text} of {}", rounded(drive)),
+                format!("{from}, `compensation`"),
+            ),
+        }
+    };
     let rpm = rounded(limits.velocity / config.scale.units_per_turn() * 60.0);
-    let velocity = format!("{} {unit}/s ({rpm} rpm)", limits.velocity);
-    table.row(cells!["", velocity, "`limits.velocity`"]);
-    let acceleration = format!("{} {unit}/s²", limits.acceleration);
-    table.row(cells!["", acceleration, "`limits.acceleration`"]);
-    let jerk = format!("{} {unit}/s³", rounded(limits.jerk()));
-    let origin = match limits.jerk {
+    let (velocity, origin) = show(limits.velocity, drive.velocity, "`limits.velocity`");
+    let velocity = format!("{velocity} {unit}/s ({rpm} rpm)");
+    table.row(cells!["", velocity, origin]);
+    let key = "`limits.acceleration`";
+    let (acceleration, origin) = show(limits.acceleration, drive.acceleration, key);
+    table.row(cells!["", format!("{acceleration} {unit}/s²"), origin]);
+    let key = match drive.jerk {
         Some(_) => "`limits.jerk`",
         None => "default: full acceleration in 50 ms",
     };
-    table.row(cells!["", jerk, origin]);
+    let (jerk, origin) = show(limits.jerk(), drive.jerk(), key);
+    table.row(cells!["", format!("{jerk} {unit}/s³"), origin]);
     let torque = rounded(axis.torque.shown(limits.torque));
     let percent = match axis.torque.unit {
         TorqueUnit::Percent => " of rated torque".to_owned(),

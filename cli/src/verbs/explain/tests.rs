@@ -129,3 +129,32 @@ fn value_formats_bytes_as_number() {
     assert_eq!(value(&[1; 9]), "01 01 01 01 01 01 01 01 01");
     assert_eq!(value(&[]), "");
 }
+
+#[test]
+fn limits_of_a_corrected_load_are_next_to_those_of_the_drive() {
+    let configs = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
+    let demo = std::fs::read_to_string(configs.join("demo.toml")).unwrap();
+    let keys = "compensation = { backlash = 0.05, homing_ends = \"negative\" }\nencoder ";
+    let machine = config::parse(
+        &configs.join("demo.toml"),
+        &demo.replacen("encoder ", keys, 1),
+    );
+    let text = explain(&machine.unwrap(), None).text(None);
+    let text = text.replace(&configs.display().to_string(), "configs");
+    for (load, file) in [
+        (
+            "237.5 of 250 mm/s (2850 rpm)",
+            "`limits.velocity`, `compensation`",
+        ),
+        (
+            "2250 of 2500 mm/s²",
+            "`limits.acceleration`, `compensation`",
+        ),
+        ("40000 of 50000 mm/s³", "in 50 ms, `compensation`"),
+    ] {
+        let row = text.lines().find(|row| row.contains(load)).unwrap_or(&text);
+        assert!(row.contains(file), "{row}");
+    }
+    let wide: Vec<&str> = text.lines().filter(|l| l.chars().count() > 100).collect();
+    assert!(wide.is_empty(), "{wide:#?}");
+}
