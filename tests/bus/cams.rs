@@ -138,13 +138,97 @@ fn a_phase_shifts_the_follower_in_motion() {
 #[test]
 fn a_cam_that_is_too_steep_stops_both_axes() {
     let cam = "[[cam]]\nname = \"c\"\npoints = [[0.0, 0.0], [5.0, 0.0], [5.2, 8.0], [9.0, 8.0]]\n";
-    let steps =
-        "[[step]]\ngear = { y = { to = \"x\", cam = \"c\" } }\n[[step]]\nmove = { x = 9.0 }\n";
-    let (error, summary) = run_badly(machine(&text(cam, steps)), virtual_time());
+    // How fast a wave is, `check` does not know.
+    let steps = "[[step]]\ngear = { y = { to = \"x\", cam = \"c\" } }\n[[step]]\nsine = { x = { amplitude = 0.5, frequency = 1.5, periods = 3 } }\n";
+    let cam = cam.replace("[5.0, 0.0], [5.2, 8.0]", "[0.1, 0.0], [0.4, 8.0]");
+    let (error, summary) = run_badly(machine(&text(&cam, steps)), virtual_time());
     assert_contains(&error, &["`y`", "cannot follow within its limits"]);
     for axis in summary.expect("the cycle has run").axes {
         assert_ne!(axis.final_state, "Operation enabled");
     }
+}
+
+/// `check` compares the follower with its limits at the velocity of the master that it knows.
+#[test]
+fn a_cam_that_its_follower_cannot_follow_is_refused() {
+    let steep =
+        "[[cam]]\nname = \"c\"\npoints = [[0.0, 0.0], [5.0, 0.0], [5.2, 8.0], [9.0, 8.0]]\n";
+    let gear = "[[step]]\ngear = { y = { to = \"x\", cam = \"c\" } }\n";
+    let scaled = gear.replace("cam =", "ratio = 0.5, cam =");
+    let flat = steep.replace("5.2, 8.0", "8.0, 8.0");
+    // 8 of 0.2: 1.875 * 40 * v, and 5.7735 * 200 * v².
+    for (cam, steps, message) in [
+        (
+            steep,
+            format!("{gear}[[step]]\nmove = {{ x = 9.0 }}\n"),
+            "at 5.1 of it, with 10 turn/s, the velocity of `x`, its velocity is 750 turn/s, and its limit 30",
+        ),
+        (
+            &steep.replace("8.0", "0.8"),
+            format!("{gear}[[step]]\nmove = {{ x = 9.0 }}\nspeed = 0.3\n"),
+            "with 3 turn/s, the velocity of `x`, its acceleration is 1039",
+        ),
+        (
+            steep,
+            format!("{gear}[[step]]\nvelocity = {{ x = -0.5 }}\n"),
+            "with 0.5 turn/s, the velocity of `x`, its velocity is 37.5",
+        ),
+        (
+            steep,
+            gear.to_owned(),
+            "with 10 turn/s, `limits.velocity` of `x`",
+        ),
+        (
+            steep,
+            format!("{gear}[[step]]\nrepeat = 2\nstep = [{{ move = {{ x = 9.0 }} }}]\n"),
+            "cannot follow the cam `c`",
+        ),
+    ] {
+        let text = text(cam, &steps);
+        let error = config(&text).expect_err(&steps);
+        assert_contains(
+            &error,
+            &[
+                "`y` cannot follow the cam `c`",
+                message,
+                "flatter, or its master slower",
+            ],
+        );
+        let line = text
+            .lines()
+            .position(|line| line.starts_with("gear"))
+            .expect("a line");
+        assert!(error.contains(&format!(":{line}:")), "{error}");
+    }
+    for (cam, steps) in [
+        (
+            steep,
+            format!("{gear}[[step]]\nmove = {{ x = 9.0 }}\nspeed = 0.02\n"),
+        ),
+        (
+            flat.as_str(),
+            format!("{scaled}[[step]]\nmove = {{ x = 9.0 }}\nspeed = 0.9\n"),
+        ),
+    ] {
+        if let Err(error) = config(&text(cam, &steps)) {
+            panic!("{error}");
+        }
+    }
+}
+
+fn config(text: &str) -> Result<ecaxis_master::config::Machine, String> {
+    let file = ecaxis_test_support::root().join("configs/m.toml");
+    ecaxis_master::config::parse(&file, text).map_err(|error| error.to_string())
+}
+
+/// A mistake in a cam is the only one that is reported: its name is known to the steps.
+#[test]
+fn a_wrong_cam_is_reported_once() {
+    let cam = "[[cam]]\nname = \"c\"\nfile = \"none.csv\"\n";
+    let gear = "[[step]]\ngear = { y = { to = \"x\", cam = \"c\" } }\n";
+    let error = config(&text(cam, gear)).expect_err("no file");
+    assert_contains(&error, &["none.csv"]);
+    assert!(!error.contains("no cam is named"), "{error}");
 }
 
 #[test]

@@ -9,7 +9,7 @@ use super::error::position;
 use super::{Motion, SetpointError};
 
 /// A point of a cam, in user units.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct CamPoint {
     /// The position of the master.
     pub at: f64,
@@ -111,10 +111,41 @@ impl Segment {
         let value = if part >= 1.0 { self.end } else { value };
         (value, slope / self.length)
     }
+
+    /// Returns the first three derivatives at this part of the segment, from 0 to 1.
+    fn derivatives(&self, part: f64) -> [f64; 3] {
+        let mut sums = [0.0; 4];
+        for coefficient in self.coefficients.iter().rev() {
+            for order in (1..4).rev() {
+                sums[order] = sums[order] * part + sums[order - 1];
+            }
+            sums[0] = sums[0] * part + coefficient;
+        }
+        // Horner's scheme gives the derivatives divided by the factorials of their orders.
+        let length = self.length;
+        [
+            sums[1] / length,
+            2.0 * sums[2] / length.powi(2),
+            6.0 * sums[3] / length.powi(3),
+        ]
+    }
 }
 
-/// The position of a follower as a function of a master's position.
-#[derive(Debug, Clone, PartialEq)]
+/// The largest first, second or third derivative of a cam, and where it is.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct CamPeak {
+    /// The position of the master.
+    pub at: f64,
+    /// The largest absolute value.
+    pub value: f64,
+}
+
+/// The parts of a segment at which its derivatives are computed: peaks are exact to 0.1 %.
+const PARTS: u32 = 96;
+
+/// The position of a follower as a function of a master's position. The follower of the default
+/// stands at 0.
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct Cam {
     segments: Box<[Segment]>,
     /// First and last point.
@@ -192,6 +223,28 @@ impl Cam {
 }
 
 impl Cam {
+    /// Returns the largest first, second and third derivative. The master's velocity v makes the
+    /// velocity d₁·v, the acceleration d₂·v² and the jerk d₃·v³ of them. O(points).
+    #[must_use]
+    pub fn peaks(&self) -> [CamPeak; 3] {
+        let mut peaks = [CamPeak::default(); 3];
+        for segment in &self.segments {
+            for part in 0..=PARTS {
+                let part = f64::from(part) / f64::from(PARTS);
+                for (peak, value) in peaks.iter_mut().zip(segment.derivatives(part)) {
+                    if value.abs() > peak.value {
+                        let at = segment.at + part * segment.length;
+                        *peak = CamPeak {
+                            at,
+                            value: value.abs(),
+                        };
+                    }
+                }
+            }
+        }
+        peaks
+    }
+
     /// Returns the motion that a gear with ratio 1 follows. `scale` is the way on the cam per way of
     /// the master. RT: O(log points).
     #[must_use]
@@ -232,6 +285,18 @@ mod tests {
                 (seven.value(at).0 - (-2.0 + 6.0 * law7)).abs() < 1e-12,
                 "{z}"
             );
+        }
+        // VDI 2143: C_v, C_a and C_j of both laws, over 60 with a lift of 6.
+        for (cam, [v, a, j]) in [
+            (&five, [1.875, 5.7735, 60.0]),
+            (&seven, [2.1875, 7.5132, 52.5]),
+        ] {
+            let lift = |order: i32| 6.0 / 60_f64.powi(order);
+            for (peak, (order, expected)) in cam.peaks().iter().zip((1..).zip([v, a, j])) {
+                let factor = peak.value / lift(order);
+                assert!((factor / expected - 1.0).abs() < 1e-3, "{order}: {factor}");
+            }
+            assert_eq!(cam.peaks()[0].at, 40.0);
         }
         // The peaks of the velocity: 1.875 and 2.1875.
         assert!((five.value(40.0).1 - 1.875 * 0.1).abs() < 1e-12);

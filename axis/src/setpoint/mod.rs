@@ -54,7 +54,7 @@ mod test_support;
 mod trapezoid;
 mod wave;
 
-pub use cam::{Cam, CamError, CamLaw, CamPoint};
+pub use cam::{Cam, CamError, CamLaw, CamPeak, CamPoint};
 pub use error::SetpointError;
 pub(crate) use error::position as check_position;
 pub use gear::{Gear, GearConfig, GearInMode};

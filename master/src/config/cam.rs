@@ -28,6 +28,11 @@ pub(crate) fn check(raw: &[RawCam], folder: &Path, p: &mut Problems<'_>) -> Vec<
             p.add_hint(name.span(), message, "give it another name");
             continue;
         }
+        // A cam with a mistake has its name: steps that name it are not wrong.
+        cams.push(NamedCam {
+            name: name.get_ref().clone(),
+            cam: Cam::default(),
+        });
         let Some((rows, place)) = rows(raw, folder, p) else {
             continue;
         };
@@ -38,10 +43,11 @@ pub(crate) fn check(raw: &[RawCam], folder: &Path, p: &mut Problems<'_>) -> Vec<
         };
         let law = raw.law.value().unwrap_or_default();
         match Cam::new(&points, law, raw.repeat.value().unwrap_or(false)) {
-            Ok(cam) => cams.push(NamedCam {
-                name: name.get_ref().clone(),
-                cam,
-            }),
+            Ok(cam) => {
+                if let Some(known) = cams.last_mut() {
+                    known.cam = cam;
+                }
+            }
             Err(error) => p.add_hint(place, error.to_string(), HINT),
         }
     }

@@ -7,6 +7,7 @@ use std::path::Path;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use toml::Spanned;
 
+mod cams;
 mod condition;
 mod endings;
 mod follow;
@@ -156,6 +157,7 @@ pub(crate) fn check(
     };
     let stop = checker.stop(&stop, p);
     checker.check_groups(&steps, &stop, p);
+    checker.check_cams(&steps, &steps, p);
     let overrides = checker.overrides(&overrides, p);
     let switched = checker.switched_inputs(sim, p);
     Program {
