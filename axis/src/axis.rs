@@ -166,7 +166,10 @@ impl Axis {
             goal: PowerGoal::Off,
             reset: false,
             reset_failed: false,
-            actual: Actual::new(config.supervision.acceleration.is_some()),
+            actual: Actual::new(
+                config.supervision.acceleration.is_some()
+                    || config.modes.with(config.mode).contains(Mode::Cst),
+            ),
             active: false,
             mode: config.mode,
             switch: None,

@@ -305,9 +305,7 @@ impl Checker {
         }
         if self.config.loops.cst.is_none() && (steady(Mode::Cst) || entered(Mode::Cst)) {
             let change = out.target_torque.abs_diff(sent.target_torque);
-            // At the velocity limit, the torque is reduced at once.
-            let reduced = was.velocity.abs().max(status.velocity.abs()) > 0.8 * limits.velocity;
-            ensure(change <= 11 || reduced, "torque steps")?;
+            ensure(change <= 11, "torque steps")?;
         }
         let offsets = (out.velocity_offset, out.torque_offset) == (0, 0);
         let csp = status.enabled && status.mode == Mode::Csp && status.switching.is_none();

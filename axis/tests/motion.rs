@@ -236,6 +236,11 @@ fn cst_ramps_and_stops() {
 /// Returns an axis that has just been commanded a torque. Its motor accelerates `strength` times as
 /// much as its limits say.
 fn with_torque(percent: f64, strength: f64) -> Rig {
+    with_torque_slope(percent, strength, LIMITS.torque * 10.0)
+}
+
+/// `slope`: the largest change of the torque, percent per second.
+fn with_torque_slope(percent: f64, strength: f64, slope: f64) -> Rig {
     let limits = Limits {
         position: None,
         // The drive of these tests reaches 250 mm/s² with its whole torque.
@@ -244,6 +249,7 @@ fn with_torque(percent: f64, strength: f64) -> Rig {
     };
     let mut config = AxisConfig::new(Mode::Cst, scale(), limits);
     config.dead_time_s = 2.0 * DT;
+    config.torque_slope = slope;
     let mut rig = Rig::new(Axis::new(config).unwrap(), Drive::at(0));
     rig.axis.command(Command::Enable).unwrap();
     rig.until(|s| s.ready, 100);
@@ -297,6 +303,52 @@ fn cst_reduces_the_torque_at_the_velocity_limit() {
             }
         }
     }
+}
+
+/// Torques at random, on motors and slopes of any strength: no step of the torque exceeds the slope,
+/// the speed stays near its limit, and a stop brings the torque to 0 on its slope.
+#[test]
+fn torques_keep_their_slope_at_the_velocity_limit() {
+    let mut overshoot: f64 = 0.0;
+    for seed in 1..=300_u64 {
+        let mut state = seed;
+        let mut random = |low: f64, high: f64| {
+            state = state
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1);
+            low + (high - low) * (state >> 33) as f64 / f64::from(1_u32 << 31)
+        };
+        let (strength, friction) = (random(0.4, 4.0), random(0.0, 150.0));
+        let slope = random(200.0, 5000.0);
+        let mut rig = with_torque_slope(random(-100.0, 100.0), strength, slope);
+        let most = slope * 10.0 * DT + 1.0;
+        let mut before = i32::from(rig.axis.step(&rig.drive.inputs(), DT).target_torque);
+        let mut fastest: f64 = 0.0;
+        for n in 0..6000 {
+            if n < 5000 && random(0.0, 1.0) < 0.002 {
+                let (percent, ramp_s) = (random(-100.0, 100.0), random(0.0, 0.2));
+                let _ = rig.axis.command(Command::Torque { percent, ramp_s });
+            }
+            if n == 5000 {
+                rig.axis.command(Command::Stop).unwrap();
+            }
+            rig.drive.load = -friction * rig.drive.velocity.signum();
+            let status = rig.cycle();
+            let torque = i32::from(rig.out.target_torque);
+            let change = f64::from((torque - before).abs());
+            assert!(change <= most, "seed {seed}, {n}: {before} {torque}");
+            assert!(status.trip.is_none(), "seed {seed}: {:?}", status.trip);
+            before = torque;
+            fastest = fastest.max(status.velocity.abs());
+        }
+        assert_eq!(before, 0, "seed {seed}");
+        overshoot = overshoot.max(fastest / LIMITS.velocity - 1.0);
+        assert!(
+            fastest < LIMITS.velocity * 1.02,
+            "seed {seed}: {fastest}, {strength} {friction} {slope}"
+        );
+    }
+    println!("{:.1} % above the velocity limit", overshoot * 100.0);
 }
 
 /// At the velocity limit, late answers and a stop begin from the torque that was sent: it goes to zero

@@ -10,6 +10,11 @@ use crate::units::{
     PerMille, Percent, RawAcceleration, RawVelocity, UserAcceleration, UserUnits, UserVelocity,
 };
 
+/// The least share of the torque limit that shows how strong a motor is, and the most that it may
+/// exceed its limits.
+const LEAST_TORQUE: f64 = 0.05;
+const MOST_STRENGTH: f64 = 10.0;
+
 /// The last outputs of the loops, user units and percent.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct LoopState {
@@ -24,6 +29,8 @@ pub(super) struct LoopState {
     reduction: f64,
     /// The torque that keeps the axis at the velocity limit, in the direction of the command.
     holding: f64,
+    /// The torque with the delay of the reported acceleration.
+    filtered_torque: f64,
     /// True: the PID loop continues from `torque`.
     takes_over: bool,
     velocity_offset: f64,
@@ -153,39 +160,57 @@ impl Axis {
 
     /// Reduces a commanded torque so that the speed stays at the velocity limit. A PI controller of
     /// the speed asks for torque, and the smaller torque counts. Its gain assumes that the torque
-    /// limit gives the acceleration limit. `before`: the torque of the last cycle; it grows with the
-    /// configured slope. RT: O(1).
+    /// limit gives the acceleration limit. The torque changes by the configured slope at most, so it
+    /// falls early enough to end at the limit. `before`: the torque of the last cycle. RT: O(1).
     pub(super) fn keep_speed(&mut self, before: f64, fresh: bool, dt_s: f64) {
         let limits = self.config.limits;
-        let torque = self.loop_state.torque;
-        let wanted = torque.abs();
-        if wanted == 0.0 {
-            // A braking torque ends with the slope as well.
-            let most = self.config.torque_slope * dt_s;
-            let state = &mut self.loop_state;
-            state.holding = 0.0;
-            state.reduction -= state.reduction.clamp(-most, most);
-            return;
-        }
+        let (torque, slope) = (self.loop_state.torque, self.config.torque_slope);
+        let (wanted, direction) = (torque.abs(), torque.signum());
         let filter_s = match self.actual.velocity_is_measured() {
             true => 0.0,
             false => FILTER_S,
         };
+        let late_s = self.config.dead_time_s + filter_s;
+        let strength = self.note_strength(before, late_s, dt_s);
         // A quarter of the delay's bandwidth; the integral part is eight times slower.
-        let bandwidth = 0.25 / (self.config.dead_time_s + 2.0 * dt_s + filter_s);
-        let gain = bandwidth * limits.torque / limits.acceleration;
-        let room = limits.velocity - self.actual.velocity() * torque.signum();
-        let direct = gain * room;
+        let bandwidth = 0.25 / (late_s + 2.0 * dt_s);
+        let per_acceleration = limits.torque / limits.acceleration;
+        let room = limits.velocity - self.actual.velocity() * direction;
+        // A torque t accelerates by s·t during the delay, and while it falls to 0: with the slope k,
+        // s·t·delay + s·t²/2k is the room.
+        let delay = (late_s + 2.0 * dt_s) * slope;
+        let last = (delay * delay + 2.0 * slope * room.max(0.0) / strength).sqrt() - delay;
+        let linear = bandwidth * per_acceleration * room;
+        let direct = linear.min(last);
         let state = &mut self.loop_state;
         if direct >= wanted {
             state.holding = 0.0;
-        } else if fresh {
+        }
+        let allowed = (direct + state.holding).clamp(-limits.torque, wanted);
+        let target = allowed * direction;
+        let next = Ramp { target, slope }.advance(before, dt_s);
+        // While the slope limits the torque, the sum must not grow.
+        if direct < wanted && direct == linear && fresh && next == target {
             let holding = state.holding + direct * bandwidth * 0.125 * dt_s;
             state.holding = holding.clamp(-limits.torque, wanted);
         }
-        let allowed = (direct + state.holding).clamp(-limits.torque, wanted);
-        let most = (before * torque.signum()).max(0.0) + self.config.torque_slope * dt_s;
-        state.reduction = (wanted - allowed.min(most)) * torque.signum();
+        state.reduction = torque - next;
+    }
+
+    /// Returns the acceleration per torque that the axis shows, at least that of its limits. `late_s`:
+    /// the age of the reported velocity.
+    fn note_strength(&mut self, torque: f64, late_s: f64, dt_s: f64) -> f64 {
+        let limits = &self.config.limits;
+        let nominal = limits.acceleration / limits.torque;
+        let state = &mut self.loop_state;
+        // The torque that caused the filtered acceleration.
+        let weight = dt_s / (dt_s + late_s + FILTER_S);
+        state.filtered_torque += (torque - state.filtered_torque) * weight;
+        if state.filtered_torque.abs() < limits.torque * LEAST_TORQUE {
+            return nominal;
+        }
+        let shown = self.actual.acceleration() / state.filtered_torque;
+        shown.max(nominal).min(nominal * MOST_STRENGTH)
     }
 
     fn close_torque(&mut self, dt_s: f64) {
