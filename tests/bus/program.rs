@@ -479,3 +479,34 @@ fn an_unreached_target_is_reported_in_its_unit() {
         "{error}"
     );
 }
+
+/// Bounds and outputs are the present values of variables, also while another branch changes them.
+#[test]
+fn variables_are_bounds_and_values_of_outputs() {
+    let text = "[variables]\nn = 0\nlimit = { initial = 3.0, range = [0.0, 9.0] }\nlamp = { initial = 0.6, range = [0.0, 1.0] }\n\
+        [[step]]\nwhile = { n = { below = \"limit\" } }\nstep = [{ add = { n = 1 } }]\n\
+        [[step]]\nif = { n = \"limit\" }\nstep = [{ set = { io.\"Output 1\" = \"lamp\" } }]\nelse = [{ alarm = \"another number\" }]\n\
+        [[step]]\nparallel = [{ step = [{ dwell = \"50ms\" }, { let = { limit = 1 } }] }, { step = [{ wait = { n = { above = \"limit\" } } }, { let = { lamp = 0 } }, { set = { io.\"Output 1\" = \"lamp\" } }] }]\n";
+    let folder = tempfile::tempdir().expect("a folder");
+    let (options, path) = ecaxis_test_support::recorded(virtual_time(), folder.path());
+    let (outcome, heard) = run(machine(&format!("{HEAD}{text}")), options);
+    outcome.result.expect("runs");
+    let rounds = steps(&heard).iter().filter(|step| *step == "1.1").count();
+    assert_eq!(rounds, 3);
+    let outputs = process_images(&path).into_iter();
+    // The terminal has one byte behind two drives of 12 bytes out and 13 bytes in.
+    let lamp: Vec<u8> = outputs
+        .filter_map(|(sent, _)| sent.get(26).copied())
+        .collect();
+    let on = lamp.iter().position(|bits| *bits == 1).expect("on");
+    let off = lamp[on..].iter().position(|bits| *bits == 0).expect("off");
+    assert!((50..60).contains(&off), "{off} ms");
+    let explained = heard.0.iter().filter_map(|progress| match progress {
+        Progress::Program { what, .. } => Some(what.as_str()),
+        _ => None,
+    });
+    let waits: Vec<_> = explained
+        .filter(|what| what.contains("wait until"))
+        .collect();
+    assert_eq!(waits, ["wait until n > limit, 10 s at most"]);
+}

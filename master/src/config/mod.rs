@@ -97,7 +97,7 @@ pub use mailbox_gateway::MailboxGatewaySetup;
 pub use position_output::PositionOutputSetup;
 pub use problem::{ConfigError, Problem};
 pub use program::{
-    Action, AxisValue, NamedSignal, NumberPlace, ProgramInputs, Step, StopGroup, StopSetup,
+    Action, AxisValue, Bound, NamedSignal, NumberPlace, ProgramInputs, Step, StopGroup, StopSetup,
     Subject, SwitchedInput, Test, Variable, VariableRef, VariableUse, When,
 };
 pub use signal::{NameError, Signal};

@@ -279,7 +279,7 @@ pub struct When(pub Vec<Vec<Test>>);
 impl When {
     /// `value` returns the present value of a subject.
     pub fn holds(&self, value: impl Fn(Subject) -> f64) -> bool {
-        let all = |tests: &Vec<Test>| tests.iter().all(|test| test.bounds.holds(value(test.of)));
+        let all = |tests: &Vec<Test>| tests.iter().all(|test| test.holds(&value));
         self.0.iter().any(all)
     }
 }
@@ -288,7 +288,26 @@ impl When {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Test {
     pub of: Subject,
-    pub bounds: Bounds,
+    pub bounds: Bounds<Bound>,
+}
+
+impl Test {
+    /// `value` returns the present value of a subject.
+    pub(crate) fn holds(&self, value: impl Fn(Subject) -> f64) -> bool {
+        let bounds = self.bounds.map(|bound| match bound {
+            Bound::Number(n) => n,
+            Bound::Variable(variable) => value(Subject::Variable(variable)),
+        });
+        bounds.holds(value(self.of))
+    }
+}
+
+/// A bound of a test.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Bound {
+    Number(f64),
+    /// The present value of a variable.
+    Variable(VariableRef),
 }
 
 /// A value that a condition tests.

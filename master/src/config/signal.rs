@@ -35,6 +35,12 @@ impl Signal {
     }
 
     /// Returns the lowest and highest value, and whether only integers are possible.
+    /// True if the signal has whole numbers only.
+    pub(crate) fn is_whole(&self) -> bool {
+        let (_, _, whole) = self.range();
+        whole
+    }
+
     pub(super) fn range(&self) -> (f64, f64, bool) {
         let steps = f64::from(self.field.bit_len).exp2();
         match self.kind() {

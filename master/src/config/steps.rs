@@ -381,7 +381,8 @@ impl ProgramChecker<'_> {
                 let count = values.len();
                 let values: Vec<_> = values
                     .into_iter()
-                    .filter_map(|(signal, value)| self.output(&signal, &value, p))
+                    .enumerate()
+                    .filter_map(|(at, (signal, value))| self.output(at, &signal, &value, p))
                     .collect();
                 (count > 0 && values.len() == count).then_some(Action::Set { values })?
             }

@@ -95,10 +95,22 @@ pub struct Condition {
 
 /// Bounds of a value. All given ones must hold.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Bounds {
-    pub equal: Option<f64>,
-    pub above: Option<f64>,
-    pub below: Option<f64>,
+pub struct Bounds<T = f64> {
+    pub equal: Option<T>,
+    pub above: Option<T>,
+    pub below: Option<T>,
+}
+
+impl<T: Copy> Bounds<T> {
+    /// Returns the bounds with each number converted.
+    #[must_use]
+    pub fn map<U>(self, convert: impl Fn(T) -> U) -> Bounds<U> {
+        Bounds {
+            equal: self.equal.map(&convert),
+            above: self.above.map(&convert),
+            below: self.below.map(&convert),
+        }
+    }
 }
 
 impl Bounds {

@@ -3,7 +3,7 @@
 use ecaxis_axis::Edge;
 use ecaxis_ecat::index::AxisIndex;
 
-use super::{Action, AxisValue, NumberPlace, Step, Subject, Test, When};
+use super::{Action, AxisValue, Bound, NumberPlace, Step, Subject, Test, When};
 use crate::config::{Bounds, Condition, Machine, Signal, duration};
 use crate::text::rounded;
 
@@ -18,7 +18,7 @@ impl Machine {
                 NumberPlace::Speed => format!("speed from `{name}`"),
                 NumberPlace::Ramp => format!("ramp from `{name}`"),
                 NumberPlace::Time => format!("time from `{name}`"),
-                NumberPlace::Value(_) => format!("from `{name}`"),
+                NumberPlace::Value(_) | NumberPlace::Output(_) => format!("from `{name}`"),
             })
         });
         let each: Vec<_> = each.collect();
@@ -209,7 +209,7 @@ impl Machine {
     pub fn condition(&self, condition: &Condition) -> String {
         self.test(&Test {
             of: Subject::Input(condition.input),
-            bounds: condition.bounds,
+            bounds: condition.bounds.map(Bound::Number),
         })
     }
 
@@ -249,7 +249,12 @@ impl Machine {
             below,
         } = test.bounds;
         let bounds = [("=", equal), (">", above), ("<", below)].into_iter();
-        let bounds = bounds.filter_map(|(sign, n)| Some(format!("{sign} {}", n?)));
+        let bounds = bounds.filter_map(|(sign, bound)| {
+            Some(match bound? {
+                Bound::Number(n) => format!("{sign} {n}"),
+                Bound::Variable(at) => format!("{sign} {}", self.variables.get(at.0)?.name),
+            })
+        });
         let bounds: Vec<_> = bounds.collect();
         format!(
             "{} {}",

@@ -5,7 +5,7 @@ use std::borrow::Cow;
 use ecaxis_ecat::index::AxisIndex;
 
 use super::{Action, Step};
-use crate::config::Machine;
+use crate::config::{Machine, Signal};
 
 /// A variable by its place in [`Machine::variables`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -38,6 +38,8 @@ pub enum NumberPlace {
     Time,
     /// A number of `let` or `add`, by its place.
     Value(usize),
+    /// The value of an output of `set`, by its place.
+    Output(usize),
 }
 
 impl Step {
@@ -97,6 +99,13 @@ impl Machine {
             (Action::Assign { values, .. }, NumberPlace::Value(at)) => {
                 if let Some((_, number)) = values.get_mut(at) {
                     *number = value;
+                }
+            }
+            (Action::Set { values }, NumberPlace::Output(at)) => {
+                if let Some((output, number)) = values.get_mut(at) {
+                    let signal = self.outputs.get(output.0);
+                    let whole = signal.is_some_and(Signal::is_whole);
+                    *number = if whole { value.round() } else { value };
                 }
             }
             _ => {}

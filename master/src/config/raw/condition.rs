@@ -7,6 +7,7 @@ use toml::de::DeValue;
 use super::super::fields::{Field, Key, Read, Table, TableKey, Value, Written};
 use super::super::problem::{Problems, Span};
 use super::super::schema::{self, Schema, any_of, named};
+use super::number::RawNumber;
 use super::step::Named;
 
 /// `[signals]` and `[variables]`: names with a value each.
@@ -58,17 +59,17 @@ pub(crate) struct RawSignal {
 #[derive(Debug)]
 pub(crate) struct RawCondition {
     pub signal: RawSignal,
-    pub equal: Key<f64>,
-    pub above: Key<f64>,
-    pub below: Key<f64>,
+    pub equal: Key<RawNumber>,
+    pub above: Key<RawNumber>,
+    pub below: Key<RawNumber>,
 }
 
 table! { "a condition",
     table Bounds {
         /// The signal is greater than this number
-        above: Key<f64>,
+        above: Key<RawNumber>,
         /// The signal is less than this number
-        below: Key<f64>,
+        below: Key<RawNumber>,
     }
 }
 
@@ -120,7 +121,7 @@ fn signals<'d>(
 
 /// Signals with a value each.
 #[derive(Debug, Default)]
-pub(crate) struct Levels(pub Vec<(RawSignal, Spanned<f64>)>);
+pub(crate) struct Levels(pub Vec<(RawSignal, Spanned<RawNumber>)>);
 
 impl Field for Levels {
     type Value = Self;
@@ -140,7 +141,7 @@ impl Read for Levels {
 
 impl Schema for Levels {
     fn schema() -> Json {
-        let value = any_of([f64::schema(), bool::schema()]);
+        let value = any_of([<RawNumber>::schema(), bool::schema()]);
         named(any_of([value.clone(), named(value)]))
     }
 }
@@ -152,10 +153,17 @@ fn is_bounds(table: &toml::de::DeTable<'_>) -> bool {
 }
 
 /// Reads a number; `true` is 1.
-fn level(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Key<f64> {
+fn level(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Key<RawNumber> {
+    let quoted = |word: &str| {
+        let word = word.trim();
+        matches!(word, "true" | "false" | "on" | "off") || word.parse::<f64>().is_ok()
+    };
     match value.get_ref() {
-        DeValue::Boolean(on) => Some(Spanned::new(value.span(), f64::from(u8::from(*on)))),
-        DeValue::String(word) => {
+        DeValue::Boolean(on) => {
+            let number = RawNumber::Fixed(f64::from(u8::from(*on)));
+            Some(Spanned::new(value.span(), number))
+        }
+        DeValue::String(word) if quoted(word) => {
             let message = format!("expected a number, found \"{word}\"");
             p.add_hint(
                 value.span(),
@@ -226,7 +234,7 @@ impl Schema for Conditions {
         let mut bounds = Bounds::schema();
         bounds["minProperties"] = 1.into();
         let bound = bounds["properties"].clone();
-        let condition = any_of([f64::schema(), bool::schema(), bounds]);
+        let condition = any_of([<RawNumber>::schema(), bool::schema(), bounds]);
         // A bound is a number.
         let mut signals = named(condition.clone());
         signals["properties"] = bound;

@@ -4,15 +4,16 @@ use toml::Spanned;
 
 use super::ProgramChecker;
 use super::number::{check_range, unknown_variable};
-use crate::config::fields::KeyExt;
-use crate::config::problem::{Problems, suggestion};
+use crate::config::fields::{Key, KeyExt};
+use crate::config::problem::{Problems, Span, suggestion};
 use crate::config::raw::{
-    Conditions, NamedValues, RawCondition, RawInput, RawSignal, RawSimulation, RawVariable, RawWhen,
+    Conditions, NamedValues, RawCondition, RawInput, RawNumber, RawSignal, RawSimulation,
+    RawVariable, RawWhen,
 };
 use crate::config::signal::{self, SignalDirection};
 use crate::config::{
-    AxisValue, Bounds, Condition, InputRef, NamedSignal, OutputRef, Signal, Subject, SwitchedInput,
-    Test, Variable, VariableRef, When,
+    AxisValue, Bound, Bounds, Condition, InputRef, NamedSignal, NumberPlace, OutputRef, Signal,
+    Subject, SwitchedInput, Test, Variable, VariableRef, When,
 };
 
 impl ProgramChecker<'_> {
@@ -131,16 +132,31 @@ impl ProgramChecker<'_> {
         raw: &RawCondition,
         p: &mut Problems<'_>,
     ) -> Option<Condition> {
+        for bound in [&raw.equal, &raw.above, &raw.below].into_iter().flatten() {
+            if let RawNumber::Variable(_) = bound.get_ref() {
+                let message = "this condition holds without the program, which has the variables";
+                p.add_hint(bound.span(), message, "write a number");
+                return None;
+            }
+        }
+        let (input, bounds) = (self.input(raw, p)?, self.bounds(raw, p)?);
+        let bounds = bounds.map(|bound| match bound {
+            Bound::Number(n) => n,
+            Bound::Variable(_) => f64::NAN,
+        });
+        Some(Condition { input, bounds })
+    }
+
+    /// Returns the input that a condition tests.
+    fn input(&mut self, raw: &RawCondition, p: &mut Problems<'_>) -> Option<InputRef> {
         let signal = self.signal(&raw.signal, p)?;
         let input = signal::resolve(&signal, self.devices, SignalDirection::In, p)?;
-        if let Some(equal) = &raw.equal {
-            possible(&input, equal, p)?;
+        if let Some(equal) = &raw.equal
+            && let RawNumber::Fixed(n) = equal.get_ref()
+        {
+            possible(&input, *n, equal.span(), p)?;
         }
-        let bounds = bounds(raw, p)?;
-        Some(Condition {
-            input: InputRef(signal::known(&mut self.inputs, input)),
-            bounds,
-        })
+        Some(InputRef(signal::known(&mut self.inputs, input)))
     }
 
     /// Returns a condition of a step.
@@ -179,13 +195,13 @@ impl ProgramChecker<'_> {
             }
         };
         let Some(of) = of else {
-            let Condition { input, bounds } = self.condition(raw, p)?;
-            let of = Subject::Input(input);
+            let of = Subject::Input(self.input(raw, p)?);
+            let bounds = self.bounds(raw, p)?;
             return Some(Test { of, bounds });
         };
         if let (Subject::Axis(_, value), Some(equal)) = (of, &raw.equal) {
-            let n = *equal.get_ref();
-            if value.is_yes_or_no() && n != 0.0 && n != 1.0 {
+            let other = |n: &RawNumber| !matches!(n, RawNumber::Fixed(n) if *n == 0.0 || *n == 1.0);
+            if value.is_yes_or_no() && other(equal.get_ref()) {
                 let axis = raw
                     .signal
                     .device
@@ -206,8 +222,62 @@ impl ProgramChecker<'_> {
                 return None;
             }
         }
-        let bounds = bounds(raw, p)?;
+        let bounds = self.bounds(raw, p)?;
         Some(Test { of, bounds })
+    }
+
+    /// Returns the bounds of a condition.
+    fn bounds(&mut self, raw: &RawCondition, p: &mut Problems<'_>) -> Option<Bounds<Bound>> {
+        let mut bound = |raw: &Key<RawNumber>| match raw {
+            None => Some(None),
+            Some(raw) => match raw.get_ref() {
+                RawNumber::Fixed(n) => Some(Some(Bound::Number(*n))),
+                RawNumber::Variable(name) => {
+                    let name = Spanned::new(raw.span(), name.clone());
+                    Some(Some(Bound::Variable(self.variable(&name, p)?)))
+                }
+            },
+        };
+        let found = [&raw.equal, &raw.above, &raw.below].map(&mut bound);
+        let [equal, above, below] = found;
+        let (equal, above, below) = (equal?, above?, below?);
+        if let (Some(low), Some(high), Some(at)) = (above, below, &raw.above)
+            && self.ends(low)[0] >= self.ends(high)[1]
+        {
+            let [low, high] = [low, high].map(|bound| self.bound_text(bound));
+            let message = format!("no value is above {low} and below {high}");
+            let hint = format!(
+                "swap them, or write a list: `[{{ … above = {low} }}, {{ … below = {high} }}]`"
+            );
+            p.add_hint(at.span(), message, hint);
+            return None;
+        }
+        Some(Bounds {
+            equal,
+            above,
+            below,
+        })
+    }
+
+    /// Returns the least and the greatest value of a bound.
+    pub(super) fn ends(&self, bound: Bound) -> [f64; 2] {
+        match bound {
+            Bound::Number(n) => [n; 2],
+            Bound::Variable(at) => {
+                let range = self.variables.get(at.0).and_then(|known| known.range);
+                range.unwrap_or([f64::NEG_INFINITY, f64::INFINITY])
+            }
+        }
+    }
+
+    pub(super) fn bound_text(&self, bound: Bound) -> String {
+        match bound {
+            Bound::Number(n) => n.to_string(),
+            Bound::Variable(at) => {
+                let name = self.variables.get(at.0).map(|known| known.name.as_str());
+                format!("`{}`", name.unwrap_or("?"))
+            }
+        }
     }
 
     /// Returns the inputs that the simulated bus switches.
@@ -226,7 +296,12 @@ impl ProgramChecker<'_> {
                     signal::resolve(&signal, self.devices, SignalDirection::In, p)
                 });
                 let Some(input) = input else { continue };
-                if possible(&input, &value, p).is_none() {
+                let RawNumber::Fixed(n) = *value.get_ref() else {
+                    let message = "the simulated bus knows no variables of the program";
+                    p.add_hint(value.span(), message, "write a number, true or false");
+                    continue;
+                };
+                if possible(&input, n, value.span(), p).is_none() {
                     continue;
                 }
                 let device = self.devices[input.device].device;
@@ -242,55 +317,41 @@ impl ProgramChecker<'_> {
                     at_ns: at.value().unwrap_or(0),
                     for_ns: duration.value(),
                     input,
-                    value: *value.get_ref(),
+                    value: n,
                 });
             }
         }
         switched
     }
 
+    /// Returns an output of `set`, the one at this place, with its value.
     pub(super) fn output(
         &mut self,
+        place: usize,
         raw: &RawSignal,
-        value: &Spanned<f64>,
+        value: &Spanned<RawNumber>,
         p: &mut Problems<'_>,
     ) -> Option<(OutputRef, f64)> {
         let signal = self.signal(raw, p)?;
         let output = signal::resolve(&signal, self.devices, SignalDirection::Out, p)?;
-        possible(&output, value, p)?;
+        let number = self.number(value, NumberPlace::Output(place), p)?;
+        let is_fixed = matches!(value.get_ref(), RawNumber::Fixed(_));
+        for end in number.ends {
+            // A whole number of a variable is rounded when the step runs.
+            let end = if is_fixed { end } else { end.round() };
+            possible(&output, end, value.span(), p)?;
+        }
         let index = signal::known(&mut self.outputs, output);
         if self.output_places.len() < self.outputs.len() {
             self.output_places.push(raw.name.span());
         }
-        Some((OutputRef(index), *value.get_ref()))
+        Some((OutputRef(index), number.value))
     }
-}
-
-fn bounds(raw: &RawCondition, p: &mut Problems<'_>) -> Option<Bounds> {
-    if let (Some(above), Some(below)) = (&raw.above, &raw.below)
-        && above.get_ref() >= below.get_ref()
-    {
-        let (above_n, below_n) = (above.get_ref(), below.get_ref());
-        let message = format!("no value is above {above_n} and below {below_n}");
-        let hint = format!(
-            "swap them, or write a list: `[{{ … above = {above_n} }}, {{ … below = {below_n} }}]`"
-        );
-        p.add_hint(above.span(), message, hint);
-        return None;
-    }
-    let [equal, above, below] =
-        [&raw.equal, &raw.above, &raw.below].map(|bound| bound.as_ref().map(|n| *n.get_ref()));
-    Some(Bounds {
-        equal,
-        above,
-        below,
-    })
 }
 
 /// Checks that the signal's bits can hold the value.
-fn possible(signal: &Signal, value: &Spanned<f64>, p: &mut Problems<'_>) -> Option<()> {
+fn possible(signal: &Signal, n: f64, at: Span, p: &mut Problems<'_>) -> Option<()> {
     let (low, high, whole) = signal.range();
-    let n = *value.get_ref();
     if (low..=high).contains(&n) && (!whole || n.fract() == 0.0) {
         return Some(());
     }
@@ -302,6 +363,6 @@ fn possible(signal: &Signal, value: &Spanned<f64>, p: &mut Problems<'_>) -> Opti
     } else {
         "it is a floating-point number of 32 bits".to_owned()
     };
-    p.add_hint(value.span(), message, hint);
+    p.add_hint(at, message, hint);
     None
 }

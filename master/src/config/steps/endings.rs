@@ -6,7 +6,7 @@ use ecaxis_ecat::index::AxisIndex;
 
 use super::ProgramChecker;
 use crate::config::problem::Problems;
-use crate::config::{Action, AxisValue, Step, Subject, Test, VariableRef, When};
+use crate::config::{Action, AxisValue, Bound, Step, Subject, Test, VariableRef, When};
 
 impl ProgramChecker<'_> {
     /// `others`: the variables that other branches set meanwhile.
@@ -64,8 +64,16 @@ impl ProgramChecker<'_> {
 
     /// True if something besides the program, or another branch, changes a value of the condition.
     fn changes(&self, when: &When, others: &BTreeSet<usize>) -> bool {
-        let changes = |test: &Test| match test.of {
-            Subject::Variable(VariableRef(at)) => others.contains(&at),
+        let varies = |bound: Option<Bound>| match bound {
+            Some(Bound::Variable(VariableRef(at))) => others.contains(&at),
+            _ => false,
+        };
+        let changes = |Test { of, bounds }: &Test| match of {
+            Subject::Variable(VariableRef(at)) if !others.contains(at) => {
+                [bounds.equal, bounds.above, bounds.below]
+                    .into_iter()
+                    .any(varies)
+            }
             _ => true,
         };
         when.0.iter().any(|tests| tests.iter().any(changes))
@@ -119,11 +127,12 @@ impl ProgramChecker<'_> {
                 }
                 Subject::Axis(..) => continue,
             };
-            let bounds = test.bounds;
+            let (bounds, text) = (test.bounds, |bound| self.bound_text(bound));
+            let [least, greatest] = [0, 1].map(|end| move |bound| self.ends(bound)[end]);
             let never = match (bounds.equal, bounds.above, bounds.below) {
-                (Some(n), ..) if n < low || n > high => format!("{n}"),
-                (_, Some(n), _) if n >= high => format!("above {n}"),
-                (_, _, Some(n)) if n <= low => format!("below {n}"),
+                (Some(n), ..) if greatest(n) < low || least(n) > high => text(n),
+                (_, Some(n), _) if least(n) >= high => format!("above {}", text(n)),
+                (_, _, Some(n)) if greatest(n) <= low => format!("below {}", text(n)),
                 _ => continue,
             };
             let message = format!("`{name}` is never {never}: it is {low} to {high}");

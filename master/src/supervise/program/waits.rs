@@ -151,7 +151,7 @@ impl Turn<'_, '_> {
             let Some(timeout) = timeout else { continue };
             if clock::now().saturating_sub(begun) > timeout {
                 let tests = || when.0.iter().flatten();
-                let open = tests().find(|test| !test.bounds.holds(value(test.of)));
+                let open = tests().find(|test| !test.holds(value));
                 let (condition, value) = match (open, tests().count()) {
                     (Some(open), _) if when.0.len() == 1 => {
                         (self.machine.test(open), value(open.of))
