@@ -22,7 +22,7 @@ const REST_S: f64 = 0.05;
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum HomingError {
     /// The search took too long.
-    #[error("home was not found within {timeout_s} s")]
+    #[error("home was not found within {} s", (timeout_s * 1e3).round() / 1e3)]
     Timeout {
         /// The time limit in seconds.
         timeout_s: f64,
@@ -390,6 +390,9 @@ mod tests {
         let timeout = HomingError::Timeout { timeout_s: 5.0 };
         assert_eq!(outcome, Outcome::Failed(timeout));
         assert_eq!(timeout.to_string(), "home was not found within 5 s");
+        let timeout_s = 60e9 * 1e-9;
+        let timeout = HomingError::Timeout { timeout_s };
+        assert_eq!(timeout.to_string(), "home was not found within 60 s");
         // Aborted in each phase.
         for rows in [
             &[(CSP, NotStarted, true, 3)][..],

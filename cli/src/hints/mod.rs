@@ -281,7 +281,7 @@ fn refused(reason: Option<&CommandError>, name: &str) -> String {
 fn not_homed(error: HomingError) -> &'static str {
     match error {
         HomingError::Timeout { .. } => {
-            "check the switch or sensor of the method, its wiring and its side (0x60FD shows the drive's inputs); a long travel needs a higher `homing.search` or a longer `homing.timeout`"
+            "check the switch or sensor of the method, its wiring and its side (0x60FD shows the drive's inputs; on the simulated bus, `track` of [device.sim] places switches); a long travel needs a higher `homing.search` or a longer `homing.timeout`"
         }
         HomingError::Drive => {
             "the search reached the other limit switch or found no index pulse: check switches, their wiring and the drive's digital inputs, and the direction of `homing.method`"

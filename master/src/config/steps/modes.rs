@@ -20,6 +20,10 @@ impl ProgramChecker<'_> {
             let all = self.axes(None, p)?;
             let axes: Vec<_> = all.into_iter().filter(homes).collect();
             if axes.is_empty() {
+                // An invalid axis has been reported, and may have a homing.
+                if self.axes.iter().any(|axis| axis.setup.is_none()) {
+                    return None;
+                }
                 let hint = "add `homing = { method = 37 }` to a [device.axis]";
                 p.add_hint(at.clone(), "no axis says how it finds home", hint);
                 return None;
