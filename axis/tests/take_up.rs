@@ -165,7 +165,7 @@ fn set_points_from_outside_end_on_their_flank() {
     }
 }
 
-/// After a stop within the play the drive is where it was told to be, and the load stands.
+/// After a stop within the play the drive is at its target, and the load stands.
 #[test]
 fn a_stop_within_the_play_is_in_target() {
     for jerk_limited in [false, true] {

@@ -3,15 +3,20 @@
 
 `ecaxis run --sim` keeps a bus of nine devices in Op: a coupler, four terminals on one branch, four drives on the other. The
 package reads the whole dictionary by SDO Information and complete access. Its values must be those of `ecaxis scan --json`
-and of the machine file. Run in an environment with `requirements.txt` installed: `python tests/judges/mailbox_gateway.py`.
+and of the machine file. Wireshark's dissector reads every datagram of this exchange. Then a million damaged datagrams arrive
+at the port: the dictionary is the same afterwards, and no cycle is late or has a wrong working counter. Run in an environment with `requirements.txt` installed: `python tests/judges/mailbox_gateway.py`.
 """
 
 import asyncio
 import ctypes
 import json
 import pathlib
+import random
 import re
+import shutil
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -41,6 +46,8 @@ encoder = 2000
 limits = { position = [-10.0, 10.0], velocity = 10.0, acceleration = 100.0, torque = 100.0, following_error = 1.0 }
 """
 OP = 8
+PORT = 0x88A4
+DAMAGED = 1_000_000
 # 1100: EtherCAT MainDevice; 5001: modular device profile.
 DEVICE_TYPE = 1100 << 16 | 5001
 PROTOCOLS = ("AoE", "EoE", "CoE", "FoE", "SoE", "VoE")
@@ -94,6 +101,79 @@ class Gateway:
             if self.port and re.search(r"cycle \d{3,}", line):
                 self.ready.set()
         self.ready.set()
+
+
+class Relay:
+    """Passes the datagrams of one client to the gateway and back, and keeps them."""
+
+    def __init__(self, port):
+        self.port, self.seen, self.client = port, [], None
+        self.front, self.back = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+        self.front.bind(("127.0.0.1", 0))
+        self.back.connect(("127.0.0.1", port))
+        for pass_on in (self.requests, self.answers):
+            threading.Thread(target=pass_on, daemon=True).start()
+
+    def requests(self):
+        while True:
+            data, self.client = self.front.recvfrom(4096)
+            self.seen.append((True, data))
+            self.back.send(data)
+
+    def answers(self):
+        while True:
+            data = self.back.recv(4096)
+            self.seen.append((False, data))
+            self.front.sendto(data, self.client)
+
+    def write(self, path):
+        """Writes a recording of IP packets (link type 101), at the port of the standard."""
+        with open(path, "wb") as file:
+            file.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 101))
+            for number, (request, data) in enumerate(self.seen):
+                ports = (50000, PORT) if request else (PORT, 50000)
+                datagram = struct.pack(">HHHH", *ports, 8 + len(data), 0) + data
+                here = bytes((127, 0, 0, 1))
+                packet = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(datagram), number & 0xFFFF, 0, 64, 17, 0, here, here)
+                packet += datagram
+                file.write(struct.pack("<IIII", number // 1000, number % 1000, len(packet), len(packet)) + packet)
+
+
+def judge_recording(report, path, count):
+    """Every datagram is a mailbox telegram to its last byte."""
+    if not shutil.which("tshark"):
+        print("skipped: no tshark")
+        return
+    fields = ["frame.protocols", "_ws.malformed", "ecat_mailbox.length", "udp.length", "data.len"]
+    command = ["tshark", "-n", "-r", path, "-T", "fields", *(part for field in fields for part in ("-e", field))]
+    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    rows = [(line.split("\t") + [""] * 4)[:5] for line in lines]
+    telegrams = [row for row in rows if "ecat_mailbox" in row[0].split(":")]
+    report.equal("datagrams that tshark reads as mailbox telegrams", len(telegrams), count)
+    report.equal("malformed", sum("malformed" in row[0] or bool(row[1]) for row in rows), 0)
+    # UDP, the EtherCAT header and the header of the telegram: 16 bytes.
+    whole = sum(int(length) + 16 == int(udp) and not data for _, _, length, udp, data in telegrams)
+    report.equal("dissected to the last byte", whole, count)
+
+
+def damaged(seen, seed=1):
+    """Yields datagrams with wrong bytes, lengths or both, from real requests and from nothing."""
+    chance = random.Random(seed)
+    requests = [data for request, data in seen if request]
+    for _ in range(DAMAGED):
+        kind = chance.randrange(4)
+        if kind == 0:
+            yield chance.randbytes(chance.randrange(64))
+            continue
+        data = bytearray(chance.choice(requests))
+        for _ in range(chance.randrange(1, 4)):
+            data[chance.randrange(len(data))] = chance.randrange(256)
+        yield bytes(data[: chance.randrange(len(data) + 1)]) if kind == 1 else bytes(data)
+
+
+def send_damaged(port, seen):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as to:
+        return sum(to.sendto(datagram, ("127.0.0.1", port)) >= 0 for datagram in damaged(seen))
 
 
 async def dictionary(port):
@@ -182,20 +262,33 @@ def main():
         machine = write_machine(folder)
         scan = [rig.binary(), "scan", "--sim", machine, "--json"]
         devices = json.loads(subprocess.run(scan, check=True, capture_output=True, text=True).stdout)["devices"]
-        run = [rig.binary(), "run", machine, "--sim", "--no-enable", "--for", "60s", "--json"]
+        run = [rig.binary(), "run", machine, "--sim", "--no-enable", "--for", "120s", "--json"]
         with rig.process(run, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as child:
             gateway = Gateway(child)
             report.need("the bus is in Op", gateway.ready.wait(30) and gateway.port, gateway.lines[-1:])
+            relay = Relay(gateway.port)
+            relay_port = relay.front.getsockname()[1]
             for _ in range(20):
-                objects = asyncio.run(dictionary(gateway.port))
+                relay.seen.clear()
+                objects = asyncio.run(dictionary(relay_port))
                 # The rate of frames is known after the first second.
                 if objects.get(0xF120, {}).get("CyclicFramesPerSecond", 0) >= 100:
                     break
                 time.sleep(0.5)
+            seen = list(relay.seen)
+            recording = pathlib.Path(folder) / "gateway.pcap"
+            relay.write(recording)
+            judge_recording(report, recording, len(seen))
+            report.equal("damaged datagrams sent", send_damaged(gateway.port, seen), DAMAGED)
+            again = asyncio.run(dictionary(gateway.port))
             child.send_signal(signal.SIGINT)
             summary = json.loads(child.stdout.read())["summary"]
             child.wait(30)
     judge(report, objects, devices)
+    report.equal("objects after the damaged datagrams", sorted(again), sorted(objects), len)
+    for number in range(len(devices)):
+        judge_device(report, number, devices[number], again, devices)
+    report.equal("cycles without answer", summary["counters"]["lost_frames"], 0)
     report.equal("wrong working counters", summary["counters"]["wkc_errors"], 0)
     return report.finish()
 

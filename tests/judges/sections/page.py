@@ -619,7 +619,7 @@ def presses(bench, browser, folder):
         tab.page.wait_for_selector(switch)
         names = tab.page.locator("[data-switch]").evaluate_all("all => all.map(each => each.dataset.switch)")
         report.equal("the page has a switch for each named input", names, ["closed", "hold", "start", "stop"])
-        # Inputs belong to nobody: no lease is needed.
+        # Inputs need no lease.
         for text, value in (("Press", 1), ("Release", 0)):
             wait_for(f"the button {text}", lambda: tab.page.inner_text(switch) == text)
             tab.page.click(switch)
