@@ -21,6 +21,7 @@ mod coe_answer;
 mod error_text;
 pub mod foe;
 pub mod gateway;
+pub mod soe;
 
 pub use abort_code::abort_text;
 pub use error_text::mailbox_error_text;
