@@ -381,11 +381,37 @@ fn sdo(error: &SdoError, origin: &str) -> String {
             abort::DEVICE_STATE => "the drive refuses it in its present state: switch it off and on",
             _ => "look the code up in the drive's manual; `ecaxis explain` shows where the value comes from",
         },
+        CoeCause::Soe(code) => soe(code),
+        CoeCause::Command(_) => "read S-0-0095 and S-0-0390 of the drive: they say why it does not execute the command",
         CoeCause::Timeout { .. } => "the drive does not answer its mailbox: switch it off and on",
         CoeCause::Gone | CoeCause::Wire(_) => "check the device's power and the cable to it",
         _ => "record the exchange with `--record`",
     }
     .to_owned()
+}
+
+/// Returns the hint for an SoE error code.
+const fn soe(code: u16) -> &'static str {
+    match code {
+        0x1001 => "the drive has no such IDN: S-0-0017 lists those that it has",
+        0x7002 | 0x7003 => {
+            "the value has another length in the drive: its attribute shows it (`ecaxis soe read`)"
+        }
+        0x7005 | 0x7012 => {
+            "the state does not allow it: end what drives the device, or enable the drive first"
+        }
+        0x7006 | 0x7007 => {
+            "the value is outside of minimum and maximum: `ecaxis soe read` shows them"
+        }
+        0x700a => {
+            "process data carries this value: write it with the program, or remove it from S-0-0024"
+        }
+        0x8001..=0x8009 | 0x2001..=0x6005 => {
+            "the drive does not have or protects this element; its value may be accessible"
+        }
+        0x800a => "count the drives of a device from 0: `--drive 0` is the first one",
+        _ => "look the IDN up in the drive's manual",
+    }
 }
 
 /// The origin of start-up SDOs from the machine file.

@@ -1,11 +1,12 @@
-//! CoE errors, with the full address of the object.
+//! CoE and SoE errors, with the full address of the object.
 
 use std::fmt;
 use std::time::Duration;
 
+use ecaxis_ecat::mailbox::soe::{CommandState, soe_error_text};
 use ecaxis_ecat::mailbox::{abort_text, mailbox_error_text};
 
-use super::{DatagramError, InfoRequest, MAX_OBJECT};
+use super::{DatagramError, IdnElement, InfoRequest, MAX_OBJECT};
 use ecaxis_ecat::object::NamedObject;
 
 /// An error of a CoE service. `station` is the SubDevice's configured address. The transfer has
@@ -28,6 +29,12 @@ pub enum CoeCause {
     /// The SubDevice aborted, with a CiA 301 or vendor-specific code.
     #[error("was refused with {:#010x}: {}", .0, abort_text(*.0))]
     Abort(u32),
+    /// The drive answered with an SoE error code.
+    #[error("was refused with {:#06x}: {}", .0, soe_error_text(*.0))]
+    Soe(u16),
+    /// A procedure command did not end as executed.
+    #[error("ended as: {0}")]
+    Command(CommandState),
     /// No answer in time. Meanwhile `set_aside` messages arrived that belong to something else.
     #[error("{phase} within {after:?}{}", StrayReplies(*set_aside))]
     Timeout {
@@ -46,7 +53,7 @@ pub enum CoeCause {
     /// Frames come back, but this SubDevice processed none of them.
     #[error("the device does not answer: it is off, or has lost its address")]
     Gone,
-    #[error("mailboxes of {out_len} bytes out and {in_len} bytes in cannot carry CoE")]
+    #[error("mailboxes of {out_len} bytes out and {in_len} bytes in cannot carry its protocols")]
     Mailbox { out_len: u16, in_len: u16 },
     /// No frames come back.
     #[error("{}", LostDatagram(.0))]
@@ -74,7 +81,10 @@ impl<S: fmt::Display> CoeError<S> {
     /// Returns the text without the station, for a reader who knows the device.
     pub fn without_station(&self) -> impl fmt::Display {
         let colon = match self.cause {
-            CoeCause::Abort(_) | CoeCause::TooLarge(_) => "",
+            CoeCause::Abort(_)
+            | CoeCause::Soe(_)
+            | CoeCause::Command(_)
+            | CoeCause::TooLarge(_) => "",
             _ => ":",
         };
         format!("{}{colon} {}", self.asked, self.cause)
@@ -86,6 +96,14 @@ impl<S> CoeError<S> {
     pub fn abort_code(&self) -> Option<u32> {
         match self.cause {
             CoeCause::Abort(code) => Some(code),
+            _ => None,
+        }
+    }
+
+    /// Returns the drive's SoE error code, if there is one.
+    pub fn soe_code(&self) -> Option<u16> {
+        match self.cause {
+            CoeCause::Soe(code) => Some(code),
             _ => None,
         }
     }
@@ -102,7 +120,10 @@ impl<S> CoeError<S> {
 
     /// True if the device itself refused; it may still answer other requests.
     pub fn is_refusal(&self) -> bool {
-        matches!(self.cause, CoeCause::Abort(_) | CoeCause::Refused(_))
+        matches!(
+            self.cause,
+            CoeCause::Abort(_) | CoeCause::Soe(_) | CoeCause::Refused(_)
+        )
     }
 }
 
@@ -110,6 +131,8 @@ impl<S> CoeError<S> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Subject {
     Object(NamedObject),
+    /// An element of an IDN (SoE).
+    Idn(IdnElement),
     /// Reading and discarding the messages in the mailbox.
     Emptying,
     /// A message of another program.
@@ -120,6 +143,7 @@ impl fmt::Display for Subject {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Object(at) => at.fmt(f),
+            Self::Idn(at) => at.fmt(f),
             Self::Emptying => f.write_str("emptying its mailbox"),
             Self::Telegram => f.write_str("a message of the mailbox gateway"),
         }
@@ -149,6 +173,8 @@ pub enum Phase {
     Repeat,
     /// The transfer continued, but too slowly.
     Transfer,
+    /// The drive did not execute a procedure command (SoE).
+    Command,
 }
 
 impl fmt::Display for Phase {
@@ -158,6 +184,7 @@ impl fmt::Display for Phase {
             Self::Answer => "no answer came",
             Self::Repeat => "a lost answer was not repeated",
             Self::Transfer => "the transfer was not complete",
+            Self::Command => "the procedure command was not executed",
         })
     }
 }

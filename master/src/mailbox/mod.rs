@@ -1,4 +1,4 @@
-//! CoE and FoE over raw datagrams, also during operation. May wait and allocate. Never panics on
+//! CoE, FoE and SoE over raw datagrams, also during operation. May wait and allocate. Never panics on
 //! data from a device.
 //!
 //! - [`MailboxTransport`]: the datagrams, the delay and the clock that this module uses.
@@ -7,6 +7,7 @@
 //! - `sdo`, `transfer`: [`CoeClient`], SDO upload and download.
 //! - `sdo_info`: the object dictionary as reported by the device (SDO Information).
 //! - [`foe`]: [`FoeClient`], file transfer.
+//! - `soe`: IDNs and procedure commands of Sercos drives, also by [`CoeClient`].
 //! - `raw`: messages of any protocol from other programs.
 //! - `worker`: [`Mailboxes`], transfers from any thread while workers serve the mailboxes.
 //! - `error`, `emergency`, `object_names`: error types and texts.
@@ -21,6 +22,7 @@ pub mod foe;
 mod raw;
 mod sdo;
 mod sdo_info;
+mod soe;
 mod transfer;
 mod transport;
 pub mod worker;
@@ -28,12 +30,13 @@ pub mod worker;
 pub use crate::rt::exchange::MailboxStatus;
 pub use ecaxis_ecat::mailbox::{abort_text, mailbox_error_text};
 pub use ecaxis_ecat::object::{NamedObject, object_name};
-pub use emergency::{EMERGENCY_QUEUE, Emergencies, Emergency, Received};
+pub use emergency::{EMERGENCY_QUEUE, Emergencies, Emergency, EmergencySource, Received};
 pub use error::{CoeCause, CoeError, InfoError, Phase, SdoError, Subject};
 pub use foe::{FoeCause, FoeClient, FoeError};
 pub use raw::{RawAnswer, RawMessage};
 pub use sdo::{CoeClient, MAX_OBJECT};
 pub use sdo_info::{EntryDescription, InfoRequest, ObjectDescription, ObjectList};
+pub use soe::IdnElement;
 pub use worker::{DeviceMailbox, MailboxError, MailboxSession, Mailboxes};
 
 /// Datagrams to a SubDevice, and time. This module has no other access to the outside.
@@ -109,7 +112,7 @@ impl Timeouts {
         match phase {
             Phase::Request | Phase::Repeat => self.request,
             Phase::Answer => self.answer,
-            Phase::Transfer => self.transfer,
+            Phase::Transfer | Phase::Command => self.transfer,
         }
     }
 }

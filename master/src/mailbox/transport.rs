@@ -5,7 +5,7 @@ use std::mem;
 use std::time::Duration;
 
 use ecaxis_ecat::mailbox::coe::Message;
-use ecaxis_ecat::mailbox::{Encode, MIN_LENGTH};
+use ecaxis_ecat::mailbox::{Encode, MIN_LENGTH, soe};
 
 use super::emergency::{Emergencies, Emergency};
 use super::error::Phase;
@@ -346,14 +346,18 @@ impl Port {
         Ok(count)
     }
 
-    /// Queues an emergency and drops any other message.
+    /// Queues an emergency or a notification and drops any other message.
     pub(super) fn set_aside<W: MailboxTransport>(&mut self, w: &W) {
-        match Message::parse(&self.incoming) {
-            Ok(Message::Emergency(bytes)) => {
-                self.emergencies
-                    .push(w.now(), Emergency::from_bytes(*bytes));
-            }
-            _ => self.forgotten += 1,
+        let emergency = match Message::parse(&self.incoming) {
+            Ok(Message::Emergency(bytes)) => Some(Emergency::from_bytes(*bytes)),
+            _ => match soe::Message::parse(&self.incoming) {
+                Ok(soe::Message::Telegram(telegram)) => Emergency::from_telegram(&telegram),
+                _ => None,
+            },
+        };
+        match emergency {
+            Some(emergency) => self.emergencies.push(w.now(), emergency),
+            None => self.forgotten += 1,
         }
     }
 

@@ -58,6 +58,7 @@ impl EmergencyReport {
             code,
             register,
             data,
+            ..
         } = self.emergency;
         EmergencyLine {
             device: self.device.clone(),

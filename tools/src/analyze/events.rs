@@ -80,7 +80,7 @@ impl EventKind {
         match self {
             Self::State { error, .. } => *error,
             Self::Transfer(transfer) => transfer.is_trouble(),
-            Self::Emergency(emergency) => !emergency.is_reset(),
+            Self::Emergency(emergency) => emergency.is_failure(),
             Self::File(file) => file.error.is_some(),
             Self::Refused(_) | Self::ErrorBit => true,
             Self::Axis { state, .. } => {

@@ -18,7 +18,7 @@ pub struct Idn(pub u16);
 const PRODUCT: u16 = 0x8000;
 const BLOCK: u16 = 0x0fff;
 
-/// A text that is no IDN.
+/// A text that is not an IDN.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("not an IDN: write S or P, a parameter set from 0 to 7 and a number up to 4095 (S-0-0047)")]
 pub struct IdnError;

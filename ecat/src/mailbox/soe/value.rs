@@ -6,10 +6,10 @@ use alloc::vec::Vec;
 
 use super::{Attribute, DataLength, Display, Idn, List};
 
-/// Why a text is no value of an IDN.
+/// Why a text is not a value of an IDN.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ValueError {
-    /// The text is no number of this kind.
+    /// The text is not a number of this kind.
     #[error("`{text}` is not {expected}")]
     Kind {
         /// The text.

@@ -11,11 +11,13 @@
 
 use std::fmt;
 use std::sync::Arc;
+use std::time::Duration;
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
+use ecaxis_ecat::mailbox::soe::Idn;
 use tokio::sync::{mpsc, oneshot};
 
-use super::{CoeClient, Emergencies, MailboxLayout, SdoError};
+use super::{CoeClient, Emergencies, IdnElement, MailboxLayout, SdoError};
 
 mod session;
 mod task;
@@ -26,14 +28,27 @@ pub use task::{MailboxWorker, run_with_workers};
 /// The capacity of a device's queue; further requests wait in their futures.
 const QUEUE: usize = 8;
 
-/// One SDO transfer.
+/// One transfer.
 #[derive(Debug)]
-struct Request {
-    index: u16,
-    sub: u8,
-    complete: bool,
-    /// The data to write; `None` reads.
-    data: Option<Vec<u8>>,
+enum Request {
+    Sdo {
+        index: u16,
+        sub: u8,
+        complete: bool,
+        /// The data to write; `None` reads.
+        data: Option<Vec<u8>>,
+    },
+    Idn {
+        at: IdnElement,
+        /// The data to write; `None` reads.
+        data: Option<Vec<u8>>,
+    },
+    /// Executes a procedure command.
+    Command {
+        drive: u8,
+        idn: Idn,
+        timeout: Duration,
+    },
 }
 
 #[derive(Debug)]
@@ -229,6 +244,40 @@ impl DeviceMailbox {
         }
     }
 
+    /// Reads an element of an IDN (SoE).
+    ///
+    /// # Errors
+    /// [`MailboxError`].
+    pub async fn read_idn(&self, at: IdnElement) -> Result<Vec<u8>, MailboxError> {
+        self.transfer(Request::Idn { at, data: None }).await
+    }
+
+    /// Writes an element of an IDN (SoE).
+    ///
+    /// # Errors
+    /// [`MailboxError`].
+    pub async fn write_idn(&self, at: IdnElement, data: &[u8]) -> Result<(), MailboxError> {
+        let data = Some(data.to_vec());
+        self.transfer(Request::Idn { at, data }).await.map(drop)
+    }
+
+    /// Executes a procedure command of a drive (SoE).
+    ///
+    /// # Errors
+    /// [`MailboxError`].
+    pub async fn execute_command(
+        &self,
+        (drive, idn): (u8, Idn),
+        timeout: Duration,
+    ) -> Result<(), MailboxError> {
+        let command = Request::Command {
+            drive,
+            idn,
+            timeout,
+        };
+        self.transfer(command).await.map(drop)
+    }
+
     async fn ask(
         &self,
         index: u16,
@@ -236,14 +285,18 @@ impl DeviceMailbox {
         complete: bool,
         data: Option<&[u8]>,
     ) -> Result<Vec<u8>, MailboxError> {
-        let (reply, answer) = oneshot::channel();
         let data = data.map(<[u8]>::to_vec);
-        let request = Request {
+        self.transfer(Request::Sdo {
             index,
             sub,
             complete,
             data,
-        };
+        })
+        .await
+    }
+
+    async fn transfer(&self, request: Request) -> Result<Vec<u8>, MailboxError> {
+        let (reply, answer) = oneshot::channel();
         let job = Job::Transfer { request, reply };
         self.lane.send(job).await.map_err(|_| self.closed())?;
         let answer = answer.await.map_err(|_| self.closed())?;

@@ -198,18 +198,38 @@ async fn transfer<W: MailboxTransport>(
     wire: &W,
     request: Request,
 ) -> Result<Vec<u8>, SdoError> {
-    let Request {
-        index,
-        sub,
-        complete,
-        data,
-    } = request;
-    match data {
-        Some(data) => {
+    match request {
+        Request::Sdo {
+            index,
+            sub,
+            complete,
+            data: Some(data),
+        } => {
             let written = coe.download(wire, index, sub, complete, &data).await;
             written.map(|()| Vec::new())
         }
-        None => coe.upload(wire, index, sub, complete).await,
+        Request::Sdo {
+            index,
+            sub,
+            complete,
+            data: None,
+        } => coe.upload(wire, index, sub, complete).await,
+        Request::Idn {
+            at,
+            data: Some(data),
+        } => {
+            let written = coe.write_idn(wire, at, &data).await;
+            written.map(|()| Vec::new())
+        }
+        Request::Idn { at, data: None } => coe.read_idn(wire, at).await,
+        Request::Command {
+            drive,
+            idn,
+            timeout,
+        } => {
+            let executed = coe.execute_command(wire, (drive, idn), timeout).await;
+            executed.map(|()| Vec::new())
+        }
     }
 }
 

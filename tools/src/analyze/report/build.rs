@@ -252,7 +252,7 @@ fn device_report<'e>(
             }
             EventKind::Emergency(emergency) => {
                 report.emergencies += 1;
-                if !emergency.is_reset() {
+                if emergency.is_failure() {
                     once(&mut report.emergency_codes, emergency.code);
                 }
             }
