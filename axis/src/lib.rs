@@ -32,6 +32,7 @@ mod limits;
 mod position_loop;
 mod profile_mode;
 pub mod scale;
+pub mod sercos;
 pub mod setpoint;
 pub mod status;
 pub mod supervision;
@@ -48,6 +49,7 @@ pub use homing::{Homing, HomingError};
 pub use limits::{LimitError, Limits};
 pub use position_loop::{FeedForward, Loops, PositionPid, VelocityLoop};
 pub use scale::{AccelerationUnit, Scale, ScaleError, VelocityBase, VelocityUnit};
+pub use sercos::{ControlOutput, DriveWords, SercosWords};
 pub use status::{
     AxisStatus, CommandError, DriveFault, EnableBlocker, HomingStatus, StopPhase, StopStatus, Trip,
 };

@@ -46,6 +46,29 @@ pub const fn of(index: u16) -> Option<(u16, u16)> {
     }
 }
 
+/// The objects of CiA 402 that mean the same as IDNs of Sercos drives, with the same units. Only the
+/// bits of control word and status word differ.
+const SAME_AS_IDN: [(u16, u16); 11] = [
+    (134, 0x6040),
+    (135, 0x6041),
+    (36, 0x60ff),
+    (37, 0x60b1),
+    (40, 0x606c),
+    (47, 0x607a),
+    (51, 0x6064),
+    (80, 0x6071),
+    (81, 0x60b2),
+    (84, 0x6077),
+    (189, 0x60f4),
+];
+
+/// Returns the object of CiA 402 that means the same as an IDN.
+#[must_use]
+pub fn same_as_idn(idn: u16) -> Option<u16> {
+    let mut known = SAME_AS_IDN.iter();
+    known.find(|(own, _)| *own == idn).map(|(_, same)| *same)
+}
+
 /// Returns the index that an object of this axis has in the first axis; `None` for an object of
 /// another axis.
 fn seen(index: u16, axis: u16) -> Option<u16> {
@@ -57,17 +80,23 @@ fn seen(index: u16, axis: u16) -> Option<u16> {
 
 impl Layout {
     /// Returns the process data as a drive with this axis alone has them: its objects have the
-    /// indices of a first axis, the other axes have none.
+    /// indices of a first axis, the other axes have none. IDNs of a Sercos drive have the indices of
+    /// the objects that mean the same; other IDNs are left out.
     #[must_use]
     pub fn of_axis(&self, axis: u16) -> Cow<'_, Self> {
-        if axis == 0 {
+        if axis == 0 && !self.idns {
             return Cow::Borrowed(self);
         }
+        let seen = |field: &Field| match self.idns {
+            true => same_as_idn(field.index).filter(|_| u16::from(field.sub) == axis),
+            false => seen(field.index, axis),
+        };
         let own = |fields: &[Field]| {
             let own = fields.iter().filter_map(|field| {
-                let index = seen(field.index, axis)?;
+                let index = seen(field)?;
                 Some(Field {
                     index,
+                    sub: if self.idns { 0 } else { field.sub },
                     ..field.clone()
                 })
             });
@@ -105,7 +134,7 @@ impl Selection {
     /// Returns the selection as that of a drive with this axis alone. Its PDOs and modules stay.
     #[must_use]
     pub fn of_axis(&self, axis: u16) -> Cow<'_, Self> {
-        if axis == 0 {
+        if axis == 0 && !self.layout.idns {
             return Cow::Borrowed(self);
         }
         let startup = self.startup.iter().filter_map(|sdo| {

@@ -38,6 +38,8 @@ pub struct Layout {
     pub rx_pdos: Vec<PdoLayout>,
     /// The PDOs of the inputs in wire order.
     pub tx_pdos: Vec<PdoLayout>,
+    /// True if the objects are IDNs (SoE), and their subindices the drives of the device.
+    pub idns: bool,
 }
 
 /// The layout of one process data SyncManager.
@@ -105,6 +107,7 @@ impl Layout {
             tx,
             rx_pdos,
             tx_pdos,
+            idns: false,
         };
         layout.check_addresses(device)?;
         // Digital I/O controllers without a processor latch single bytes and do not need buffers.

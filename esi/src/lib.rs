@@ -35,5 +35,5 @@ pub use select::{
     DcSettings, DeviceQuery, EntryRef, SelectError, SelectOptions, SelectedModule, Selection,
     UserSdo, find_device, offered_modes, select,
 };
-pub use startup::StartupSdo;
+pub use startup::{IdnValue, StartupIdn, StartupSdo};
 pub use xml::{decode_text, parse, parse_where};

@@ -353,10 +353,6 @@ fn usable(found: &mut FindingBuilder, path: &str, file: &EsiFile, device: &Devic
         found.add(severity, position, &path, format!("{what}: {error}"));
     };
     match select(file, device, &choice) {
-        Err(error @ SelectError::SoeOnly { .. }) => {
-            found.add(Severity::Error, device.position, path, error.to_string());
-            return;
-        }
         // The file is correct: the user must name the modules.
         Err(error @ SelectError::ModuleNeeded { .. }) => {
             refuse(Severity::Note, "its default configuration", &error);

@@ -394,7 +394,7 @@ fn every_device_is_selectable_with_its_defaults() {
                         device.name
                     );
                 }
-                Err(SelectError::ModuleNeeded { .. } | SelectError::SoeOnly { .. }) => {}
+                Err(SelectError::ModuleNeeded { .. }) => {}
                 Err(error) => panic!("{} {}: {error}", path.display(), device.name),
             }
             for mode in offered_modes(&file, device) {

@@ -262,12 +262,29 @@ fn a_slot_that_needs_a_module_is_a_note() {
     assert!(findings[0].message.contains("needs a module"));
 }
 
+/// A start-up command of SoE that cannot be read is left out with its line.
 #[test]
-fn an_soe_only_drive_is_rejected() {
-    let file = device("<Mailbox><SoE/></Mailbox>", "");
-    let error = choose(&file, None).unwrap_err();
-    assert!(matches!(error, SelectError::SoeOnly { .. }), "{error}");
-    let findings = lint(&file);
-    assert_eq!(findings[0].severity, Severity::Error);
-    assert!(choose(&device("<Mailbox><CoE/><SoE/></Mailbox>", ""), None).is_ok());
+fn a_damaged_idn_command_is_left_out() {
+    let command = |attributes: &str, idn: &str| {
+        format!(
+            "<Mailbox><SoE><InitCmd{attributes}><Transition>PS</Transition>{idn}<Data>0100</Data></InitCmd></SoE></Mailbox>"
+        )
+    };
+    for (attributes, idn) in [
+        ("", ""),
+        (" Chn=\"8\"", "<IDN>1</IDN>"),
+        ("", "<IDN>65536</IDN>"),
+    ] {
+        let file = device(&command(attributes, idn), "");
+        let soe = file.devices[0].soe_only().expect("SoE");
+        assert!(soe.init_cmds.is_empty(), "{idn}");
+        assert_eq!(lint(&file)[0].severity, Severity::Error, "{idn}");
+    }
+    let file = device(&command(" Chn=\"7\"", "<IDN>65535</IDN>"), "");
+    let soe = file.devices[0].soe_only().expect("SoE");
+    assert_eq!(
+        (soe.init_cmds[0].drive, soe.init_cmds[0].idn.to_string()),
+        (7, "P-7-4095".into())
+    );
+    assert!(lint(&file).iter().all(|f| f.severity != Severity::Error));
 }

@@ -4,7 +4,7 @@ use std::fmt;
 
 use super::{
     DcMode, Dictionary, Fmmu, FmmuUse, LocalName, Mailbox, Pdo, Position, Slots, SmMapping, SmUse,
-    SyncManager, SyncUnit,
+    Soe, SyncManager, SyncUnit,
 };
 use ecaxis_ecat::vendor::VendorId;
 
@@ -107,11 +107,23 @@ pub struct Device {
 }
 
 impl Device {
-    /// True for SoE (SERCOS over EtherCAT) without CoE, where IDNs define the process data.
+    /// Returns the properties of SoE (Sercos over EtherCAT) of a device without CoE, where IDNs define
+    /// the process data.
     #[must_use]
-    pub fn is_soe_only(&self) -> bool {
-        let mailbox = self.mailbox.as_ref();
-        mailbox.is_some_and(|mailbox| mailbox.soe && mailbox.coe.is_none())
+    pub fn soe_only(&self) -> Option<&Soe> {
+        let mailbox = self.mailbox.as_ref()?;
+        mailbox.soe.as_ref().filter(|_| mailbox.coe.is_none())
+    }
+
+    /// Numbers the entries of a device with SoE only: each gets its drive as subindex.
+    pub(crate) fn number_drives(&mut self) {
+        if self.soe_only().is_none() {
+            return;
+        }
+        for pdo in self.rx_pdos.iter_mut().chain(&mut self.tx_pdos) {
+            let drive = pdo.drive();
+            pdo.entries.iter_mut().for_each(|entry| entry.sub = drive);
+        }
     }
 
     /// Returns the SyncManager through which the MainDevice reads the mailbox.

@@ -1,5 +1,7 @@
 //! Mailbox protocols and their start-up commands.
 
+use ecaxis_ecat::mailbox::soe::Idn;
+
 use super::{Position, SlotDependence};
 
 /// `Mailbox`: the supported protocols.
@@ -13,8 +15,8 @@ pub struct Mailbox {
     pub foe: bool,
     /// Ethernet over EtherCAT.
     pub eoe: bool,
-    /// Servo drive profile over EtherCAT.
-    pub soe: bool,
+    /// Servo drive profile over EtherCAT; `None`: not supported.
+    pub soe: Option<Soe>,
     /// ADS over EtherCAT.
     pub aoe: bool,
     /// Vendor-specific protocol over EtherCAT.
@@ -40,6 +42,35 @@ pub struct Coe {
     pub diag_history: bool,
     /// `InitCmd` in file order.
     pub init_cmds: Vec<InitCmd>,
+}
+
+/// `SoE`: properties of the servo drive profile over EtherCAT.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Soe {
+    /// `ChannelCount`: the number of drives in the device; `None`: not in the file.
+    pub channel_count: Option<u8>,
+    /// `DriveFollowsBit3Support`: bit 3 of the drive status word reports that the drive follows its
+    /// command values.
+    pub follows_bit: bool,
+    /// `InitCmd` in file order.
+    pub init_cmds: Vec<IdnInitCmd>,
+}
+
+/// `SoE/InitCmd`: an IDN that the vendor requires at a state transition.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct IdnInitCmd {
+    /// The position of the element.
+    pub position: Position,
+    /// `IP`, `PS`, `SO`, …; one command may have several.
+    pub transitions: Vec<String>,
+    /// `Chn`: the drive of the device, from 0.
+    pub drive: u8,
+    /// `IDN`.
+    pub idn: Idn,
+    /// The value.
+    pub data: Vec<u8>,
+    /// `Comment`.
+    pub comment: String,
 }
 
 /// `InitCmd`: an SDO download that the vendor requires at a state transition.

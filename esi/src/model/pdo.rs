@@ -86,6 +86,12 @@ pub struct SlotDependence {
 }
 
 impl Pdo {
+    /// Returns the drive of a telegram of a device with SoE: bits 12 to 14 of the index.
+    #[must_use]
+    pub fn drive(&self) -> u8 {
+        self.index.to_be_bytes()[0] >> 4 & 7
+    }
+
     /// Returns the length in bits.
     #[must_use]
     pub fn bit_len(&self) -> u32 {

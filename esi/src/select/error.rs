@@ -347,13 +347,27 @@ pub enum SelectError {
         /// The length of the object in bytes.
         expected: usize,
     },
-    /// The device supports SoE and not CoE.
+    /// An object of CoE is to be written to a device with SoE only.
     #[error(
-        "{device} speaks SoE and not CoE: what its process data contains is set by SoE IDNs, which ecaxis does not speak"
+        "{device} speaks SoE and not CoE: it has no object {}; write IDNs (`idn`) instead of `sdo`", address(*index, *sub)
     )]
     SoeOnly {
         /// The type name of the device.
         device: String,
+        /// The index.
+        index: u16,
+        /// The subindex.
+        sub: u8,
+    },
+    /// S-0-0001 and S-0-0002 cannot express the bus cycle.
+    #[error(
+        "{device}: a cycle of {cycle_ns} ns cannot be written to S-0-0001 and S-0-0002, which hold 1 to 65535 µs"
+    )]
+    SoeCycle {
+        /// The type name of the device.
+        device: String,
+        /// The bus cycle in ns.
+        cycle_ns: u64,
     },
     /// The choice needs a CoE mailbox, and the device has none.
     #[error("{device} has no CoE mailbox, so {what} cannot be written")]

@@ -27,6 +27,7 @@ mod error;
 mod module;
 mod oversampling;
 mod pdo;
+mod soe;
 
 pub use dc::DcSettings;
 pub use device::{DeviceQuery, find_device};
@@ -40,7 +41,7 @@ use crate::model::{
     Device, Dictionary, Direction, EsiFile, Identity, InitCmd, Module, Object, Pdo, Position,
     Warning,
 };
-use crate::startup::{self, StartupSdo};
+use crate::startup::{self, StartupIdn, StartupSdo};
 
 /// An object for a PDO mapping.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -88,6 +89,8 @@ pub struct SelectOptions<'a> {
     pub cycle_ns: u64,
     /// Start-up SDOs of the user, sent last.
     pub sdo: &'a [UserSdo],
+    /// Start-up IDNs of the user (SoE), sent last.
+    pub idns: &'a [StartupIdn],
 }
 
 /// The complete configuration of one device.
@@ -119,6 +122,8 @@ pub struct Selection {
     pub layout: Layout,
     /// The SDOs to send before SafeOp, in order.
     pub startup: Vec<StartupSdo>,
+    /// The IDNs to write at start-up, in order (SoE).
+    pub startup_idns: Vec<StartupIdn>,
     /// Decisions that the user may not expect.
     pub notes: Vec<String>,
 }
@@ -171,10 +176,8 @@ pub fn select(
     device: &Device,
     choice: &SelectOptions<'_>,
 ) -> Result<Selection, SelectError> {
-    if device.is_soe_only() {
-        return Err(SelectError::SoeOnly {
-            device: device.name.clone(),
-        });
+    if let Some(soe) = device.soe_only() {
+        return soe::select(file, device, soe, choice);
     }
     let axes = match choice.axes {
         [] => &[0],
@@ -260,6 +263,7 @@ pub fn select(
         dc,
         layout,
         startup: Vec::new(),
+        startup_idns: Vec::new(),
         notes,
     };
     selection.startup = startup::list(device, &mut selection, &dictionary, choice)?;
@@ -318,6 +322,9 @@ fn merged(device: &Device, placed: &[module::PluggedModule<'_>]) -> Dictionary {
 /// texts.
 #[must_use]
 pub fn offered_modes(file: &EsiFile, device: &Device) -> Vec<Mode> {
+    if device.soe_only().is_some() {
+        return vec![Mode::Csp, Mode::Csv, Mode::Cst];
+    }
     let has_slots = device
         .slots
         .as_ref()

@@ -10,7 +10,7 @@ use super::{
 };
 use crate::model::{
     Coe, DcMode, Device, Direction, Eeprom, Entry, EsiFile, Fmmu, Identification, Info, Mailbox,
-    Pdo, SmUse, SyncManager, SyncTime, SyncUnit, Vendor,
+    Pdo, SmUse, Soe, SyncManager, SyncTime, SyncUnit, Vendor,
 };
 
 impl Sii {
@@ -24,7 +24,7 @@ impl Sii {
             all.collect()
         };
         let type_name = type_name(self, &general);
-        Device {
+        let mut device = Device {
             identity: self.identity,
             name: match general.name.as_str() {
                 "" => type_name.clone(),
@@ -57,7 +57,9 @@ impl Sii {
                 ..Eeprom::default()
             },
             ..Device::default()
-        }
+        };
+        device.number_drives();
+        device
     }
 
     /// Returns an ESI file with this device only.
@@ -291,7 +293,7 @@ fn mailbox(sii: &Sii, general: &General) -> Option<Mailbox> {
         }),
         foe: protocols.has(Protocols::FOE),
         eoe: protocols.has(Protocols::EOE),
-        soe: protocols.has(Protocols::SOE),
+        soe: protocols.has(Protocols::SOE).then(Soe::default),
         aoe: protocols.has(Protocols::AOE),
         voe: protocols.has(Protocols::VOE),
     })

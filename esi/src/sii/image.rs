@@ -204,7 +204,7 @@ fn protocols(mailbox: &Mailbox) -> Protocols {
         (mailbox.eoe, Protocols::EOE),
         (mailbox.coe.is_some(), Protocols::COE),
         (mailbox.foe, Protocols::FOE),
-        (mailbox.soe, Protocols::SOE),
+        (mailbox.soe.is_some(), Protocols::SOE),
         (mailbox.voe, Protocols::VOE),
     ];
     Protocols(

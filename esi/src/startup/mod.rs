@@ -21,6 +21,8 @@ mod pdo;
 
 use std::collections::HashMap;
 
+use ecaxis_ecat::mailbox::soe::Idn;
+
 use crate::axis;
 use crate::layout::Layout;
 use crate::model::{Device, InitCmd, Object, ObjectItem, Writable};
@@ -47,6 +49,30 @@ pub struct StartupSdo {
     pub origin: String,
     /// True if the device may refuse the SDO and keep its own value.
     pub optional: bool,
+}
+
+/// One IDN to write (SoE).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StartupIdn {
+    /// The transition, as in [`StartupSdo`].
+    pub transition: &'static str,
+    /// The drive of the device, from 0.
+    pub drive: u8,
+    /// The IDN.
+    pub idn: Idn,
+    /// The value.
+    pub value: IdnValue,
+    /// The element or key from which the IDN originates.
+    pub origin: String,
+}
+
+/// The value of a start-up IDN.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum IdnValue {
+    /// The bytes; lists contain their lengths.
+    Bytes(Vec<u8>),
+    /// A text whose bytes follow from the attribute that the drive reports.
+    Text(String),
 }
 
 /// The transitions up to Op, in order.

@@ -54,6 +54,7 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Devi
     }
     (device.name, device.names) = names.take_all();
     mapping::complete(&mut device);
+    device.number_drives();
     if device.name.is_empty() {
         device.name = device.type_name.clone();
     }

@@ -4,7 +4,9 @@
 use super::cursor::{Cursor, Element};
 use super::text::Names;
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Coe, InitCmd, Mailbox, SlotDependence};
+use ecaxis_ecat::mailbox::soe::{Idn, MAX_DRIVES};
+
+use crate::model::{Coe, IdnInitCmd, InitCmd, Mailbox, SlotDependence, Soe};
 
 pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Mailbox, EsiError> {
     let mut mailbox = Mailbox {
@@ -16,7 +18,7 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Mail
             "CoE" => mailbox.coe = Some(coe(c, el)?),
             "FoE" => mailbox.foe = true,
             "EoE" => mailbox.eoe = true,
-            "SoE" => mailbox.soe = true,
+            "SoE" => mailbox.soe = Some(soe(c, el)?),
             "AoE" => mailbox.aoe = true,
             "VoE" => mailbox.voe = true,
             _ => {}
@@ -44,6 +46,63 @@ fn coe<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Coe, EsiError> {
         Ok(())
     })?;
     Ok(coe)
+}
+
+fn soe<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Soe, EsiError> {
+    let mut soe = Soe {
+        channel_count: c.attribute_number(element, "ChannelCount")?,
+        follows_bit: c.attribute_flag(element, "DriveFollowsBit3Support")?,
+        init_cmds: Vec::new(),
+    };
+    c.children(element, |c, el| {
+        if el.name == "InitCmd" {
+            let read = idn_init_cmd(c, el).map(|cmd| soe.init_cmds.push(cmd));
+            return c.leave_out(el, read);
+        }
+        Ok(())
+    })?;
+    Ok(soe)
+}
+
+fn idn_init_cmd<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<IdnInitCmd, EsiError> {
+    let drive: u8 = c.attribute_number(element, "Chn")?.unwrap_or(0);
+    if drive >= MAX_DRIVES {
+        return Err(c.error_at(
+            element,
+            EsiProblem::Number {
+                what: "InitCmd Chn",
+                text: drive.to_string(),
+                min: 0,
+                max: i128::from(MAX_DRIVES - 1),
+            },
+        ));
+    }
+    let mut cmd = IdnInitCmd {
+        position: c.position(element),
+        transitions: Vec::new(),
+        drive,
+        idn: Idn::default(),
+        data: Vec::new(),
+        comment: String::new(),
+    };
+    let mut comments = Names::default();
+    let mut idn = None;
+    c.children(element, |c, el| {
+        match el.name {
+            "Transition" => cmd.transitions.push(c.text(el)?.to_ascii_uppercase()),
+            "IDN" => idn = Some(c.number(el, "InitCmd IDN")?),
+            "Data" => cmd.data = c.hex_bytes(el, "InitCmd data")?,
+            "Comment" => comments.add(c, el)?,
+            _ => {}
+        }
+        Ok(())
+    })?;
+    let missing = EsiProblem::Missing {
+        what: "InitCmd/IDN",
+    };
+    cmd.idn = Idn(idn.ok_or_else(|| c.error_at(element, missing))?);
+    cmd.comment = comments.take().into_owned();
+    Ok(cmd)
 }
 
 fn init_cmd<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<InitCmd, EsiError> {

@@ -69,9 +69,6 @@ fn of_device(file: &EsiFile, device: &Device, full: bool) -> String {
         ..SelectOptions::default()
     };
     choices.add("default", &plain, full);
-    if device.is_soe_only() {
-        return choices.out;
-    }
     for mode in offered_modes(file, device) {
         choices.add(
             &format!("mode {mode}"),

@@ -35,7 +35,7 @@ pub fn device(device: &Device) -> String {
         for (set, name) in [
             (mailbox.foe, "foe"),
             (mailbox.eoe, "eoe"),
-            (mailbox.soe, "soe"),
+            (mailbox.soe.is_some(), "soe"),
             (mailbox.aoe, "aoe"),
             (mailbox.voe, "voe"),
         ] {

@@ -72,3 +72,30 @@ errors! {
     0x800b => "general error",
     0x800c => "no element is addressed",
 }
+
+/// The errors of class 1 in the order of the bits of S-0-0011 (IEC 61800-7-204).
+pub const CLASS_1_DIAGNOSTICS: [&str; 16] = [
+    "overload shutdown",
+    "amplifier overtemperature",
+    "motor overtemperature",
+    "cooling error",
+    "control voltage error",
+    "feedback error",
+    "commutation error",
+    "overcurrent",
+    "overvoltage",
+    "undervoltage",
+    "error of the power supply phases",
+    "excessive position deviation",
+    "communication error",
+    "travel limit exceeded",
+    "reserved bit 14",
+    "manufacturer-specific error (S-0-0129)",
+];
+
+/// Returns the texts of the bits of S-0-0011 that are set.
+pub fn class_1_texts(bits: u16) -> impl Iterator<Item = &'static str> {
+    let all = (0..).zip(CLASS_1_DIAGNOSTICS);
+    all.filter(move |(bit, _)| bits >> bit & 1 != 0)
+        .map(|(_, text)| text)
+}

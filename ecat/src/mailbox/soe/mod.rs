@@ -31,7 +31,7 @@ mod tests;
 mod value;
 
 pub use attribute::{Attribute, CommandState, DataLength, DataState, Display, List};
-pub use error::{ERROR_CODES, soe_error_text};
+pub use error::{CLASS_1_DIAGNOSTICS, ERROR_CODES, class_1_texts, soe_error_text};
 pub use idn::{IDN_NAMES, Idn, IdnError};
 pub use value::{ValueError, format_value, parse_value};
 

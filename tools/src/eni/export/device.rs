@@ -125,7 +125,7 @@ impl PlacedDevice<'_> {
             ("AoE", mailbox.aoe),
             ("EoE", mailbox.eoe),
             ("CoE", mailbox.coe.is_some()),
-            ("SoE", mailbox.soe),
+            ("SoE", mailbox.soe.is_some()),
             ("FoE", mailbox.foe),
             ("VoE", mailbox.voe),
         ] {

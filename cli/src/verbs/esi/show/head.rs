@@ -131,7 +131,7 @@ pub(super) fn protocols(mailbox: &Mailbox) -> String {
         (mailbox.coe.is_some(), "CoE"),
         (mailbox.foe, "FoE"),
         (mailbox.eoe, "EoE"),
-        (mailbox.soe, "SoE"),
+        (mailbox.soe.is_some(), "SoE"),
         (mailbox.aoe, "AoE"),
         (mailbox.voe, "VoE"),
     ];

@@ -93,24 +93,15 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return print_json(&as_json::device(&file, device, &choice, &selection));
     }
     let mut out = head::document(&file, device);
-    let mailbox = device.mailbox.as_ref();
-    let soe_alone = mailbox.is_some_and(|mailbox| mailbox.soe && mailbox.coe.is_none());
-    if soe_alone {
-        out.heading(
-            "not usable: it speaks SoE and not CoE; IDNs set what its process data contains, and ecaxis does not \
-             speak SoE",
-        );
-    }
     offers::write(&file, device, &choice, &mut out);
     match &selection {
-        Ok(selection) if !soe_alone => configuration(device, selection, &choice, &mut out),
-        Err(error) if !soe_alone => {
+        Ok(selection) => configuration(device, selection, &choice, &mut out),
+        Err(error) => {
             out.heading(format!("no default configuration: {error}"));
             if matches!(error, SelectError::ModuleNeeded { .. }) {
                 note("help: `--modules` takes one module for each slot, `-` for none");
             }
         }
-        _ => {}
     }
     print(&out)
 }
