@@ -108,6 +108,8 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
             "set the device's alias or ID switch, or find it by `position`".to_owned()
         }
         Cause::StartUp { source, origin, .. } => sdo(source, origin),
+        Cause::StartUpIdn { source, origin, .. } => sdo(source, origin),
+        Cause::IdnValue { .. } => "correct the value in `idn`; `ecaxis soe read` shows the attribute".into(),
         Cause::NotHeld { .. } => {
             "the device rounds or limits the value, or another object has changed it: write the value that it holds, or omit `verify` for this object".to_owned()
         }

@@ -322,7 +322,7 @@ fn merged(device: &Device, placed: &[module::PluggedModule<'_>]) -> Dictionary {
 /// texts.
 #[must_use]
 pub fn offered_modes(file: &EsiFile, device: &Device) -> Vec<Mode> {
-    if device.soe_only().is_some() {
+    if device.soe_only().is_some() && !device.rx_pdos.is_empty() {
         return vec![Mode::Csp, Mode::Csv, Mode::Cst];
     }
     let has_slots = device

@@ -31,6 +31,7 @@ pub(super) async fn start_up(
     moment: StartupPhase,
     progress: &dyn Fn(Step),
 ) -> Result<(), Error> {
+    super::soe::start_up(wire, config, device, moment, progress).await?;
     let due = |transition: &str| (transition == "SO") == (moment == StartupPhase::InSafeOp);
     let list: Vec<_> = config
         .selection

@@ -68,7 +68,7 @@ pub(crate) async fn bring_back(
     let init = device.transition(AlState::Init, true);
     al::change_states(wire, &[init], AlState::Init).await?;
     reset(wire, &device.at).await?;
-    let before = device.coe.as_ref().map(|coe| *coe.layout());
+    let before = device.client().map(|client| *client.layout());
     mailbox::restore(wire, config, &device.at, before.as_ref()).await?;
     if let (true, Some(reference)) = (device.dc, bus.reference) {
         let _held = bus.latch.lock().await;

@@ -83,7 +83,8 @@ fn sync_manager(number: u8) -> u16 {
     registers::SYNC_MANAGER + registers::SYNC_MANAGER_LEN * u16::from(number)
 }
 
-/// Returns the mailbox that the device has from now on; `None` if the ESI declares no CoE. `device`
+/// Returns the mailbox that the device has from now on; `None` if the ESI declares neither
+/// CoE nor SoE. `device`
 /// is in PreOp before and afterwards.
 pub(super) async fn open(
     wire: &impl MailboxTransport,
@@ -91,8 +92,7 @@ pub(super) async fn open(
     device: &DeviceRef,
     progress: &dyn Fn(Step),
 ) -> Result<Option<MailboxLayout>, Error> {
-    let coe = config.device.mailbox.as_ref().and_then(|m| m.coe.as_ref());
-    let (Some(_), Some(esi)) = (coe, EsiMailbox::of(config)) else {
+    let Some(esi) = EsiMailbox::of(config).filter(|_| is_used(config)) else {
         return Ok(None);
     };
     let area = |(_, sm): (u8, &SyncManager)| (sm.start_address, sm.default_size);
@@ -135,10 +135,9 @@ pub(super) async fn open(
     }))
 }
 
-/// Returns the mailbox that a device has by its ESI; `None` without CoE.
+/// Returns the mailbox that a device has by its ESI; `None` without CoE and SoE.
 pub(super) fn expected(config: &DeviceConfig, device: &DeviceRef) -> Option<MailboxLayout> {
-    config.device.mailbox.as_ref()?.coe.as_ref()?;
-    let esi = EsiMailbox::of(config)?;
+    let esi = EsiMailbox::of(config).filter(|_| is_used(config))?;
     Some(MailboxLayout {
         station: device.station,
         out_address: esi.out.1.start_address,
@@ -148,6 +147,12 @@ pub(super) fn expected(config: &DeviceConfig, device: &DeviceRef) -> Option<Mail
         out_sm: esi.out.0,
         in_sm: esi.inp.0,
     })
+}
+
+/// True if the device has CoE, or SoE alone.
+fn is_used(config: &DeviceConfig) -> bool {
+    let mailbox = config.device.mailbox.as_ref();
+    mailbox.is_some_and(|m| m.coe.is_some() || m.soe.is_some())
 }
 
 /// Address and length of both mailboxes, out and in.

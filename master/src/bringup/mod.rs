@@ -49,6 +49,7 @@ mod mapping;
 mod output_defaults;
 pub mod process_data;
 pub(crate) mod ring;
+mod soe;
 mod times;
 pub(crate) use identify::{compare as compare_identity, known as known_identity, name_at};
 mod watchdog;
@@ -76,6 +77,8 @@ pub struct BusDevice {
     pub timeouts: StateTimeouts,
     /// `None` without a CoE mailbox, and once a mailbox worker owns the mailbox.
     pub coe: Option<CoeClient>,
+    /// Likewise of a device with SoE and without CoE.
+    pub soe: Option<CoeClient>,
     /// True if the device has a system time: not every device that reports one in 0x0008 has it
     /// enabled.
     pub dc: bool,
@@ -307,8 +310,11 @@ async fn describe(
     let status = enumerate::at(wire, position, "reading its ports", registers::DL_STATUS).await;
     // Used only for a later comparison; 0 if unreadable.
     let dl_status = status.map_or(0, u16::from_le_bytes);
+    let client = coe.map(|layout| CoeClient::new(layout).with_timeouts(mailbox_timeouts(info)));
+    let (coe, soe) = by_protocol(config, client);
     Ok(BusDevice {
-        coe: coe.map(|layout| CoeClient::new(layout).with_timeouts(mailbox_timeouts(info))),
+        coe,
+        soe,
         timeouts: StateTimeouts::new(info),
         at,
         held: Vec::new(),
@@ -325,6 +331,17 @@ async fn describe(
     })
 }
 
+/// Returns the client of a device as that of CoE, or of SoE.
+fn by_protocol(
+    config: &DeviceConfig,
+    client: Option<CoeClient>,
+) -> (Option<CoeClient>, Option<CoeClient>) {
+    match config.device.soe_only() {
+        Some(_) => (None, client),
+        None => (client, None),
+    }
+}
+
 /// Returns an optional device that is absent, with its future station address.
 fn absent(config: &DeviceConfig, index: u16) -> BusDevice {
     /// Devices that are present have lower addresses.
@@ -336,8 +353,11 @@ fn absent(config: &DeviceConfig, index: u16) -> BusDevice {
         station: FIRST_ABSENT + index,
     };
     let coe = mailbox::expected(config, &at);
+    let client = coe.map(|layout| CoeClient::new(layout).with_timeouts(mailbox_timeouts(info)));
+    let (coe, soe) = by_protocol(config, client);
     BusDevice {
-        coe: coe.map(|layout| CoeClient::new(layout).with_timeouts(mailbox_timeouts(info))),
+        coe,
+        soe,
         timeouts: StateTimeouts::new(info),
         at,
         held: Vec::new(),
@@ -476,6 +496,7 @@ impl BusDevice {
         Self {
             at: self.at.clone(),
             coe: None,
+            soe: None,
             held: Vec::new(),
             adopted: Vec::new(),
             limits: Vec::new(),
@@ -484,10 +505,24 @@ impl BusDevice {
         }
     }
 
+    /// Returns the client of the device's mailbox.
+    pub(crate) fn client(&self) -> Option<&CoeClient> {
+        self.coe.as_ref().or(self.soe.as_ref())
+    }
+
+    pub(crate) fn take_client(&mut self) -> Option<CoeClient> {
+        self.coe.take().or_else(|| self.soe.take())
+    }
+
+    /// Gives the device the client of its mailbox.
+    pub(crate) fn set_client(&mut self, config: &DeviceConfig, client: Option<CoeClient>) {
+        (self.coe, self.soe) = by_protocol(config, client);
+    }
+
     /// Passes the device's emergencies to the listener.
     fn report(&self, listener: &dyn EmergencySink) {
-        if let Some(coe) = &self.coe {
-            listener.listen(&self.at.name, &coe.emergencies());
+        if let Some(client) = self.client() {
+            listener.listen(&self.at.name, &client.emergencies());
         }
     }
 }

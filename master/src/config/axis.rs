@@ -47,7 +47,11 @@ pub(crate) fn setup(
     config.jerk_limited = raw.limits.jerk.is_some();
     config.loops = control::loops(raw, shown, selection, p)?;
     control::guards(raw, &mut config, &torque, shown, p)?;
-    config.quick_stop = quick_stop(sdos, selection);
+    config.quick_stop = match selection.is_some_and(|selection| selection.layout.idns) {
+        // A falling edge of "drive on" decelerates, then removes the torque.
+        true => Some(QuickStopOption(2)),
+        false => quick_stop(sdos, selection),
+    };
     let homing = match &raw.homing {
         Some(homing) => Some(control::homing(homing, &config, selection, p)?),
         None => None,

@@ -10,7 +10,7 @@ use toml::Spanned;
 use super::fields::{Key, KeyExt};
 use super::needed::{self, Needs};
 use super::problem::{Problems, Span, suggestion};
-use super::raw::{RawDevice, RawEntry};
+use super::raw::{RawDevice, RawEntry, SdoValue};
 use super::{DeviceConfig, Locator, MailboxSource, Startup, gateway, sdo, sim};
 use crate::esi_library::{RevisionMatch, SiiImage};
 use crate::rt::config::ProcessDataCopy;
@@ -337,6 +337,7 @@ impl DeviceQuery<'_> {
             .iter()
             .map(String::as_str)
             .collect();
+        let idns = self.idns(device, p)?;
         let mut choice = esi::SelectOptions {
             mode: self.mode,
             axes: self.axes,
@@ -349,6 +350,7 @@ impl DeviceQuery<'_> {
             dc_mode: self.raw.dc.as_ref().map(|d| d.get_ref().as_str()),
             cycle_ns: self.cycle_ns,
             sdo: &[],
+            idns: &idns,
         };
         let mut first = esi::select(file, device, &choice)
             .map_err(|e| self.report(&e, p))
@@ -393,6 +395,41 @@ impl DeviceQuery<'_> {
         Some(selection)
     }
 
+    /// Returns the start-up IDNs of the file.
+    fn idns(&self, device: &esi::Device, p: &mut Problems<'_>) -> Option<Vec<esi::StartupIdn>> {
+        let mut idns = Vec::new();
+        for raw in &self.raw.idn {
+            if device.soe_only().is_none() {
+                let message = format!("{} has no IDNs: it does not speak SoE alone", device.name);
+                p.add_hint(raw.span.clone(), message, "write objects with `sdo`");
+                return None;
+            }
+            let Ok(idn) = raw.idn.get_ref().parse() else {
+                let message = format!("`{}` is not an IDN", raw.idn.get_ref());
+                p.add_hint(
+                    raw.idn.span(),
+                    message,
+                    "write it as \"S-0-0138\" or \"P-0-0150\"",
+                );
+                return None;
+            };
+            idns.push(esi::StartupIdn {
+                transition: "PS",
+                drive: raw.drive.value().unwrap_or(0),
+                idn,
+                value: match raw.value.get_ref() {
+                    SdoValue::Integer(n) => esi::IdnValue::Text(n.to_string()),
+                    SdoValue::Float(n) => esi::IdnValue::Text(n.to_string()),
+                    SdoValue::Boolean(b) => esi::IdnValue::Text(u8::from(*b).to_string()),
+                    SdoValue::Text(text) => esi::IdnValue::Text(text.clone()),
+                    SdoValue::Bytes(bytes) => esi::IdnValue::Bytes(bytes.clone()),
+                },
+                origin: "idn of the machine file".to_owned(),
+            });
+        }
+        Some(idns)
+    }
+
     fn report(&self, e: &esi::SelectError, p: &mut Problems<'_>) {
         use esi::SelectError as E;
         let raw = self.raw;
@@ -425,7 +462,9 @@ impl DeviceQuery<'_> {
             E::NoSuchDcMode { .. } => of(raw.dc.place()),
             E::NoSuchModule { .. } | E::TooManyModules { .. } => of(raw.modules.place()),
             E::NoSuchAssignment { .. } => of(raw.assignment.place()),
-            E::CycleNotExpressible { .. } | E::DcOutOfRange { .. } => self.cycle.clone(),
+            E::CycleNotExpressible { .. } | E::SoeCycle { .. } | E::DcOutOfRange { .. } => {
+                self.cycle.clone()
+            }
             E::UnknownEntry { list, index, sub }
             | E::NotMappable {
                 list, index, sub, ..
@@ -433,7 +472,7 @@ impl DeviceQuery<'_> {
             E::NotConfigurable { list: name, .. }
             | E::TooManyEntries { list: name, .. }
             | E::MissingEntry { list: name, .. } => list(name),
-            E::SdoLength { index, sub, .. } => sdo(*index, *sub),
+            E::SdoLength { index, sub, .. } | E::SoeOnly { index, sub, .. } => sdo(*index, *sub),
             _ => device.clone(),
         };
         match e {

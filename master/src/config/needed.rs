@@ -109,7 +109,8 @@ pub(crate) fn missing(
     needs: &Needs,
     layout: &esi::layout::Layout,
 ) -> Option<AddedObjects> {
-    if raw.pdo.rx.is_some() || raw.pdo.tx.is_some() {
+    // A Sercos drive has no mode in its process data.
+    if raw.pdo.rx.is_some() || raw.pdo.tx.is_some() || layout.idns {
         return None;
     }
     let mut missing = [Vec::new(), Vec::new()];

@@ -38,6 +38,12 @@ impl Startup {
         Self { all, own }
     }
 
+    /// Returns the options of IDNs (SoE).
+    #[must_use]
+    pub fn of_idns(&self) -> StartupOptions {
+        self.all
+    }
+
     /// Returns the options of an object. Store and restore parameters (0x1010, 0x1011) read back
     /// other values than written, so they have none.
     #[must_use]

@@ -89,7 +89,7 @@ impl DeviceInfo {
                 mailbox.eoe,
                 coe,
                 mailbox.foe,
-                mailbox.soe,
+                mailbox.soe.is_some(),
                 mailbox.voe,
             ]
         });

@@ -49,7 +49,9 @@ impl Class {
             | Cause::Scan(_)
             | Cause::Missing { .. }
             | Cause::Reversed { .. } => Self::Bus,
-            Cause::StartUp { source, .. } | Cause::Sdo(source) => match source.cause {
+            Cause::StartUp { source, .. }
+            | Cause::StartUpIdn { source, .. }
+            | Cause::Sdo(source) => match source.cause {
                 CoeCause::Gone | CoeCause::Wire(_) => Self::Bus,
                 // A device that another MainDevice sets to Init loses its mailbox.
                 CoeCause::Timeout { .. } if evidence.other_frames() > 0 => Self::Bus,

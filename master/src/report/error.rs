@@ -9,7 +9,7 @@ use ecaxis_axis::{CommandError, Mode, State, Statusword, Trip};
 
 use crate::config::{LimitConflict, UnitProblem};
 use crate::link::{LinkError, OpenError};
-use crate::mailbox::{DatagramError, InfoError, SdoError};
+use crate::mailbox::{DatagramError, IdnElement, InfoError, SdoError};
 use crate::rt::gateway::NodeState;
 use crate::rt::image::{NotMapped, TooLarge};
 use crate::rt::setpoint_generator::GeneratorError;
@@ -17,9 +17,12 @@ use crate::text::rounded;
 
 use super::cause_text::{al_note, by, code_note, list, lost, lost_note, mode_note};
 use super::error_place::{FailedStep, Location};
-use super::{DeviceRef, DiagnosisMessage, EepromError, EmergencyReport, StateError};
+use super::{
+    DeviceRef, DiagnosisMessage, EepromError, EmergencyReport, SercosDiagnosis, StateError,
+};
 use ecaxis_ecat::al_state::AlState;
 use ecaxis_ecat::al_status_code::al_status_text;
+use ecaxis_ecat::mailbox::soe::ValueError;
 use ecaxis_esi::address;
 use ecaxis_esi::sii::{SiiError, SiiWarning};
 
@@ -175,6 +178,21 @@ pub enum Cause {
         value: String,
         origin: String,
         source: SdoError,
+    },
+    /// A start-up IDN of a Sercos drive.
+    #[error("start-up IDN {at} = {value} (from {origin}): {}", source.cause)]
+    StartUpIdn {
+        at: IdnElement,
+        value: String,
+        origin: String,
+        source: SdoError,
+    },
+    /// The value of a start-up IDN does not fit the attribute that the drive reports.
+    #[error("start-up IDN {at} (from {origin}): {problem}")]
+    IdnValue {
+        at: IdnElement,
+        origin: String,
+        problem: ValueError,
     },
     /// `verify` in the machine file.
     #[error(
@@ -531,6 +549,8 @@ pub struct DriveReport {
     pub history: Vec<DiagnosisMessage>,
     /// The drive's own limits that the machine file exceeds.
     pub limits: Vec<LimitConflict>,
+    /// What a Sercos drive says.
+    pub sercos: Option<SercosDiagnosis>,
 }
 
 impl fmt::Display for DriveReport {
@@ -540,6 +560,9 @@ impl fmt::Display for DriveReport {
         }
         for message in &self.history {
             write!(f, "; diagnosis history: {message}")?;
+        }
+        if let Some(sercos) = &self.sercos {
+            sercos.fmt(f)?;
         }
         Ok(())
     }

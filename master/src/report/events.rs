@@ -74,6 +74,9 @@ fn describe_event(event: Event, machine: &Machine) -> String {
         } => {
             format!("`{}` refused a command: {reason}", axis(at))
         }
+        Event::ResetDrive { axis: at, .. } => {
+            format!("`{}` clears the errors of its drive (S-0-0099)", axis(at))
+        }
         Event::PhaseLocked { .. } => "frames are in phase with SYNC0".to_owned(),
         Event::PhaseLost { .. } => "frames have lost their phase to SYNC0".to_owned(),
         Event::ClockOff {

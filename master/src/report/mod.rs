@@ -16,6 +16,7 @@ mod error;
 mod error_place;
 pub mod events;
 mod progress;
+mod sercos_diagnosis;
 pub(crate) mod summary;
 
 pub(crate) use device_error::EEPROM_TIMEOUT;
@@ -29,6 +30,7 @@ pub use events::EventLine;
 pub use progress::{
     AxisLine, DevicePlace, Home, Observer, ProbeCapture, Progress, Status, StepRef, UnknownDevice,
 };
+pub use sercos_diagnosis::SercosDiagnosis;
 pub use summary::{
     AxisSummary, DeviceErrors, GatewaySummary, GroupStop, NodeSummary, Summary, ThreadSummary,
 };

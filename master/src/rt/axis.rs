@@ -1,6 +1,8 @@
 //! One axis in the cycle, between its process data and its set-point generator.
 
-use ecaxis_axis::{Axis, AxisStatus, Command, CommandError, Inputs, Outputs, StopMethod};
+use ecaxis_axis::{
+    Axis, AxisStatus, Command, CommandError, DriveWords, Inputs, Outputs, StopMethod,
+};
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex};
 
 use super::gantry::Leader;
@@ -15,6 +17,8 @@ use crate::clock::Nanos;
 pub struct RtAxis {
     pub axis: Axis,
     pub bits: AxisBits,
+    /// The words of the drive's profile.
+    pub words: DriveWords,
     pub device: DeviceIndex,
     /// The node of an axis behind a gateway.
     pub node: Option<NodePlace>,
@@ -37,6 +41,8 @@ pub struct RtAxis {
     /// group.
     pub(super) armed: bool,
     pub(super) ordered: bool,
+    /// The drive needs a procedure command to clear its errors.
+    pub(super) reset: bool,
     /// The axis was processed in this cycle.
     pub(super) acted: bool,
     /// The override of this cycle.
@@ -51,6 +57,7 @@ impl RtAxis {
         Self {
             axis,
             bits,
+            words: DriveWords::Cia402,
             device,
             node: None,
             cycles: 1,
@@ -64,6 +71,7 @@ impl RtAxis {
             heard: None,
             armed: false,
             ordered: false,
+            reset: false,
             acted: false,
             rates: Rates::WHOLE,
             leader: None,
@@ -111,7 +119,7 @@ impl RtAxis {
     pub(super) fn read(&self, image: &[u8], fresh: bool, late: bool) -> Inputs {
         let bits = &self.bits;
         Inputs {
-            statusword: bits.statusword.get(image) as u16,
+            statusword: self.words.statusword(bits.statusword.get(image) as u16),
             position: bits.position.map(|b| b.get(image) as i32),
             velocity: bits.velocity.map(|b| b.get(image) as i32),
             torque: bits.torque.map(|b| b.get(image) as i16),
@@ -130,12 +138,14 @@ impl RtAxis {
         }
     }
 
-    pub(super) fn write(&self, image: &mut [u8], outputs: &Outputs) {
+    pub(super) fn write(&mut self, image: &mut [u8], outputs: &Outputs) {
+        let control = self.words.control(outputs.controlword);
+        self.reset |= control.reset;
         let bits = &self.bits;
         let mode = self
             .node
             .map_or(outputs.mode, |_| epos::vendor_mode(outputs.mode));
-        bits.controlword.set(image, i64::from(outputs.controlword));
+        bits.controlword.set(image, i64::from(control.word));
         for (to, value) in [
             (bits.mode, i64::from(mode)),
             (bits.target_position, i64::from(outputs.target_position)),

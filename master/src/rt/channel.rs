@@ -93,6 +93,11 @@ pub enum Event {
         axis: AxisIndex,
         reason: CommandError,
     },
+    /// A Sercos drive needs the procedure command S-0-0099 to clear its errors.
+    ResetDrive {
+        cycle: u64,
+        axis: AxisIndex,
+    },
     /// The machine begins to stop.
     Stopping {
         cycle: u64,

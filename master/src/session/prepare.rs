@@ -5,7 +5,7 @@ use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use ecaxis_axis::Axis;
+use ecaxis_axis::{Axis, DriveWords, SercosWords};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
 use ethercrab::MainDevice;
@@ -115,7 +115,7 @@ impl RunBuilder<'_> {
                 let members = bus.devices.iter().map(|device| ExchangeDevice {
                     station: device.at.station,
                     clock: device.follows,
-                    mailbox: device.coe.as_ref().map(|coe| coe.layout().in_sm),
+                    mailbox: device.client().map(|client| client.layout().in_sm),
                 });
                 let members: Vec<_> = members.collect();
                 let (rt_end, outer) = channel(&first_snapshot(
@@ -201,6 +201,7 @@ impl RunBuilder<'_> {
                     sim_inputs,
                     buttons: Buttons::default(),
                     mailbox_gateway: None,
+                    resets: None,
                     ring_delays,
                     device_log: DeviceLog::default(),
                 };
@@ -247,9 +248,10 @@ fn mailbox_workers(
     let wires =
         CyclicMailboxTransport::all(wire, &exchange.bus_status(), bus.devices.len(), cycle_ns);
     let openings = bus.devices.iter_mut().zip(wires).map(|(device, wire)| {
-        let mailbox = device.coe.take().map(|coe| (wire, coe));
+        let coe = device.coe.is_some();
+        let mailbox = device.take_client().map(|client| (wire, client));
         let name = device.at.name.clone();
-        WorkerConfig { name, mailbox }
+        WorkerConfig { name, mailbox, coe }
     });
     let listener: Arc<dyn EmergencySink> = Arc::new(log.clone());
     worker::open(openings, &listener)
@@ -300,6 +302,9 @@ fn plan(machine: &Machine) -> Result<CyclePlan, Error> {
         let axis = Axis::compensated(config, setup.compensation.clone())
             .map_err(|error| Cause::Axis(error).with_name(&setup.name))?;
         let mut slot = RtAxis::new(axis, bits, index, image.groups[index]);
+        if let Some(soe) = machine.devices[index].device.soe_only() {
+            slot.words = DriveWords::Sercos(SercosWords::new(soe.follows_bit));
+        }
         if let Some(node) = setup.node {
             let gateway = gateways.iter().position(|g: &Gateway| g.device() == index);
             let number = gateway.unwrap_or(gateways.len());

@@ -6,13 +6,14 @@ use std::time::Duration;
 use ecaxis_axis::{AxisStatus, State, Trip};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex};
 
+use super::sercos;
 use super::{Supervisor, diagnosis_history};
 use crate::acyclic::al;
 use crate::clock::{self, Nanos};
 use crate::config::{InputRef, LimitConflict};
 use crate::post_mortem::snapshot::{self, Depth};
 use crate::post_mortem::{DeviceSnapshot, Witnessed};
-use crate::report::{Cause, DriveReport, Error, Progress};
+use crate::report::{Cause, DriveReport, Error, Progress, SercosDiagnosis};
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::{RtCommand, Snapshot};
 use crate::rt::setpoint_generator::GeneratorState;
@@ -73,7 +74,10 @@ impl Supervisor {
             },
             StopCause::DriveFault { axis } => {
                 let since = clock::now().saturating_sub(BEFORE_A_FAULT);
-                let code = self.error_code(axis).await;
+                let code = match sercos::drive_of(&self.machine, axis) {
+                    None => self.error_code(axis).await,
+                    Some(_) => None,
+                };
                 if let Some(code) = code {
                     self.send(RtCommand::ErrorCode { axis, code }).await;
                 }
@@ -175,6 +179,12 @@ impl Supervisor {
     /// Reports a fault from before this run; enabling clears it.
     pub(super) async fn report_preexisting_fault(&mut self, axis: AxisIndex) {
         let name = self.axis_name(axis);
+        if let Some(sercos) = self.sercos_diagnosis(axis).await {
+            self.report(Progress::Warning(format!(
+                "`{name}` had an error before this run; it is reset{sercos}"
+            )));
+            return;
+        }
         let code = self.error_code(axis).await.unwrap_or(0);
         let text = ecaxis_axis::cia402::describe(code).text;
         self.report(Progress::Warning(format!(
@@ -192,8 +202,11 @@ impl Supervisor {
 
     /// Reads an object of an axis's device. Returns `None` after a timeout.
     async fn upload(&mut self, axis: AxisIndex, index: u16) -> Option<Vec<u8>> {
-        // A gateway passes no SDO on to its nodes.
+        // A gateway passes no SDO on to its nodes, and a Sercos drive has no objects.
         let setup = self.setup(axis).filter(|setup| setup.node.is_none())?;
+        if sercos::drive_of(&self.machine, axis).is_some() {
+            return None;
+        }
         let index = ecaxis_esi::axis::object(index, setup.number);
         let mailbox = self.mailboxes.urgent(setup.device)?;
         clock::timeout(ASK_TIMEOUT, mailbox.upload(index, 0))
@@ -251,10 +264,16 @@ impl Supervisor {
             else {
                 continue;
             };
+            let sercos_free = self
+                .machine
+                .devices
+                .get(device)
+                .is_some_and(|config| config.device.soe_only().is_none());
             let Some(look) = looks.get_mut(usize::from(found.at.position)) else {
                 continue;
             };
-            if look.answers && ask != snapshot::ObjectSelection::default() && clock::now() < end {
+            let objects = sercos_free && look.answers;
+            if objects && ask != snapshot::ObjectSelection::default() && clock::now() < end {
                 snapshot::read_objects(&mailbox, setup.number, ask, look).await;
             }
         }
@@ -285,7 +304,15 @@ impl Supervisor {
             emergencies: self.log.last_of(&config.name, since),
             history,
             limits: self.exceeded_limits(axis),
+            sercos: self.sercos_diagnosis(axis).await,
         })
+    }
+
+    /// Returns what a Sercos drive says about its failure.
+    async fn sercos_diagnosis(&mut self, axis: AxisIndex) -> Option<SercosDiagnosis> {
+        let (device, drive) = sercos::drive_of(&self.machine, axis)?;
+        let mailbox = self.mailboxes.urgent(device)?;
+        Some(sercos::diagnose(&mailbox, drive, ASK_TIMEOUT).await)
     }
 
     /// Checks the mode of each axis over CoE if 0x6061 is not in its process data. Otherwise the

@@ -41,6 +41,7 @@ pub(crate) use program::Buttons;
 pub use program::ProgramControl;
 use returns::ReturnPort;
 pub(crate) use ring::RingWatch;
+use sercos::ResetQueue;
 
 mod clock_tree;
 mod coordinated;
@@ -52,6 +53,7 @@ pub mod operator;
 mod program;
 mod returns;
 mod ring;
+pub(crate) mod sercos;
 mod shut_down;
 
 /// The period at which the supervisor reads the cycle's snapshot.
@@ -128,6 +130,8 @@ pub struct Supervisor {
     pub(crate) ring: RingWatch,
     /// What clients of the mailbox gateway see of the cycle.
     pub(crate) mailbox_gateway: Option<LivePublisher>,
+    /// The resets of Sercos drives.
+    pub(crate) resets: Option<ResetQueue>,
     /// The propagation delays in the closed ring, with cable redundancy.
     pub(crate) ring_delays: Option<Arc<std::sync::Mutex<RingDelays>>>,
 }
@@ -156,13 +160,14 @@ impl Supervisor {
         let heartbeat = self.outer.heartbeat.clone();
         let latch = Arc::<Mutex<()>>::default();
         // The futures are large, and nothing needs them on the stack.
-        let (delays, returns) = (
+        let (delays, returns, resets) = (
             Box::pin(self.keep_delays(Arc::clone(&latch))),
             Box::pin(self.return_devices(latch)),
+            Box::pin(self.open_resets().run()),
         );
         let work = async {
             let aside = async {
-                tokio::join!(delays, returns);
+                tokio::join!(delays, returns, resets);
                 std::future::pending::<Infallible>().await
             };
             tokio::select! {
@@ -472,6 +477,7 @@ impl Supervisor {
                     self.refused.truncate(REFUSALS - 1);
                     self.refused.push_back((axis, reason));
                 }
+                Event::ResetDrive { axis, .. } => self.request_reset(axis),
                 // Stops are taken from the snapshot, where they cannot be lost.
                 Event::Stopping { .. }
                 | Event::GroupStopping { .. }

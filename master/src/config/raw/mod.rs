@@ -5,6 +5,7 @@ use toml::de::DeValue;
 
 use ecaxis_axis::StopMethod;
 use ecaxis_axis::setpoint::CamLaw;
+use ecaxis_ecat::mailbox::soe::Idn;
 use ecaxis_esi::Address;
 
 use super::fields::{Domain, Field, Key, Ns, Read, Table, TableKey, Value, Written, unquoted};
@@ -256,6 +257,9 @@ table! { "[[device]]",
         pdo: RawPdos,
         /// Start-up SDOs, sent in order after those of the ESI (list of tables; default none)
         sdo: Vec<RawSdo>,
+        /// Start-up IDNs of a Sercos drive (SoE), sent in order after those of the ESI (list of
+        /// tables; default none)
+        idn: Vec<RawIdn>,
         /// `verify = true` and `skip_equal = true` for all start-up SDOs (table; default neither)
         startup: RawStartup,
         /// Units, limits, loops, supervision and homing of a drive's axis; as `[[device.axis]]` for
@@ -306,6 +310,10 @@ impl Read for RawEntry {
             let sub = sub.unwrap_or(0);
             return Some(Self { span, index, sub });
         };
+        if let Ok(idn) = text.parse::<Idn>() {
+            let (index, sub) = (idn.0, 0);
+            return Some(Self { span, index, sub });
+        }
         let (index, sub) = text.split_once(':').unwrap_or((text, "0"));
         let index = unquoted(index).and_then(|i| u16::try_from(i).ok());
         let (Some(index @ 1..), Some(sub)) = (index, Address::sub_of(sub)) else {
@@ -337,6 +345,17 @@ table! { "`sdo`",
         verify: Option<bool>,
         /// If true, an object that holds the value is not written (default that of `startup`)
         skip_equal: Option<bool>,
+    }
+}
+
+table! { "`idn`",
+    row RawIdn {
+        /// IDN
+        idn: Spanned<String> = "\"S-0-0138\"",
+        /// Drive of the device (0 to 7; default 0)
+        drive: Key<u8> [0..=7],
+        /// Value: a number, a text, or a list of bytes; numbers and texts follow the attribute that the drive reports
+        value: Spanned<SdoValue> = "2000",
     }
 }
 

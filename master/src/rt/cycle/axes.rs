@@ -6,6 +6,7 @@ use ecaxis_ecat::index::AxisIndex;
 use super::{Engine, Nanos};
 use crate::rt::axis::RtAxis;
 use crate::rt::bus_monitor::StopCause;
+use crate::rt::channel::Event;
 use crate::rt::exchange::DeviceAnswer;
 use crate::rt::gantry;
 use crate::rt::gateway::Gateway;
@@ -157,6 +158,7 @@ impl Engine {
         }
         let outputs = slot.axis.act();
         slot.write(self.exchange.outputs_mut(), &outputs);
+        let resets = std::mem::take(&mut slot.reset);
         let status = slot.axis.status();
         slot.armed |= slot.ordered && status.fault.is_none() && slot.heard.is_some();
         if status.enabled {
@@ -179,5 +181,9 @@ impl Engine {
             _ => lost.then_some(StopCause::FollowLost { axis: index }),
         };
         group.found = group.found.or(cause);
+        if resets {
+            let cycle = self.stats.counters.cycles;
+            self.report(Event::ResetDrive { cycle, axis: index });
+        }
     }
 }

@@ -125,9 +125,12 @@ impl Engine {
         let most_ns = ((self.plain.slowest_s + MARGIN_S) * 1e9) as Nanos;
         let over = now.saturating_sub(since) > most_ns;
         let mut ended = true;
-        for (slot, rest) in self.axes.iter().zip(&mut self.plain.rest) {
+        for (slot, rest) in self.axes.iter_mut().zip(&mut self.plain.rest) {
             let image = self.exchange.inputs();
-            let word = Statusword::from_bits_retain(slot.bits.statusword.get(image) as u16);
+            let word = slot
+                .words
+                .statusword(slot.bits.statusword.get(image) as u16);
+            let word = Statusword::from_bits_retain(word);
             let powered = State::from_statusword(word).has_power();
             let position = slot.bits.position.map(|bits| bits.get(image));
             match position {
@@ -142,7 +145,8 @@ impl Engine {
             };
             ended &= !powered;
             let outputs = self.exchange.outputs_mut();
-            slot.bits.controlword.set(outputs, i64::from(word.bits()));
+            let word = slot.words.control(word.bits()).word;
+            slot.bits.controlword.set(outputs, i64::from(word));
         }
         // One more second for the drives to receive the Controlword.
         ended || now.saturating_sub(since) > most_ns + 1_000_000_000

@@ -71,7 +71,7 @@ impl RunningSegment {
         let loan = self.mailboxes.borrow(index).await;
         let mut device = self.devices[index].without_mailbox();
         let (coe, give_back) = loan.unzip();
-        device.coe = coe;
+        device.set_client(&self.machine.devices[index], coe);
         device.serial = search.serial;
         let progress = &self.progress;
         let report = |step| {
@@ -89,7 +89,7 @@ impl RunningSegment {
             latch: &self.latch,
         };
         let returned = bring_back(bus, index, &mut device, &report).await;
-        if let (Some(coe), Some(give_back)) = (device.coe.take(), give_back) {
+        if let (Some(coe), Some(give_back)) = (device.take_client(), give_back) {
             let _ = give_back.send(coe);
         }
         returned?;
