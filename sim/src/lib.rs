@@ -31,6 +31,7 @@ pub mod gateway;
 pub mod network;
 mod random;
 pub mod serve;
+mod soe;
 
 pub use device::{DeviceOptions, MailboxOptions, SimDevice, SimError};
 pub use drive::{ElasticLoad, PitchError, PlantParams, Track};

@@ -37,6 +37,7 @@ mod program;
 mod repeats;
 mod samples;
 mod several_axes;
+mod soe;
 mod states;
 mod superimpose;
 mod units;

@@ -108,7 +108,9 @@ impl PdoRules {
             .mailbox
             .as_ref()
             .and_then(|mailbox| mailbox.coe.as_ref());
-        let (assign, config) = coe.map_or((false, false), |coe| (coe.pdo_assign, coe.pdo_config));
+        // S-0-0016 and S-0-0024 list the contents of a Sercos drive's telegrams.
+        let sercos = device.soe_only().is_some();
+        let (assign, config) = coe.map_or((false, sercos), |coe| (coe.pdo_assign, coe.pdo_config));
         for pdo in device.rx_pdos.iter().chain(&device.tx_pdos) {
             rules.learn(store, pdo, config);
         }

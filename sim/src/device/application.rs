@@ -238,11 +238,15 @@ impl SimDevice {
         for drive in self.application.drives_mut() {
             drive.show(&mut self.store);
         }
+        if let Some(sercos) = &self.sercos {
+            sercos.show(&mut self.store, self.application.drives());
+        }
     }
 
     /// Resets the application as at power-on.
     pub(super) fn restart_application(&mut self, now: Nanos) {
         self.store = self.fresh.store.clone();
+        self.sercos = self.fresh.sercos.clone();
         let Application::Gateway(gateway) = &mut self.application else {
             self.application = self.fresh.application.clone();
             return;

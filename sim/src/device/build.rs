@@ -21,6 +21,7 @@ use crate::esc::{Esc, EscConfig, EscInfo};
 use crate::firmware::{BootLoader, FirmwareOptions};
 use crate::foe::FileStore;
 use crate::gateway::{Gateway, GatewayError, GatewayOptions};
+use crate::soe::{self, Sercos};
 
 /// The CiA 402 profile number.
 const DRIVE_PROFILE: u32 = 402;
@@ -204,7 +205,12 @@ impl SimDevice {
                 }
             },
         );
-        let is_drive = device.mailbox.is_some() && is_drive(device, &objects.store);
+        let is_sercos = device.soe_only().is_some();
+        if is_sercos {
+            soe::prepare(&mut objects.store, device);
+        }
+        let is_drive = is_sercos || device.mailbox.is_some() && is_drive(device, &objects.store);
+        let mut sercos = None;
         let application = match gateway.take() {
             Some(mut gateway) => {
                 gateway.bind(&objects.store);
@@ -213,7 +219,15 @@ impl SimDevice {
             None if is_drive => {
                 let mut plants = vec![options.plant];
                 plants.extend(options.further_plants);
-                Application::new_drives(&mut objects.store, &plants)
+                let drives = Application::new_drives(&mut objects.store, &plants);
+                if is_sercos {
+                    let counts = |drive: usize| {
+                        let plant = plants.get(drive).copied().unwrap_or_default();
+                        plant.counts_per_turn
+                    };
+                    sercos = Some(Box::new(Sercos::new(&mut objects.store, device, counts)));
+                }
+                drives
             }
             None => Application::Io(Io::default()),
         };
@@ -281,6 +295,7 @@ impl SimDevice {
             fresh: Box::new(PowerOnState {
                 store: store.clone(),
                 application: application.clone(),
+                sercos: sercos.clone(),
             }),
             esc,
             supervision: Supervision::new(&store),
@@ -288,6 +303,7 @@ impl SimDevice {
             pdo,
             process,
             application,
+            sercos,
             mailbox: mailbox(device),
             mailbox_limits: mailbox_limits(device),
             boot_mailbox: boot_mailbox(device),

@@ -300,6 +300,9 @@ impl SimDevice {
             && let Some(mailbox) = &mut self.mailbox
         {
             mailbox.reset();
+            if let Some(sercos) = &mut self.sercos {
+                sercos.reset();
+            }
             for n in [mailbox.receive, mailbox.send] {
                 if let Some(sm) = self.esc.sms.get_mut(n) {
                     sm.reset();

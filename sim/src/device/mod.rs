@@ -29,13 +29,14 @@ use ecaxis_esi::model::Access;
 use crate::Nanos;
 use crate::coe::object_dictionary::ObjectStore;
 use crate::coe::pdo::PdoRules;
-use crate::drive::{Drive, Emergency, State};
+use crate::drive::{Emergency, State};
 use crate::esc::Esc;
 use crate::esc::al::AlState;
 use crate::esc::dc::sync::Edges;
 use crate::firmware::BootLoader;
 use crate::foe::FileStore;
 use crate::frame::Datagram;
+use crate::soe::Sercos;
 use application::Application;
 pub use build::{DeviceOptions, SimError};
 use esm::Al;
@@ -94,6 +95,7 @@ struct MailboxLimits {
 struct PowerOnState {
     store: ObjectStore,
     application: Application,
+    sercos: Option<Box<Sercos>>,
 }
 
 /// Delays through the device, from the first bit in to the first bit out.
@@ -138,6 +140,8 @@ pub struct SimDevice {
     process: Vec<ProcessData>,
     supervision: Supervision,
     application: Application,
+    /// The Sercos side of the drives.
+    sercos: Option<Box<Sercos>>,
     mailbox: Option<Mailbox>,
     mailbox_limits: [MailboxLimits; 8],
     boot_mailbox: ((u16, u16), (u16, u16)),
@@ -405,6 +409,7 @@ impl SimDevice {
         let in_op = self.al.state == AlState::Op;
         let now = || self.esc.clock.true_time(at);
         self.application.act(&mut self.store, in_op, now);
+        self.act_sercos(at);
         self.send_emergencies();
         self.watch_sync0();
         let alone = self.outputs_are_none() || self.application.samples_when_acting();
@@ -415,11 +420,41 @@ impl SimDevice {
 
     fn send_emergencies(&mut self) {
         loop {
-            let mut drives = self.application.drives_mut().iter_mut();
-            let Some(emergency) = drives.find_map(Drive::take_emergency) else {
+            let mut drives = (0..).zip(self.application.drives_mut());
+            let emergency = drives.find_map(|(n, drive)| Some((n, drive.take_emergency()?)));
+            let Some((drive, emergency)) = emergency else {
                 break;
             };
-            self.queue_emergency(&emergency);
+            match self.sercos {
+                Some(_) => {
+                    if let Some(message) = Sercos::emergency(drive, &emergency) {
+                        self.queue_soe(&message);
+                    }
+                }
+                None => self.queue_emergency(&emergency),
+            }
+        }
+    }
+
+    /// Advances the procedure commands of Sercos drives and sends their notifications.
+    fn act_sercos(&mut self, local: u64) {
+        let Some(sercos) = &mut self.sercos else {
+            return;
+        };
+        for message in sercos.act(self.application.drives_mut(), local) {
+            self.queue_soe(&message);
+        }
+    }
+
+    /// Makes a Sercos drive refuse each access to an IDN with this error code. Code 0 ends it.
+    pub fn refuse_idn(&mut self, drive: u8, idn: u16, code: u16) {
+        if let Some(sercos) = &mut self.sercos {
+            sercos
+                .forced
+                .retain(|(own, number, _)| (*own, *number) != (drive, idn));
+            if code != 0 {
+                sercos.forced.push((drive, idn, code));
+            }
         }
     }
 

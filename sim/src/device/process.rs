@@ -75,6 +75,9 @@ impl SimDevice {
                 bits::copy(self.store.exchange_mut(m.slot), 0, buffer, m.bit, m.bits);
             }
         }
+        if let Some(sercos) = &mut self.sercos {
+            sercos.take_outputs(&mut self.store, self.application.drives());
+        }
         self.application.sync(&mut self.store);
     }
 

@@ -335,6 +335,11 @@ impl Drive {
         self.raise(code, self.parameters.options.fault_ramp());
     }
 
+    /// Clears a fault in the next control cycle, unless its cause persists.
+    pub(crate) fn reset_fault(&mut self) {
+        self.reset = true;
+    }
+
     /// Sets a lasting fault cause. Resets fail until `None` removes the cause.
     pub fn set_fault_cause(&mut self, code: Option<u16>) {
         self.faults.set_cause(code);

@@ -30,6 +30,7 @@ mod protocol {
     pub(super) const ERROR: u8 = 0;
     pub(super) const COE: u8 = 3;
     pub(super) const FOE: u8 = 4;
+    pub(super) const SOE: u8 = 5;
 }
 
 /// Mailbox error details (ETG.1000.4 table 30).
@@ -365,8 +366,26 @@ impl SimDevice {
                 };
                 mailbox.foe.request(target, request)
             }
+            protocol::SOE if state != AlState::Boot => match &mut self.sercos {
+                Some(sercos) => {
+                    let now = (state, self.local);
+                    sercos.request(&mut self.store, now, payload, room)
+                }
+                None => Answer::Error(Detail::UnsupportedProtocol),
+            },
             _ => Answer::Error(Detail::UnsupportedProtocol),
         }
+    }
+
+    /// Sends a message of SoE without a request.
+    pub(super) fn queue_soe(&mut self, message: &[u8]) {
+        if matches!(self.al.state, AlState::Init | AlState::Boot) {
+            return;
+        }
+        if let Some(mailbox) = &mut self.mailbox {
+            mailbox.queue.push(protocol::SOE, message, Class::Emergency);
+        }
+        self.pump_mailbox();
     }
 
     fn room(&self) -> MailboxCapacity {
