@@ -12,7 +12,7 @@
 //! | enable operation with halt | 0xC000 | decelerates and keeps torque |
 //! | fault reset | 0, and the procedure command S-0-0099 | clears errors of class 1 |
 //!
-//! S-0-0135 does not tell the states before "Operation enabled" apart. The last command decides.
+//! S-0-0135 does not distinguish the states before "Operation enabled". The last command decides.
 
 use crate::cia402::Statusword;
 

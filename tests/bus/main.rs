@@ -38,6 +38,7 @@ mod repeats;
 mod samples;
 mod several_axes;
 mod soe;
+mod soe_idns;
 mod states;
 mod superimpose;
 mod units;

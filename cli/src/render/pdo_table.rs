@@ -1,6 +1,7 @@
 //! Tables that several subcommands use.
 
-use ecaxis_esi::{Device, Field, Layout, SmLayout, SmUse, StartupSdo, address};
+use ecaxis_ecat::mailbox::soe::Idn;
+use ecaxis_esi::{Device, Field, IdnValue, Layout, Selection, SmLayout, SmUse, address};
 use ecaxis_master::parameters::meaning::meaning;
 use ecaxis_master::text::pluralize;
 use ecaxis_tools::cells;
@@ -36,12 +37,12 @@ pub(crate) fn process_data(device: &Device, layout: &Layout, out: &mut Document)
     }
     out.gap();
     out.table(table);
-    fields("outputs", layout.rx_bytes(), &layout.rx, out);
-    fields("inputs", layout.tx_bytes(), &layout.tx, out);
+    fields("outputs", layout.rx_bytes(), (&layout.rx, layout.idns), out);
+    fields("inputs", layout.tx_bytes(), (&layout.tx, layout.idns), out);
 }
 
 /// Adds the offset of each object of one direction.
-fn fields(what: &str, bytes: usize, fields: &[Field], out: &mut Document) {
+fn fields(what: &str, bytes: usize, (fields, idns): (&[Field], bool), out: &mut Document) {
     out.gap();
     out.line(format!("{what}: {}", pluralize(bytes, "byte")));
     if fields.is_empty() {
@@ -58,7 +59,10 @@ fn fields(what: &str, bytes: usize, fields: &[Field], out: &mut Document) {
     for field in fields {
         gap(&mut table, end, field.bit_offset);
         end = field.bit_offset + u32::from(field.bit_len);
-        let object = address(field.index, field.sub);
+        let object = match idns {
+            true => Idn(field.index).to_string(),
+            false => address(field.index, field.sub).to_string(),
+        };
         let (at, pdo) = (place(field.bit_offset), hex16(field.pdo));
         table.row(cells![
             at,
@@ -78,8 +82,12 @@ fn fields(what: &str, bytes: usize, fields: &[Field], out: &mut Document) {
 }
 
 /// Adds the start-up list with the origin of each command.
-pub(crate) fn startup(startup: &[StartupSdo], out: &mut Document) {
+pub(crate) fn startup(selection: &Selection, out: &mut Document) {
+    let startup = &selection.startup;
     out.gap();
+    if selection.layout.idns {
+        return startup_idns(selection, out);
+    }
     if startup.is_empty() {
         out.line("no start-up SDOs");
         return;
@@ -96,6 +104,28 @@ pub(crate) fn startup(startup: &[StartupSdo], out: &mut Document) {
         table.row(cells![sdo.transition, object, value, name, sdo.origin]);
     }
     out.line("start-up SDOs, in this order (PS: between PreOp and SafeOp)");
+    out.table(table);
+}
+
+/// Adds the start-up IDNs of a Sercos drive.
+fn startup_idns(selection: &Selection, out: &mut Document) {
+    let mut table = Table::new("at|drive|IDN|value|name|from");
+    for idn in &selection.startup_idns {
+        let value = match &idn.value {
+            IdnValue::Bytes(bytes) => value(bytes),
+            IdnValue::Text(text) => text.clone(),
+        };
+        let name = idn.idn.name().unwrap_or_default();
+        table.row(cells![
+            idn.transition,
+            idn.drive,
+            idn.idn,
+            value,
+            name,
+            idn.origin
+        ]);
+    }
+    out.line("start-up IDNs, in this order (IP: before PreOp, PS: between PreOp and SafeOp)");
     out.table(table);
 }
 

@@ -1,6 +1,6 @@
 //! The configuration of a device as JSON, for `esi show` and `explain`.
 
-use ecaxis_esi::{Field, Mode, Selection, SmLayout, StartupSdo};
+use ecaxis_esi::{Field, IdnValue, Mode, Selection, SmLayout, StartupIdn, StartupSdo};
 use ecaxis_master::parameters::meaning::meaning;
 use ecaxis_tools::document::format::hex_bytes;
 use serde_json::{Value, json};
@@ -17,7 +17,7 @@ pub(crate) fn configuration(selection: &Selection, cycle_ns: u64) -> Value {
         .dc
         .as_ref()
         .map(|dc| json!({ "name": dc.name, "assign_activate": dc.assign_activate }));
-    json!({
+    let mut shown = json!({
         "mode": selection.mode.map(Mode::name),
         "modules": selection.modules.iter().map(|m| &*m.type_name).collect::<Vec<_>>(),
         "cycle_ns": cycle_ns,
@@ -30,13 +30,29 @@ pub(crate) fn configuration(selection: &Selection, cycle_ns: u64) -> Value {
         "input_bytes": layout.tx_bytes(),
         "startup": selection.startup.iter().map(sdo).collect::<Vec<_>>(),
         "notes": selection.notes,
-    })
+    });
+    if let (true, Some(shown)) = (layout.idns, shown.as_object_mut()) {
+        let idns = selection.startup_idns.iter().map(idn);
+        shown.insert("startup_idns".to_owned(), idns.collect());
+    }
+    shown
 }
 
 pub(crate) fn field(field: &Field) -> Value {
     json!({
         "pdo": field.pdo, "index": field.index, "sub": field.sub, "bit_offset": field.bit_offset,
         "bits": field.bit_len, "type": field.data_type, "name": field.name,
+    })
+}
+
+fn idn(idn: &StartupIdn) -> Value {
+    let (data, text) = match &idn.value {
+        IdnValue::Bytes(bytes) => (Some(hex_bytes(&**bytes, "")), None),
+        IdnValue::Text(text) => (None, Some(text)),
+    };
+    json!({
+        "transition": idn.transition, "drive": idn.drive, "idn": idn.idn.to_string(),
+        "name": idn.idn.name(), "data": data, "text": text, "from": idn.origin,
     })
 }
 

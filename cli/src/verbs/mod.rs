@@ -27,6 +27,7 @@ mod schema;
 mod sdo;
 mod serve;
 mod sim;
+mod soe;
 mod tune;
 
 #[derive(Debug, Subcommand)]
@@ -39,6 +40,7 @@ pub(crate) enum Verb {
     Scan(scan::Args),
     Compare(compare::Args),
     Sdo(sdo::Args),
+    Soe(soe::Args),
     Eeprom(eeprom::Args),
     Esi(esi::Args),
     Eni(eni::Args),
@@ -63,6 +65,7 @@ impl Verb {
             Self::Scan(args) => Some(&args.verbosity),
             Self::Compare(args) => Some(&args.verbosity),
             Self::Sdo(args) => Some(&args.verbosity),
+            Self::Soe(args) => Some(&args.verbosity),
             Self::Eeprom(args) => Some(&args.verbosity),
             Self::Sim(args) => Some(&args.verbosity),
             Self::Bench(args) => Some(&args.verbosity),
@@ -87,6 +90,7 @@ impl Verb {
         match self {
             Self::Run(_) | Self::Serve(_) | Self::Jog(_) => true,
             Self::Sdo(args) => args.changes(),
+            Self::Soe(args) => args.changes(),
             Self::Eeprom(args) => args.changes(),
             Self::Firmware(args) => args.changes(),
             Self::Tune(args) => args.changes(),
@@ -123,6 +127,7 @@ impl Verb {
             Self::Scan(args) => scan::run(&args),
             Self::Compare(args) => compare::run(&args),
             Self::Sdo(args) => sdo::run(&args),
+            Self::Soe(args) => soe::run(&args),
             Self::Eeprom(args) => eeprom::run(&args),
             Self::Esi(args) => esi::run(&args),
             Self::Eni(args) => eni::run(&args),

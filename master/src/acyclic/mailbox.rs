@@ -2,7 +2,7 @@
 
 use ecaxis_ecat::registers;
 use ecaxis_esi::model::SmUse;
-use ecaxis_esi::sii::{MailboxAreas, Sii};
+use ecaxis_esi::sii::{MailboxAreas, Protocols, Sii};
 
 use super::Registers;
 use crate::acyclic::al::{self, AlState};
@@ -18,7 +18,7 @@ const ENABLED: u8 = 1;
 
 pub use crate::config::state_timeouts::PRE_OP_TIMEOUT;
 
-/// A CoE mailbox, and the state to which its device returns afterwards.
+/// A mailbox with CoE or SoE, and the state to which its device returns afterwards.
 #[derive(Debug)]
 pub struct MailboxSession {
     pub coe: CoeClient,
@@ -50,7 +50,12 @@ pub async fn open(
     });
     let coe = match found {
         AlState::PreOp | AlState::SafeOp | AlState::Op => {
-            CoeClient::joining(configured(&registers).await?)
+            let layout = configured(&registers).await?;
+            let has = |protocol| sii.protocols.has(protocol);
+            match has(Protocols::SOE) && !has(Protocols::COE) {
+                true => CoeClient::joining_soe(layout),
+                false => CoeClient::joining(layout),
+            }
         }
         AlState::Init => {
             let layout = configure(&registers, sii, sii.mailbox).await?;

@@ -24,6 +24,8 @@ pub struct CoeClient {
     pub(super) unsettled: bool,
     /// The object of the segmented transfer in progress, as far as known.
     pub(super) in_segments: Option<(u16, u8)>,
+    /// Another program may have used the mailbox of a device with SoE alone.
+    pub(super) joins_soe: bool,
 }
 
 impl CoeClient {
@@ -32,6 +34,7 @@ impl CoeClient {
             port: Port::new(layout),
             unsettled: true,
             in_segments: None,
+            joins_soe: false,
         }
     }
 
@@ -54,6 +57,15 @@ impl CoeClient {
         const DEVICE_TYPE: u16 = 0x1000;
         Self {
             in_segments: Some((DEVICE_TYPE, 0)),
+            ..Self::new(layout)
+        }
+    }
+
+    /// As [`CoeClient::joining`], of a device with SoE and without CoE. A read whose answer is dropped
+    /// precedes the first request.
+    pub fn joining_soe(layout: MailboxLayout) -> Self {
+        Self {
+            joins_soe: true,
             ..Self::new(layout)
         }
     }
@@ -262,6 +274,9 @@ impl CoeClient {
             let farewell = Request::Abort { index, sub, code };
             // The device may not receive it; whether it is present shows in the next step.
             let _ = self.port.send(w, &farewell).await;
+        }
+        if std::mem::take(&mut self.joins_soe) {
+            self.join_soe(w).await?;
         }
         if self.unsettled {
             self.port.drain(w, DRAIN).await?;

@@ -8,7 +8,7 @@ use std::fmt;
 use std::time::Duration;
 
 use ecaxis_ecat::mailbox::soe::{
-    CommandState, DataState, Element, Idn, Message, Operation, Telegram, room,
+    CommandState, DataState, Element, Idn, List, Message, Operation, Telegram, room,
 };
 
 use super::error::{CoeCause, Phase, SdoError, Subject};
@@ -18,6 +18,10 @@ use super::{CoeClient, MailboxTransport};
 
 /// The maximum length of an element in bytes: a full list with its lengths.
 const MAX_ELEMENT: usize = 0xffff + 4;
+/// The maximum number of old messages that are read before the first request.
+const JOIN_DRAIN: usize = 64;
+/// How often a read may be repeated.
+const REPEATS: u32 = 3;
 /// The pause between two reads of a procedure command's data state.
 const COMMAND_PAUSE: Duration = Duration::from_millis(5);
 /// The error code of a procedure command that is set already.
@@ -65,6 +69,12 @@ impl fmt::Display for IdnElement {
     }
 }
 
+/// True if an element that is longer than one message is a whole list: other elements are shorter.
+fn list_of(data: &[u8], room: usize) -> bool {
+    data.len() <= room
+        || List::parse(data).is_some_and(|list| list.data.len() + List::HEADER == data.len())
+}
+
 /// One transfer.
 struct Transfer {
     at: IdnElement,
@@ -75,18 +85,50 @@ struct Transfer {
 }
 
 impl CoeClient {
-    /// Reads an element of an IDN. Lists contain their lengths.
+    /// Reads an element of an IDN. Lists contain their lengths. A read that lost a fragment is repeated:
+    /// the drive has put the next one into its mailbox before the loss shows.
     pub async fn read_idn<W: MailboxTransport>(
         &mut self,
         w: &W,
         at: IdnElement,
     ) -> Result<Vec<u8>, SdoError> {
+        let mut repeats = 0;
+        loop {
+            // The last attempt accepts a device that counts wrongly.
+            match self.read_once(w, at, repeats < REPEATS).await {
+                Err(error) if error.is_malformed() && repeats < REPEATS => repeats += 1,
+                done => return done,
+            }
+        }
+    }
+
+    async fn read_once<W: MailboxTransport>(
+        &mut self,
+        w: &W,
+        at: IdnElement,
+        counts: bool,
+    ) -> Result<Vec<u8>, SdoError> {
         let mut transfer = self.begin_idn(w, at, Operation::ReadResponse).await?;
+        self.port.take_gap();
         let request = Telegram::read_request(at.drive, at.element, at.idn);
         let sent = self.port.send(w, &request).await;
         let done = match sent {
             Ok(()) => self.receive_idn(w, &mut transfer).await,
             Err(trouble) => Err(self.idn_trouble(&transfer, trouble)),
+        };
+        let done = match done {
+            Ok(_) if self.port.take_gap() && counts => {
+                let lost = "a fragment was lost: the counter of the mailbox has a gap";
+                Err(self.idn_error(&transfer, CoeCause::Malformed(lost.into())))
+            }
+            Ok(data) => match list_of(&data, room(self.port.layout.in_len)) {
+                true => Ok(data),
+                false => {
+                    let lost = "the length of a list in fragments contradicts its contents";
+                    Err(self.idn_error(&transfer, CoeCause::Malformed(lost.into())))
+                }
+            },
+            failed => failed,
         };
         self.end_idn(done)
     }
@@ -193,6 +235,22 @@ impl CoeClient {
                 asked: Subject::Idn(at),
                 cause,
             }),
+        }
+    }
+
+    /// Sends a read and drops its answer. A device that takes the read for a repetition does not answer.
+    pub(super) async fn join_soe<W: MailboxTransport>(
+        &mut self,
+        w: &W,
+    ) -> Result<(), TransportError> {
+        const SETTLE: Duration = Duration::from_millis(20);
+        self.port.drain(w, JOIN_DRAIN).await?;
+        let read = Telegram::read_request(0, Element::DataState, Idn::TELEGRAM_TYPE);
+        self.port.send(w, &read).await?;
+        let mut deadline = Deadline::after(w, SETTLE);
+        match self.port.receive(w, &mut deadline).await {
+            Ok(()) | Err(TransportError::Timeout(_)) => Ok(()),
+            Err(trouble) => Err(trouble),
         }
     }
 

@@ -84,6 +84,8 @@ pub(super) struct Port {
     previous: Vec<u8>,
     /// The number of messages in a row whose counter the SubDevice has incremented.
     in_order: u32,
+    /// A device that counts has left out a counter: a message was lost.
+    gap: bool,
     /// The time when the mailbox was last read; a status from before this time is obsolete.
     read_at: u64,
     /// The SubDevice has fetched the last request, so the next message fills an empty mailbox.
@@ -103,6 +105,7 @@ impl Port {
             incoming: vec![0; usize::from(layout.in_len)],
             previous: vec![0; usize::from(layout.in_len)],
             in_order: 0,
+            gap: false,
             read_at: 0,
             free: false,
             counter: 0,
@@ -278,12 +281,19 @@ impl Port {
         if self.in_order >= COUNTED && self.incoming == self.previous {
             return true;
         }
-        self.in_order = if before != 0 && now == before % 7 + 1 {
+        let follows = before != 0 && now == before % 7 + 1;
+        self.gap |= !follows && self.in_order >= COUNTED;
+        self.in_order = if follows {
             self.in_order.saturating_add(1)
         } else {
             0
         };
         false
+    }
+
+    /// Returns true if a message was lost since the last call, as far as the counter shows.
+    pub(super) fn take_gap(&mut self) -> bool {
+        mem::take(&mut self.gap)
     }
 
     /// Makes the SubDevice put the last message back into its mailbox.

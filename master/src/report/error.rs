@@ -17,9 +17,7 @@ use crate::text::rounded;
 
 use super::cause_text::{al_note, by, code_note, list, lost, lost_note, mode_note};
 use super::error_place::{FailedStep, Location};
-use super::{
-    DeviceRef, DiagnosisMessage, EepromError, EmergencyReport, SercosDiagnosis, StateError,
-};
+use super::{DeviceRef, DriveReport, EepromError, StateError};
 use ecaxis_ecat::al_state::AlState;
 use ecaxis_ecat::al_status_code::al_status_text;
 use ecaxis_ecat::mailbox::soe::ValueError;
@@ -537,34 +535,6 @@ impl Error {
                 | Cause::Controller
                 | Cause::NotDisabled { .. }
         )
-    }
-}
-
-/// What a failed device reports in addition to its error code.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct DriveReport {
-    /// The device's last emergencies, oldest first.
-    pub emergencies: Vec<EmergencyReport>,
-    /// The device's diagnosis messages (0x10F3), newest first.
-    pub history: Vec<DiagnosisMessage>,
-    /// The drive's own limits that the machine file exceeds.
-    pub limits: Vec<LimitConflict>,
-    /// What a Sercos drive says.
-    pub sercos: Option<SercosDiagnosis>,
-}
-
-impl fmt::Display for DriveReport {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for report in &self.emergencies {
-            write!(f, "; {}", report.emergency)?;
-        }
-        for message in &self.history {
-            write!(f, "; diagnosis history: {message}")?;
-        }
-        if let Some(sercos) = &self.sercos {
-            sercos.fmt(f)?;
-        }
-        Ok(())
     }
 }
 

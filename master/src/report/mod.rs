@@ -11,26 +11,26 @@ mod cause_text;
 mod device_error;
 mod device_log;
 mod diagnosis_message;
+mod drive_report;
 mod emergencies;
 mod error;
 mod error_place;
 pub mod events;
 mod progress;
-mod sercos_diagnosis;
 pub(crate) mod summary;
 
 pub(crate) use device_error::EEPROM_TIMEOUT;
 pub use device_error::{DeviceRef, EepromError, StateError};
 pub use device_log::DeviceLog;
 pub use diagnosis_message::{DiagnosisKind, DiagnosisMessage};
+pub use drive_report::{DriveReport, SercosDiagnosis};
 pub use emergencies::{EmergencyLine, EmergencyLog, EmergencyReport};
-pub use error::{Cause, DriveReport, Error};
+pub use error::{Cause, Error};
 pub use error_place::{FailedStep, Location};
 pub use events::EventLine;
 pub use progress::{
     AxisLine, DevicePlace, Home, Observer, ProbeCapture, Progress, Status, StepRef, UnknownDevice,
 };
-pub use sercos_diagnosis::SercosDiagnosis;
 pub use summary::{
     AxisSummary, DeviceErrors, GatewaySummary, GroupStop, NodeSummary, Summary, ThreadSummary,
 };

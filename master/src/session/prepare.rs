@@ -248,10 +248,9 @@ fn mailbox_workers(
     let wires =
         CyclicMailboxTransport::all(wire, &exchange.bus_status(), bus.devices.len(), cycle_ns);
     let openings = bus.devices.iter_mut().zip(wires).map(|(device, wire)| {
-        let coe = device.coe.is_some();
         let mailbox = device.take_client().map(|client| (wire, client));
         let name = device.at.name.clone();
-        WorkerConfig { name, mailbox, coe }
+        WorkerConfig { name, mailbox }
     });
     let listener: Arc<dyn EmergencySink> = Arc::new(log.clone());
     worker::open(openings, &listener)

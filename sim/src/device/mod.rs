@@ -446,15 +446,11 @@ impl SimDevice {
         }
     }
 
-    /// Makes a Sercos drive refuse each access to an IDN with this error code. Code 0 ends it.
-    pub fn refuse_idn(&mut self, drive: u8, idn: u16, code: u16) {
+    /// Makes Sercos drives refuse each access to these IDNs: drive, IDN, error code.
+    pub(crate) fn refuse_idns(&mut self, idns: &[(u8, u16, u16)]) {
         if let Some(sercos) = &mut self.sercos {
-            sercos
-                .forced
-                .retain(|(own, number, _)| (*own, *number) != (drive, idn));
-            if code != 0 {
-                sercos.forced.push((drive, idn, code));
-            }
+            sercos.forced.clear();
+            sercos.forced.extend_from_slice(idns);
         }
     }
 

@@ -201,6 +201,8 @@ impl Faults {
         for (n, device) in devices.iter_mut().enumerate() {
             device.refusals.clear();
             device.forced_aborts.clear();
+            device.refuse_idns(&[]);
+            let mut idns = Vec::new();
             device.ignored_writes.clear();
             let mut held = None;
             let (mut silent, mut late, mut ignored) = (false, 0, false);
@@ -209,6 +211,7 @@ impl Faults {
                     FaultKind::RefuseState { state, code } => device.refusals.push((state, code)),
                     FaultKind::SdoAbort { index, sub, code } => {
                         device.forced_aborts.push((index, sub, code));
+                        idns.push((sub, index, u16::try_from(code).unwrap_or(0x800b)));
                     }
                     FaultKind::SdoIgnored { index, sub } => {
                         device.ignored_writes.push((index, sub));
@@ -220,6 +223,7 @@ impl Faults {
                     _ => {}
                 }
             }
+            device.refuse_idns(&idns);
             device.hold_drive_in(held);
             device.silence_mailbox(silent);
             device.disturb_clock(late, ignored);

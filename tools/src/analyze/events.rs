@@ -6,6 +6,7 @@ use ecaxis_axis::State;
 use ecaxis_axis::cia402::describe;
 
 use super::mailbox::{FileTransfer, Transfer, TransferDirection, TransferOutcome};
+use super::soe::IdnTransfer;
 use super::values::value;
 use ecaxis_ecat::al_status_code::al_status_text;
 use ecaxis_master::acyclic::AlState;
@@ -52,6 +53,7 @@ pub enum EventKind {
     Transfer(Box<Transfer>),
     Emergency(Emergency),
     File(Box<FileTransfer>),
+    Idn(Box<IdnTransfer>),
     ObjectList(usize),
     NoInformation(u32),
     Refused(u16),
@@ -70,6 +72,7 @@ impl EventKind {
     pub fn matters(&self) -> bool {
         match self {
             Self::Transfer(transfer) => transfer.is_trouble(),
+            Self::Idn(transfer) => transfer.is_trouble(),
             Self::Station(_) | Self::Code(_) => false,
             _ => true,
         }
@@ -82,6 +85,7 @@ impl EventKind {
             Self::Transfer(transfer) => transfer.is_trouble(),
             Self::Emergency(emergency) => emergency.is_failure(),
             Self::File(file) => file.error.is_some(),
+            Self::Idn(transfer) => transfer.is_trouble(),
             Self::Refused(_) | Self::ErrorBit => true,
             Self::Axis { state, .. } => {
                 matches!(state, State::Fault | State::FaultReactionActive)
@@ -170,6 +174,7 @@ impl fmt::Display for EventKind {
             Self::Transfer(transfer) => transfer.fmt(f),
             Self::Emergency(emergency) => emergency.fmt(f),
             Self::File(file) => file.fmt(f),
+            Self::Idn(transfer) => transfer.fmt(f),
             Self::ObjectList(1) => write!(f, "lists 1 object"),
             Self::ObjectList(count) => write!(f, "lists {count} objects"),
             Self::NoInformation(code) => {

@@ -4,8 +4,10 @@ use std::collections::BTreeMap;
 
 use ecaxis_ecat::mailbox::abort_code::is_no_such_object;
 use ecaxis_ecat::mailbox::coe::{Answer, Fragment, Message, Request};
-use ecaxis_ecat::mailbox::{self, TYPE_COE, TYPE_ERROR, TYPE_FOE, foe};
+use ecaxis_ecat::mailbox::{self, TYPE_COE, TYPE_ERROR, TYPE_FOE, TYPE_SOE, foe};
 use ecaxis_master::mailbox::Emergency;
+
+use super::soe::{IdnOutcome, IdnTransfer, SoeMailbox};
 
 /// The maximum number of stored bytes of an object; the full length is counted.
 const KEPT: usize = 1024;
@@ -87,6 +89,7 @@ pub enum MailboxEvent {
     Transfer(Transfer),
     Emergency(Emergency),
     File(FileTransfer),
+    Idn(IdnTransfer),
     /// An object list with this number of objects.
     ObjectList(usize),
     /// The mailbox refused a message other than an SDO request.
@@ -100,6 +103,7 @@ pub enum MailboxEvent {
 pub struct Mailbox {
     transfer: Option<Pending>,
     file: Option<FileTransfer>,
+    soe: SoeMailbox,
     last_request: Vec<u8>,
     /// The number of objects in an incomplete list.
     listed: usize,
@@ -167,10 +171,13 @@ impl Mailbox {
             TYPE_COE if to_device => self.request(at, bytes, &mut reported),
             TYPE_COE => self.response(at, bytes, &mut reported),
             TYPE_FOE => self.foe(at, to_device, bytes, &mut reported),
+            TYPE_SOE => self.soe.message(at, bytes, &mut reported),
             TYPE_ERROR => {
                 let code = mailbox.error_code().unwrap_or(0);
                 if self.transfer.is_some() {
                     self.close(at, TransferOutcome::Refused(code), &mut reported);
+                } else if self.soe.is_waiting() {
+                    self.soe.end(at, IdnOutcome::Mailbox(code), &mut reported);
                 } else {
                     reported.push(MailboxEvent::Refused(code));
                 }
@@ -184,6 +191,7 @@ impl Mailbox {
     pub fn end(&mut self, at: u64) -> Vec<MailboxEvent> {
         let mut reported = Vec::new();
         self.close(at, TransferOutcome::Unanswered, &mut reported);
+        self.soe.end(at, IdnOutcome::Unanswered, &mut reported);
         if let Some(mut file) = self.file.take() {
             file.ended_at = at;
             reported.push(MailboxEvent::File(file));

@@ -31,6 +31,7 @@ mod registers;
 mod report;
 mod rows;
 mod segment;
+mod soe;
 mod values;
 
 pub use context::{Context, library};

@@ -481,6 +481,7 @@ impl RecordedSegment {
                 }
                 MailboxEvent::Emergency(emergency) => (at, EventKind::Emergency(emergency)),
                 MailboxEvent::File(file) => (file.began, EventKind::File(Box::new(file))),
+                MailboxEvent::Idn(idn) => (idn.began, EventKind::Idn(Box::new(idn))),
                 MailboxEvent::ObjectList(count) => (at, EventKind::ObjectList(count)),
                 MailboxEvent::NoInformation(code) => (at, EventKind::NoInformation(code)),
                 MailboxEvent::Refused(code) => (at, EventKind::Refused(code)),

@@ -242,7 +242,7 @@ fn device(machine: &Machine, index: DeviceIndex, out: &mut Document) {
     }
     process_data(&device.device, &selection.layout, out);
     clock(device, out);
-    startup(&device.selection.startup, out);
+    startup(&device.selection, out);
 }
 
 /// Returns file, line and column of an element, or the EEPROM image.

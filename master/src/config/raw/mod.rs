@@ -21,6 +21,7 @@ mod axis;
 mod condition;
 mod number;
 mod path;
+mod startup;
 mod step;
 
 pub(crate) use axis::{
@@ -29,6 +30,7 @@ pub(crate) use axis::{
 pub(crate) use condition::{Conditions, Levels, NamedValues, RawCondition, RawSignal, RawWhen};
 pub(crate) use number::{RawNumber, RawVariable};
 pub(crate) use path::{RawPath, RawPoint};
+pub(crate) use startup::{RawIdn, RawStartup};
 pub(crate) use step::{Named, RawAction, RawAxes, RawGear, RawProbe, RawStep, RawWave, TimeLimit};
 
 table! { "the machine file",
@@ -348,17 +350,6 @@ table! { "`sdo`",
     }
 }
 
-table! { "`idn`",
-    row RawIdn {
-        /// IDN
-        idn: Spanned<String> = "\"S-0-0138\"",
-        /// Drive of the device (0 to 7; default 0)
-        drive: Key<u8> [0..=7],
-        /// Value: a number, a text, or a list of bytes; numbers and texts follow the attribute that the drive reports
-        value: Spanned<SdoValue> = "2000",
-    }
-}
-
 impl RawSdo {
     /// Returns the SDO as a drive with this axis alone has it; `None`: it belongs to another axis.
     pub fn of_axis(&self, axis: u16) -> Option<Self> {
@@ -408,15 +399,6 @@ impl Schema for SdoValue {
     fn schema() -> serde_json::Value {
         let one = serde_json::json!({ "type": ["integer", "number", "boolean", "string"] });
         any_of([one, Vec::<u8>::schema()])
-    }
-}
-
-table! { "`startup`",
-    table RawStartup {
-        /// If true, all start-up SDOs are read back and compared (default false)
-        verify: Option<bool>,
-        /// If true, objects that hold their value are not written (default false)
-        skip_equal: Option<bool>,
     }
 }
 

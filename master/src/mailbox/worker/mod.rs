@@ -313,8 +313,6 @@ pub struct WorkerConfig<W> {
     pub name: String,
     /// `None` if the device has no mailbox.
     pub mailbox: Option<(W, CoeClient)>,
-    /// False if the mailbox has SoE and not CoE.
-    pub coe: bool,
 }
 
 /// Receives the emergencies of devices.
@@ -330,12 +328,7 @@ pub fn open<W>(
 ) -> (Mailboxes, Vec<MailboxWorker<W>>) {
     let mut counters = Vec::new();
     let mut workers = Vec::new();
-    for WorkerConfig {
-        name,
-        mailbox,
-        coe: _,
-    } in devices
-    {
+    for WorkerConfig { name, mailbox } in devices {
         let name: Arc<str> = name.into();
         let queues = mailbox.map(|(wire, coe)| {
             let (jobs, asked) = mpsc::channel(QUEUE);

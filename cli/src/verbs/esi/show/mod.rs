@@ -130,7 +130,7 @@ fn configuration(
         out.item("note: ", note);
     }
     process_data(device, &selection.layout, out);
-    startup(&selection.startup, out);
+    startup(selection, out);
 }
 
 fn devices(file: &EsiFile) -> Document {
