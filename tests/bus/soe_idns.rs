@@ -177,7 +177,7 @@ fn idns_are_read_and_written_during_operation() {
 /// Lost frames repeat no write and lose no fragment.
 #[test]
 fn lists_survive_lost_frames() {
-    let script = "[[fault]]\nkind = \"frame-loss\"\nprobability = 0.02\nat = \"1s\"\n";
+    let script = "[[fault]]\nkind = \"frame-loss\"\nprobability = 0.01\nat = \"1s\"\n";
     let machine_options = faults(script);
     with_user(machine_options, async |mailboxes| {
         let mailbox = mailboxes.device("sercos").expect("it is there");

@@ -21,7 +21,7 @@ const MAX_ELEMENT: usize = 0xffff + 4;
 /// The maximum number of old messages that are read before the first request.
 const JOIN_DRAIN: usize = 64;
 /// How often a read may be repeated.
-const REPEATS: u32 = 3;
+const REPEATS: u32 = 10;
 /// The pause between two reads of a procedure command's data state.
 const COMMAND_PAUSE: Duration = Duration::from_millis(5);
 /// The error code of a procedure command that is set already.
