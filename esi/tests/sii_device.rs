@@ -78,7 +78,11 @@ fn device_of_an_image_is_configured_like_that_of_its_esi() {
             let alike = actual.as_ref().is_some_and(|actual| {
                 process_data(actual) == process_data(&expected) && dc(actual) == dc(&expected)
             });
-            let mailbox = |d: &Device| d.mailbox.as_ref().map(|m| (m.coe.is_some(), m.foe, m.eoe));
+            let mailbox = |d: &Device| {
+                d.mailbox
+                    .as_ref()
+                    .map(|m| (m.coe.is_some(), m.foe, m.eoe.is_some()))
+            };
             if alike && mailbox(described) == mailbox(device) {
                 same += 1;
             } else {

@@ -18,6 +18,7 @@ use alloc::vec::Vec;
 pub mod abort_code;
 pub mod coe;
 mod coe_answer;
+pub mod eoe;
 mod error_text;
 pub mod foe;
 pub mod gateway;

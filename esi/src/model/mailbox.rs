@@ -13,14 +13,25 @@ pub struct Mailbox {
     pub coe: Option<Coe>,
     /// File access over EtherCAT.
     pub foe: bool,
-    /// Ethernet over EtherCAT.
-    pub eoe: bool,
+    /// Ethernet over EtherCAT; `None`: not supported.
+    pub eoe: Option<Eoe>,
     /// Servo drive profile over EtherCAT; `None`: not supported.
     pub soe: Option<Soe>,
     /// ADS over EtherCAT.
     pub aoe: bool,
     /// Vendor-specific protocol over EtherCAT.
     pub voe: bool,
+}
+
+/// `EoE`: properties of Ethernet over EtherCAT. `None`: the ESI does not say.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Eoe {
+    /// `IP`: the device takes an IP address.
+    pub ip: Option<bool>,
+    /// `MAC`: the device takes a MAC address.
+    pub mac: Option<bool>,
+    /// `TimeStamp`: the device sends time stamps.
+    pub time_stamp: Option<bool>,
 }
 
 /// `CoE`: properties of CANopen over EtherCAT.

@@ -9,8 +9,8 @@ use super::{
     General, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiFmmuDetail, SiiPdo, SiiSyncManager,
 };
 use crate::model::{
-    Coe, DcMode, Device, Direction, Eeprom, Entry, EsiFile, Fmmu, Identification, Info, Mailbox,
-    Pdo, SmUse, Soe, SyncManager, SyncTime, SyncUnit, Vendor,
+    Coe, DcMode, Device, Direction, Eeprom, Entry, Eoe, EsiFile, Fmmu, Identification, Info,
+    Mailbox, Pdo, SmUse, Soe, SyncManager, SyncTime, SyncUnit, Vendor,
 };
 
 impl Sii {
@@ -292,7 +292,7 @@ fn mailbox(sii: &Sii, general: &General) -> Option<Mailbox> {
             ..Coe::default()
         }),
         foe: protocols.has(Protocols::FOE),
-        eoe: protocols.has(Protocols::EOE),
+        eoe: protocols.has(Protocols::EOE).then(Eoe::default),
         soe: protocols.has(Protocols::SOE).then(Soe::default),
         aoe: protocols.has(Protocols::AOE),
         voe: protocols.has(Protocols::VOE),

@@ -201,7 +201,7 @@ pub(super) fn mailbox_areas(device: &Device) -> MailboxAreas {
 fn protocols(mailbox: &Mailbox) -> Protocols {
     let bits = [
         (mailbox.aoe, Protocols::AOE),
-        (mailbox.eoe, Protocols::EOE),
+        (mailbox.eoe.is_some(), Protocols::EOE),
         (mailbox.coe.is_some(), Protocols::COE),
         (mailbox.foe, Protocols::FOE),
         (mailbox.soe.is_some(), Protocols::SOE),
@@ -255,7 +255,7 @@ fn general(device: &Device) -> General {
         name: device.name.clone(),
         coe_details,
         foe: mailbox.is_some_and(|mailbox| mailbox.foe),
-        eoe: mailbox.is_some_and(|mailbox| mailbox.eoe),
+        eoe: mailbox.is_some_and(|mailbox| mailbox.eoe.is_some()),
         flags: flags
             .into_iter()
             .filter(|(on, _)| *on)

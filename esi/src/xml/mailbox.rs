@@ -6,7 +6,7 @@ use super::text::Names;
 use crate::error::{EsiError, EsiProblem};
 use ecaxis_ecat::mailbox::soe::{Idn, MAX_DRIVES};
 
-use crate::model::{Coe, IdnInitCmd, InitCmd, Mailbox, SlotDependence, Soe};
+use crate::model::{Coe, Eoe, IdnInitCmd, InitCmd, Mailbox, SlotDependence, Soe};
 
 pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Mailbox, EsiError> {
     let mut mailbox = Mailbox {
@@ -17,7 +17,7 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Mail
         match el.name {
             "CoE" => mailbox.coe = Some(coe(c, el)?),
             "FoE" => mailbox.foe = true,
-            "EoE" => mailbox.eoe = true,
+            "EoE" => mailbox.eoe = Some(eoe(c, el)?),
             "SoE" => mailbox.soe = Some(soe(c, el)?),
             "AoE" => mailbox.aoe = true,
             "VoE" => mailbox.voe = true,
@@ -26,6 +26,14 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Mail
         Ok(())
     })?;
     Ok(mailbox)
+}
+
+fn eoe<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Eoe, EsiError> {
+    Ok(Eoe {
+        ip: c.attribute_optional_flag(element, "IP")?,
+        mac: c.attribute_optional_flag(element, "MAC")?,
+        time_stamp: c.attribute_optional_flag(element, "TimeStamp")?,
+    })
 }
 
 fn coe<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Coe, EsiError> {

@@ -34,7 +34,7 @@ pub fn device(device: &Device) -> String {
         }
         for (set, name) in [
             (mailbox.foe, "foe"),
-            (mailbox.eoe, "eoe"),
+            (mailbox.eoe.is_some(), "eoe"),
             (mailbox.soe.is_some(), "soe"),
             (mailbox.aoe, "aoe"),
             (mailbox.voe, "voe"),

@@ -86,7 +86,7 @@ impl DeviceInfo {
             let coe = mailbox.coe.is_some();
             [
                 mailbox.aoe,
-                mailbox.eoe,
+                mailbox.eoe.is_some(),
                 coe,
                 mailbox.foe,
                 mailbox.soe.is_some(),

@@ -123,7 +123,7 @@ impl PlacedDevice<'_> {
         }
         for (name, spoken) in [
             ("AoE", mailbox.aoe),
-            ("EoE", mailbox.eoe),
+            ("EoE", mailbox.eoe.is_some()),
             ("CoE", mailbox.coe.is_some()),
             ("SoE", mailbox.soe.is_some()),
             ("FoE", mailbox.foe),

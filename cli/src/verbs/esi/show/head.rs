@@ -130,7 +130,7 @@ pub(super) fn protocols(mailbox: &Mailbox) -> String {
     let names = [
         (mailbox.coe.is_some(), "CoE"),
         (mailbox.foe, "FoE"),
-        (mailbox.eoe, "EoE"),
+        (mailbox.eoe.is_some(), "EoE"),
         (mailbox.soe.is_some(), "SoE"),
         (mailbox.aoe, "AoE"),
         (mailbox.voe, "VoE"),
