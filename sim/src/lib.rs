@@ -13,8 +13,8 @@
 //! * [`serve`]: the segment on a real network interface, for any MainDevice
 //!
 //! [`SimDevice`] connects the controller (`esc`) with the application: state machine, mailbox and
-//! process data (`device`), object dictionary and SDO server (`coe`), files (`foe`), program memory
-//! and boot loader (`firmware`).
+//! process data (`device`), object dictionary and SDO server (`coe`), files (`foe`), an IP host
+//! (`eoe`), program memory and boot loader (`firmware`).
 
 #![deny(missing_docs)]
 
@@ -22,6 +22,7 @@ mod bits;
 mod coe;
 mod device;
 pub mod drive;
+mod eoe;
 mod esc;
 pub mod faults;
 mod firmware;

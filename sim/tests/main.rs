@@ -15,6 +15,7 @@ mod counting;
 mod delays;
 mod drives;
 mod eeprom;
+mod eoe;
 mod firmware;
 mod fixtures;
 mod foe;

@@ -14,6 +14,7 @@ use crate::coe::history;
 use crate::coe::object_dictionary::ObjectStore;
 use crate::coe::pdo::{PdoRules, expand};
 use crate::drive::PlantParams;
+use crate::eoe::EoeServer;
 use crate::esc::chip::ChipRequirements;
 use crate::esc::ports::Medium;
 use crate::esc::registers::{ADDRESS_SPACE, PROCESS_RAM};
@@ -304,7 +305,7 @@ impl SimDevice {
             process,
             application,
             sercos,
-            mailbox: mailbox(device),
+            mailbox: mailbox(device, options.serial),
             mailbox_limits: mailbox_limits(device),
             boot_mailbox: boot_mailbox(device),
             has_coe: coe.is_some(),
@@ -507,7 +508,7 @@ fn mapped_end(device: &Device, pdo: &PdoRules, store: &ObjectStore) -> usize {
         .fold(modular, usize::max)
 }
 
-fn mailbox(device: &Device) -> Option<Mailbox> {
+fn mailbox(device: &Device, serial: u32) -> Option<Mailbox> {
     let find = |usage| {
         device
             .sync_managers
@@ -515,8 +516,10 @@ fn mailbox(device: &Device) -> Option<Mailbox> {
             .take(8)
             .position(|sm| sm.usage == usage)
     };
-    device.mailbox.as_ref()?;
-    Some(Mailbox::new(find(SmUse::MBoxOut)?, find(SmUse::MBoxIn)?))
+    let protocols = device.mailbox.as_ref()?;
+    let mut mailbox = Mailbox::new(find(SmUse::MBoxOut)?, find(SmUse::MBoxIn)?);
+    mailbox.eoe = protocols.eoe.map(|_| Box::new(EoeServer::new(serial)));
+    Some(mailbox)
 }
 
 fn mailbox_limits(device: &Device) -> [MailboxLimits; 8] {

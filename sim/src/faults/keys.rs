@@ -18,6 +18,8 @@ const KINDS: &[(&str, &[&str])] = &[
     ("sdo-abort", &["device", "index", "sub", "code"]),
     ("sdo-ignored", &["device", "index", "sub"]),
     ("mailbox-silent", &["device"]),
+    ("eoe-flood", &["device"]),
+    ("eoe-fragments", &["device"]),
     ("watchdog", &["device"]),
     ("sync-late", &["device", "delay"]),
     ("clock-ignored", &["device"]),
@@ -126,6 +128,8 @@ fn kind(name: &str, raw: &RawFault) -> Result<FaultKind, String> {
             sub: raw.sub.unwrap_or(0),
         },
         "mailbox-silent" => FaultKind::MailboxSilent,
+        "eoe-flood" => FaultKind::EoeFlood,
+        "eoe-fragments" => FaultKind::EoeFragments,
         "watchdog" => FaultKind::Watchdog,
         "sync-late" => FaultKind::SyncLate {
             delay: duration(raw.delay.as_deref().ok_or("`delay` is missing")?)?,

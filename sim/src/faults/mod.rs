@@ -35,6 +35,8 @@
 //! * `sdo-ignored` (`device`, `index`, `sub`): the device confirms the SDO, the object keeps its
 //!   value
 //! * `mailbox-silent` (`device`): requests stay in the mailbox without an answer
+//! * `eoe-flood` (`device`): the device sends Ethernet broadcasts (EoE) without end
+//! * `eoe-fragments` (`device`): fragments of its Ethernet frames are lost, repeated or contradictory
 //! * `watchdog` (`device`): the process data watchdog expires once, despite outputs
 //! * `sync-late` (`device`, `delay`): SYNC0 starts this much after its start time
 //! * `clock-ignored` (`device`): the device does not take the distributed system time (0x0910), and
@@ -77,6 +79,7 @@ mod tests;
 
 use crate::Nanos;
 use crate::device::{Identification, SimDevice};
+use crate::eoe::EoeFaults;
 use crate::gateway::GatewayFault;
 use crate::random::Random;
 pub(crate) use frames::BitFlip;
@@ -206,6 +209,7 @@ impl Faults {
             device.ignored_writes.clear();
             let mut held = None;
             let (mut silent, mut late, mut ignored) = (false, 0, false);
+            let mut ethernet = EoeFaults::default();
             for fault in self.active().filter(|fault| fault.device == n) {
                 match fault.kind {
                     FaultKind::RefuseState { state, code } => device.refusals.push((state, code)),
@@ -217,6 +221,8 @@ impl Faults {
                         device.ignored_writes.push((index, sub));
                     }
                     FaultKind::MailboxSilent => silent = true,
+                    FaultKind::EoeFlood => ethernet.flood = true,
+                    FaultKind::EoeFragments => ethernet.fragments = true,
                     FaultKind::SyncLate { delay } => late = delay,
                     FaultKind::ClockIgnored => ignored = true,
                     FaultKind::Stuck { state } => held = Some(state),
@@ -226,6 +232,7 @@ impl Faults {
             device.refuse_idns(&idns);
             device.hold_drive_in(held);
             device.silence_mailbox(silent);
+            device.disturb_ethernet(ethernet);
             device.disturb_clock(late, ignored);
         }
         let concerns_frames = self.active().any(|fault| fault.kind.hits().is_some());

@@ -117,6 +117,10 @@ pub(crate) enum FaultKind {
     },
     /// Requests stay in the mailbox of the device without an answer.
     MailboxSilent,
+    /// The device sends Ethernet broadcasts without end.
+    EoeFlood,
+    /// Fragments of Ethernet frames are lost, repeated or contradictory.
+    EoeFragments,
     /// The process data watchdog expires, despite outputs.
     Watchdog,
     /// SYNC0 starts `delay` ns after its start time.

@@ -4,7 +4,7 @@
 //! * `queue`: outgoing messages, counters, repetition
 //! * `options`: mailbox properties that the ESI leaves open
 //!
-//! [`crate::coe`] and [`crate::foe`] implement CoE and FoE. A request stays in its SyncManager
+//! [`crate::coe`], [`crate::foe`] and [`crate::eoe`] implement the protocols. A request stays in its SyncManager
 //! until the device fetches it. While the device processes a request or too many answers wait, the
 //! next request stays there and the mailbox is full.
 
@@ -17,6 +17,7 @@ use queue::{Class, Queue};
 use super::SimDevice;
 use crate::coe::{self, CoeServer, CoeServices, Dictionary, ParameterCommand};
 use crate::drive::Emergency;
+use crate::eoe::{EoeFaults, EoeServer};
 use crate::esc::al::AlState;
 use crate::esc::registers as reg;
 use crate::foe::{FoeRequest, FoeServer, Target};
@@ -28,6 +29,7 @@ const HEADER: usize = 6;
 /// Mailbox types (ETG.1000.4 table 29).
 mod protocol {
     pub(super) const ERROR: u8 = 0;
+    pub(super) const EOE: u8 = 2;
     pub(super) const COE: u8 = 3;
     pub(super) const FOE: u8 = 4;
     pub(super) const SOE: u8 = 5;
@@ -80,6 +82,8 @@ pub(super) struct Mailbox {
     request: Vec<u8>,
     coe: CoeServer,
     foe: FoeServer,
+    /// `None`: the device has no EoE.
+    pub(super) eoe: Option<Box<EoeServer>>,
 }
 
 impl Mailbox {
@@ -94,12 +98,17 @@ impl Mailbox {
             request: Vec::new(),
             coe: CoeServer::default(),
             foe: FoeServer::default(),
+            eoe: None,
         }
     }
 
     /// Drops all pending work, as entering or leaving Init does.
     pub(super) fn reset(&mut self) {
-        *self = Self::new(self.receive, self.send);
+        let eoe = self.eoe.as_ref().map(|eoe| Box::new(eoe.restarted()));
+        *self = Self {
+            eoe,
+            ..Self::new(self.receive, self.send)
+        };
     }
 
     /// Postpones all work to this local time or later.
@@ -115,7 +124,9 @@ impl Mailbox {
 
     /// Returns the local time of the next work for [`SimDevice::serve_mailbox`].
     pub(super) fn due(&self) -> u64 {
-        self.fetch_due.min(self.answer_due).min(self.transfer_due)
+        let eoe = self.eoe.as_ref().map_or(u64::MAX, |eoe| eoe.due());
+        let own = self.fetch_due.min(self.answer_due);
+        own.min(self.transfer_due).min(eoe)
     }
 
     fn is_working(&self) -> bool {
@@ -182,6 +193,7 @@ impl SimDevice {
         if self.is_restarting() {
             return;
         }
+        let room = self.room();
         let Some(mailbox) = &mut self.mailbox else {
             return;
         };
@@ -194,6 +206,12 @@ impl SimDevice {
         else {
             return;
         };
+        if mailbox.queue.is_empty()
+            && let Some(eoe) = &mut mailbox.eoe
+            && let Some(fragment) = eoe.next_fragment(room)
+        {
+            mailbox.queue.push(protocol::EOE, &fragment, Class::Notice);
+        }
         let Some(message) = mailbox.queue.next(usize::from(sm.len)) else {
             return;
         };
@@ -220,6 +238,8 @@ impl SimDevice {
             let request = std::mem::take(&mut mailbox.request);
             self.answer(&request);
             self.watch_transfer(local);
+        } else if mailbox.transfer_due > local {
+            self.work_ethernet(local);
         } else {
             mailbox.transfer_due = u64::MAX;
             if let Some(message) = mailbox.coe.expire() {
@@ -351,6 +371,13 @@ impl SimDevice {
                 }
                 answer
             }
+            // As in Bootstrap, an application without a network is in Init.
+            protocol::EOE if state != AlState::Boot && mailbox.eoe.is_some() => {
+                match &mut mailbox.eoe {
+                    Some(eoe) => eoe.request(payload, room, self.local),
+                    None => Answer::Error(Detail::UnsupportedProtocol),
+                }
+            }
             protocol::FOE if self.has_foe => {
                 let bootstrap = state == AlState::Boot;
                 let target = match &mut self.processor {
@@ -386,6 +413,46 @@ impl SimDevice {
             mailbox.queue.push(protocol::SOE, message, Class::Emergency);
         }
         self.pump_mailbox();
+    }
+
+    /// Lets the IP host behind the mailbox work.
+    fn work_ethernet(&mut self, local: u64) {
+        let eoe = self.mailbox.as_mut().and_then(|mailbox| mailbox.eoe.take());
+        let Some(mut eoe) = eoe else { return };
+        eoe.work(local, &|| self.web_page());
+        if let Some(mailbox) = &mut self.mailbox {
+            mailbox.eoe = Some(eoe);
+        }
+    }
+
+    /// Disturbs the Ethernet traffic of the device.
+    pub(crate) fn disturb_ethernet(&mut self, faults: EoeFaults) {
+        let local = self.local;
+        if let Some(eoe) = self
+            .mailbox
+            .as_mut()
+            .and_then(|mailbox| mailbox.eoe.as_mut())
+        {
+            eoe.disturb(faults, local);
+        }
+    }
+
+    /// Returns the web page of the device.
+    fn web_page(&self) -> String {
+        let mut rows = format!("<tr><td>state</td><td>{:?}</td></tr>\n", self.al.state);
+        for (n, drive) in (1..).zip(self.axes()) {
+            rows += &format!(
+                "<tr><td>axis {n}</td><td>{:?}</td></tr>\n<tr><td>position</td><td>{}</td></tr>\n",
+                drive.state(),
+                drive.position_counts()
+            );
+        }
+        format!(
+            "<!DOCTYPE html>\n<html><head><title>{name}</title></head><body>\n<h1>{name}</h1>\n\
+             <table>\n<tr><td>serial number</td><td>{}</td></tr>\n{rows}</table>\n</body></html>\n",
+            self.serial,
+            name = self.name
+        )
     }
 
     fn room(&self) -> MailboxCapacity {

@@ -89,6 +89,11 @@ impl Queue {
         }
     }
 
+    /// True if no message waits.
+    pub(super) fn is_empty(&self) -> bool {
+        self.waiting.is_empty()
+    }
+
     pub(super) fn error(&mut self, detail: Detail) {
         let class = match detail {
             Detail::NoMoreMemory => Class::Full,
