@@ -13,6 +13,7 @@
 //! - [`samples`]: the values of every cycle, for other threads and processes;
 //! - [`ros2`]: these values as ROS 2 messages and as MCAP files;
 //! - [`mailbox`]: CoE and FoE over raw datagrams, also during operation;
+//! - [`eoe`]: Ethernet over EtherCAT, with a virtual switch;
 //! - [`acyclic`]: access to a bus without a cycle, in the state in which it is;
 //! - [`parameters`]: object names and values; saved to files, compared, restored;
 //! - [`link`]: transports for Ethernet frames;
@@ -42,6 +43,7 @@ pub mod clock;
 mod concurrent;
 pub mod config;
 mod datagram;
+pub mod eoe;
 pub mod esi_library;
 pub mod file;
 pub mod file_digest;

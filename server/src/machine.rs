@@ -34,6 +34,7 @@ pub fn keep_up(hub: &Arc<Hub>, options: &Options, stop: &Arc<CancelToken>, descr
             operator: Some(Box::new(ServerOperator::new(Arc::clone(hub), client))),
             samples: hub.samples.writer(),
             link: None,
+            ethernet: None,
         };
         let machine = (*hub.machine).clone();
         let mut observer = Reporter {
@@ -174,6 +175,10 @@ impl Observer for Reporter<'_> {
             }
             Progress::MailboxGateway { address, write } => hub.event(json!({
                 "event": "mailbox_gateway", "address": address.to_string(), "write": write,
+            })),
+            Progress::Tap(tap) => hub.event(json!({
+                "event": "tap", "name": tap.name,
+                "address": tap.address.map(|(address, prefix)| format!("{address}/{prefix}")),
             })),
             Progress::Warning(text) => warning(hub, text),
             Progress::Denied(denied) => warning(hub, &denied.to_string()),

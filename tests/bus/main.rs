@@ -16,6 +16,7 @@ mod cycles;
 mod damaged_eeprom;
 mod demo;
 mod eeproms;
+mod eoe;
 mod flow;
 mod fsoe;
 mod gateway_axes;

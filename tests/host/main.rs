@@ -5,6 +5,7 @@
 
 mod bench;
 mod chain;
+mod eoe;
 mod first_steps;
 mod gateway;
 mod interruptions;

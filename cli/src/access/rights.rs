@@ -17,6 +17,7 @@ const VARIABLE: &str = "ECAXIS_RIGHTS";
 pub(crate) fn of_machine(machine: &Machine) -> NeededRights {
     let mut needed = NeededRights {
         one_bring_up: true,
+        interface: machine.tap.is_some(),
         low_port: machine
             .mailbox_gateway
             .is_some_and(|gateway| is_low(gateway.bind)),

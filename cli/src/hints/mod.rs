@@ -26,7 +26,7 @@ mod service;
 pub(crate) use fault_report::diagnosed;
 pub(crate) use firmware::{firmware, shared_bus};
 pub(crate) use host::{capabilities, concern, denied, interface, interfaces, overload};
-use service::{FRAMES, eeprom, information, parameter};
+use service::{FRAMES, eeprom, eoe, information, parameter, tap};
 pub(crate) use service::{image, restore, with_other_main_device};
 
 /// Returns the advice for the error code of an emergency message, as for 0x603F.
@@ -80,6 +80,8 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
             "devices without a mailbox, such as digital terminals, have no parameters".to_owned()
         }
         Cause::WrongState { .. } => "bring it to Init first, or switch it off and on".to_owned(),
+        Cause::Eoe { source, .. } => eoe(source),
+        Cause::Tap { source, name, .. } => tap(source, name),
         Cause::Sdo(source) if error.is_in_bring_up() => sdo(source, "bring-up"),
         Cause::Sdo(source) => parameter(source),
         Cause::Information(source) => information(source).to_owned(),

@@ -1,5 +1,6 @@
 //! Advice for work on a bus without a cycle.
 
+use std::io::ErrorKind;
 use std::path::Path;
 
 use ecaxis_ecat::mailbox::abort_code as abort;
@@ -7,7 +8,7 @@ use ecaxis_master::acyclic::eeprom::EepromError;
 use ecaxis_master::acyclic::image::WriteError;
 use ecaxis_master::acyclic::parameters::restore::RestoreError;
 use ecaxis_master::config::Nic;
-use ecaxis_master::mailbox::{CoeCause, InfoError, SdoError};
+use ecaxis_master::mailbox::{CoeCause, EoeError, InfoError, SdoError};
 use ecaxis_master::report::{Cause, Error};
 
 use super::{Failure, failure, sdo};
@@ -120,4 +121,31 @@ pub(super) fn parameter(error: &SdoError) -> String {
         _ => return sdo(error, "the device"),
     };
     hint.to_owned()
+}
+
+/// Returns the hint for IP parameters that a device has not taken.
+pub(super) fn eoe(error: &EoeError) -> String {
+    match error {
+        EoeError::Result(_) => {
+            "remove what the device does not support from `eoe`, or write `eoe = {}`: it keeps its own parameters".to_owned()
+        }
+        EoeError::Mailbox(CoeCause::Refused(_)) => {
+            "the device has no EoE: omit `eoe`, or use the ESI file of its firmware".to_owned()
+        }
+        EoeError::Mailbox(_) => FRAMES.to_owned(),
+    }
+}
+
+/// Returns the hint for a TAP interface that cannot be opened.
+pub(super) fn tap(error: &std::io::Error, name: &str) -> String {
+    match error.kind() {
+        ErrorKind::PermissionDenied => format!(
+            "grant CAP_NET_ADMIN (docs/eoe.md), or create it beforehand: `ip tuntap add {name} mode tap user $USER`"
+        ),
+        ErrorKind::ResourceBusy => {
+            "another program uses it: write another name for `tap`".to_owned()
+        }
+        ErrorKind::NotFound => "load the module: `modprobe tun`".to_owned(),
+        _ => format!("an interface `{name}` of another kind may exist: `ip link show {name}`"),
+    }
 }

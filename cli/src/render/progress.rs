@@ -156,6 +156,7 @@ impl Observer for ProgressPrinter {
                 let rights = if *write { "" } else { ", read only" };
                 note(&format!("mailbox gateway: {address} (UDP and TCP){rights}"));
             }
+            Progress::Tap(tap) => note(&format!("Ethernet of the devices (EoE): {tap}")),
             Progress::Emergency(report) => note(&format!("warning: {report}")),
             // The stop of the group is reported.
             Progress::DeviceLost { .. }

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use ecaxis_master::config::duration;
+use ecaxis_master::eoe::EthernetCounters;
 use ecaxis_master::rt::stats::Percentiles;
 use ecaxis_master::session::{
     AxisSummary, DeviceErrors, EmergencyLine, EventLine, GatewaySummary, Summary, ThreadSummary,
@@ -49,6 +50,7 @@ pub(crate) fn summary(summary: &Summary) -> Document {
     out.gap();
     out.table(errors(&summary.errors));
     gateways(&summary.gateways, &mut out);
+    ethernet(&summary.ethernet, &mut out);
     emergencies(&summary.emergencies, summary.more_emergencies, &mut out);
     if summary.events.iter().any(|event| event.failure) {
         out.gap();
@@ -232,6 +234,23 @@ fn gateways(gateways: &[GatewaySummary], out: &mut Document) {
     }
 }
 
+/// Shows the ports of the virtual switch (EoE).
+fn ethernet(ports: &[EthernetCounters], out: &mut Document) {
+    let mut table = Table::new("Ethernet (EoE)|frames from it|to it|dropped");
+    for port in ports {
+        let dropped = [
+            port.overflows,
+            port.not_taken,
+            port.invalid,
+            port.incomplete,
+        ];
+        let dropped: u64 = dropped.iter().sum();
+        table.row(cells![port.name, port.from_port, port.to_port, dropped]);
+    }
+    out.gap();
+    out.table(table);
+}
+
 fn emergencies(emergencies: &[EmergencyLine], more: u64, out: &mut Document) {
     let mut table = Table::new("time|device|emergency|register|data|what");
     for line in emergencies {
@@ -404,6 +423,7 @@ mod tests {
                 data: [1, 2, 3, 4, 0xff],
             }],
             more_emergencies: 2,
+            ethernet: Vec::new(),
             gateways: vec![GatewaySummary {
                 name: "can".into(),
                 errors: vec!["CAN error passive"],

@@ -10,6 +10,9 @@ use serde_json::json;
 use crate::hints::{self, Failure};
 use crate::render::{note_of, print, print_json, shown};
 
+/// Precedes the description of the TAP interface.
+pub(crate) const TAP: &str = "EoE during the run: TAP ";
+
 const EXAMPLES: &str = "\
 Examples:
   ecaxis check machine.toml
@@ -120,6 +123,9 @@ fn summary(machine: &Machine) -> Document {
             device.name,
             if device.optional { "; optional" } else { "" }
         ));
+        if let Some(eoe) = &device.eoe {
+            out.item("  ", format!("EoE: {eoe}"));
+        }
         for note in &selection.notes {
             let (lead, note) = note_of(note);
             out.item(format!("  {lead}"), note);
@@ -131,6 +137,9 @@ fn summary(machine: &Machine) -> Document {
                 format!("{file}:{at} {}: {}", warning.path, warning.message),
             );
         }
+    }
+    if let Some(tap) = &machine.tap {
+        out.line(format!("{TAP}{tap}"));
     }
     out
 }

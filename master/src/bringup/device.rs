@@ -97,6 +97,24 @@ pub(super) async fn start_up(
     Ok(())
 }
 
+/// Sets the IP parameters of a device with EoE, if the machine file has them.
+pub(super) async fn set_ip_parameters(
+    wire: &impl MailboxTransport,
+    config: &DeviceConfig,
+    device: &mut BusDevice,
+) -> Result<(), Error> {
+    let parameters = config.eoe.as_ref().and_then(|eoe| eoe.parameters.as_ref());
+    let (Some(parameters), Some(coe)) = (parameters, device.coe.as_mut()) else {
+        return Ok(());
+    };
+    let set = coe.set_ip_parameters(wire, parameters).await;
+    set.map_err(|source| {
+        let parameters = config.eoe.as_ref().map(ToString::to_string);
+        let parameters = parameters.unwrap_or_default();
+        Cause::Eoe { parameters, source }.with_device(&device.at)
+    })
+}
+
 fn abort_code(error: &Error) -> Option<u32> {
     match &*error.cause {
         Cause::StartUp { source, .. } => source.abort_code(),

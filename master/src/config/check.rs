@@ -11,6 +11,7 @@ use super::compensation;
 use super::copy::{self, OutputWriter};
 use super::device::{self, CheckedDevice, EsiFiles};
 use super::duration::show;
+use super::eoe;
 use super::fields::KeyExt;
 use super::gantry;
 use super::mailbox_gateway;
@@ -37,6 +38,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
     let cycle_span = raw.bus.cycle.place().unwrap_or_default();
     let bus = bus(raw.bus, p);
     unique_names(&raw.devices, p);
+    eoe::unique(&raw.devices, p);
     if let Some(beyond) = raw.devices.get(MAX_SUBDEVICES) {
         let message = format!("a bus has at most {MAX_SUBDEVICES} SubDevices");
         p.add(beyond.span.clone(), message);
@@ -167,6 +169,8 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
     let devices: IndexVec<_, _> = devices.into();
     let gateway = raw.mailbox_gateway.as_ref();
     let gateway = gateway.map(|raw| mailbox_gateway::check(raw, p));
+    let tap = raw.eoe.as_ref();
+    let tap = tap.and_then(|raw| eoe::tap(raw, bus.as_ref(), &devices, p));
     connections.check(&devices, p);
     optional.check(&devices, &program, p);
     Some(Machine {
@@ -200,6 +204,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
             lease_ns: raw.server.lease.value().unwrap_or(500_000_000),
         },
         mailbox_gateway: gateway,
+        tap,
     })
 }
 

@@ -11,7 +11,7 @@ use super::fields::{Key, KeyExt};
 use super::needed::{self, Needs};
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawDevice, RawEntry, SdoValue};
-use super::{DeviceConfig, Locator, MailboxSource, Startup, gateway, sdo, sim};
+use super::{DeviceConfig, Locator, MailboxSource, Startup, eoe, gateway, sdo, sim};
 use crate::esi_library::{RevisionMatch, SiiImage};
 use crate::rt::config::ProcessDataCopy;
 
@@ -71,6 +71,8 @@ pub(crate) fn check(
         repeated_outputs(chosen);
         profile_objects(&raw, chosen, p);
     }
+    let notes = chosen.as_mut().map(|chosen| &mut chosen.notes);
+    let eoe = eoe::device(&raw, device, notes, p);
     let sim = raw.sim.take().map(|sim| {
         let axis = match axes.first() {
             None => Err(()),
@@ -118,6 +120,7 @@ pub(crate) fn check(
             optional: raw.optional.value().unwrap_or(false) || raw.behind.is_some(),
             sim,
             gateway,
+            eoe,
             line: p.line(&raw.span),
         })
     })();

@@ -64,7 +64,7 @@ fn document_lists_every_key() {
 
 /// The tables of the schema that a section of the document describes.
 #[rustfmt::skip] // one row per section
-const SECTIONS: [(&str, &str); 17] = [
+const SECTIONS: [(&str, &str); 19] = [
     ("[bus]", "/properties/bus"),
     ("[[device]]", "/properties/device/items"),
     ("[device.axis]", "/definitions/axis"),
@@ -82,6 +82,8 @@ const SECTIONS: [(&str, &str); 17] = [
     ("[stop]", "/properties/stop"),
     ("[override]", "/properties/override"),
     ("[server]", "/properties/server"),
+    ("[eoe]", "/properties/eoe"),
+    ("Ethernet of a device", "/properties/device/items/properties/eoe"),
 ];
 
 /// Formats a row as the doc comment of the key.

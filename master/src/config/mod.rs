@@ -30,6 +30,7 @@
 //! | `gantry.rs` | two axes that move as one |
 //! | `gateway.rs` | the CAN network behind a gateway, its nodes and their axes |
 //! | `mailbox_gateway.rs` | the mailbox gateway for other vendors' tools |
+//! | `eoe.rs` | Ethernet over EtherCAT: the TAP interface, IP parameters |
 //! | `steps.rs` | checks of the program; `[stop]` in `steps/stop.rs` |
 //! | `program.rs` | the program, and its steps as text |
 //!
@@ -53,6 +54,7 @@ mod documented;
 pub(crate) mod drive_limits;
 mod drive_units;
 pub mod duration;
+mod eoe;
 #[macro_use]
 mod fields;
 mod gantry;
@@ -91,6 +93,7 @@ pub use copy::{BitRange, CopySetup};
 pub(crate) use device::unused_axis;
 pub use drive_limits::LimitConflict;
 pub use drive_units::{AdoptedUnits, UnitProblem};
+pub use eoe::{EoeSetup, TapSetup};
 pub use gateway::{GatewaySetup, NodeSetup};
 pub use locator::{Locator, SegmentHead};
 pub use mailbox_gateway::MailboxGatewaySetup;
@@ -170,6 +173,8 @@ pub struct Machine {
     pub server: ServerSetup,
     /// The mailbox gateway; `None`: there is none.
     pub mailbox_gateway: Option<MailboxGatewaySetup>,
+    /// The TAP interface of the devices with EoE; `None`: there is none.
+    pub tap: Option<TapSetup>,
 }
 
 /// Settings of the server for clients that command the machine.
@@ -294,6 +299,8 @@ pub struct DeviceConfig {
     pub sim: sim::SimSetup,
     /// The CAN network behind a gateway with described nodes.
     pub gateway: Option<GatewaySetup>,
+    /// The port at the virtual switch; `None`: EoE is not used.
+    pub eoe: Option<EoeSetup>,
     /// The line of its `[[device]]` in the machine file.
     pub line: u32,
 }

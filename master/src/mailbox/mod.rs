@@ -8,6 +8,7 @@
 //! - `sdo_info`: the object dictionary as reported by the device (SDO Information).
 //! - [`foe`]: [`FoeClient`], file transfer.
 //! - `soe`: IDNs and procedure commands of Sercos drives, also by [`CoeClient`].
+//! - `eoe`: Ethernet frames between the requests of others.
 //! - `raw`: messages of any protocol from other programs.
 //! - `worker`: [`Mailboxes`], transfers from any thread while workers serve the mailboxes.
 //! - `error`, `emergency`, `object_names`: error types and texts.
@@ -17,6 +18,7 @@ use std::time::Duration;
 use crate::cancel::CancelToken;
 
 mod emergency;
+mod eoe;
 mod error;
 pub mod foe;
 mod raw;
@@ -31,6 +33,7 @@ pub use crate::rt::exchange::MailboxStatus;
 pub use ecaxis_ecat::mailbox::{abort_text, mailbox_error_text};
 pub use ecaxis_ecat::object::{NamedObject, object_name};
 pub use emergency::{EMERGENCY_QUEUE, Emergencies, Emergency, EmergencySource, Received};
+pub use eoe::EoeError;
 pub use error::{CoeCause, CoeError, InfoError, Phase, SdoError, Subject};
 pub use foe::{FoeCause, FoeClient, FoeError};
 pub use raw::{RawAnswer, RawMessage};

@@ -9,7 +9,7 @@ use std::time::Duration;
 use ecaxis_ecat::mailbox::coe::{Answer, Message, Request};
 use ecaxis_ecat::mailbox::gateway::Telegram;
 use ecaxis_ecat::mailbox::{
-    DecodeError, Encode, HEADER, Mailbox, TYPE_COE, TYPE_ERROR, TYPE_FOE, TYPE_SOE, foe,
+    DecodeError, Encode, HEADER, Mailbox, TYPE_COE, TYPE_EOE, TYPE_ERROR, TYPE_FOE, TYPE_SOE, foe,
 };
 
 use super::error::{Phase, SdoError, Subject};
@@ -216,6 +216,10 @@ fn meaning(request: &RawMessage, answer: &[u8]) -> Meaning {
         protocol if protocol != request.protocol => return Meaning::Other,
         TYPE_COE => {}
         TYPE_SOE if soe_continues(&message) => return Meaning::More,
+        // A part of an Ethernet frame answers nothing.
+        TYPE_EOE if message.body.first().is_some_and(|kind| kind & 0x0f == 0) => {
+            return Meaning::Other;
+        }
         _ => return Meaning::Last,
     }
     let asked = request.mailbox();

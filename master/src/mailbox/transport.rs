@@ -10,6 +10,7 @@ use ecaxis_ecat::mailbox::{Encode, MIN_LENGTH, soe};
 use super::emergency::{Emergencies, Emergency};
 use super::error::Phase;
 use super::{DatagramError, MailboxLayout, MailboxTransport, Timeouts};
+use crate::eoe::EoePort;
 use crate::link::MAX_DATA;
 use ecaxis_ecat::registers;
 
@@ -92,6 +93,8 @@ pub(super) struct Port {
     pub(super) free: bool,
     /// 1 to 7; the SubDevice distinguishes a new message from a repetition by it.
     counter: u8,
+    /// The port of the switch that takes EoE messages.
+    pub(super) eoe: Option<EoePort>,
 }
 
 impl Port {
@@ -109,15 +112,20 @@ impl Port {
             read_at: 0,
             free: false,
             counter: 0,
+            eoe: None,
         }
     }
 
     /// Returns the port of a device that has restarted.
     pub(super) fn restarted(&self) -> Self {
+        if let Some(eoe) = &self.eoe {
+            eoe.restart();
+        }
         Self {
             timeouts: self.timeouts,
             emergencies: self.emergencies.clone(),
             forgotten: self.forgotten,
+            eoe: self.eoe.clone(),
             ..Self::new(self.layout)
         }
     }
@@ -356,8 +364,54 @@ impl Port {
         Ok(count)
     }
 
-    /// Queues an emergency or a notification and drops any other message.
+    /// Reads one message, if there is one, and sets it aside.
+    pub(super) async fn take_one<W: MailboxTransport>(
+        &mut self,
+        w: &W,
+    ) -> Result<(), TransportError> {
+        let mut budget = RetryBudget::default();
+        let read = match self.waits(w) {
+            true => self.read(w, &mut budget).await?,
+            false => self.fetch(w, &mut budget).await?,
+        };
+        match read {
+            ReadOutcome::Message => self.set_aside(w),
+            ReadOutcome::Lost => match self.repeat(w, &mut budget).await {
+                // A message that cannot be repeated no longer occupies the mailbox.
+                Ok(()) | Err(TransportError::Timeout(_)) => {}
+                Err(trouble) => return Err(trouble),
+            },
+            ReadOutcome::Waiting | ReadOutcome::Nothing => {}
+        }
+        Ok(())
+    }
+
+    /// Writes a message once, with a counter of its own. Returns the working counter, 0 if the
+    /// mailbox is full.
+    pub(super) async fn write_once<W: MailboxTransport>(
+        &mut self,
+        w: &W,
+        message: &impl Encode,
+    ) -> Result<u16, DatagramError> {
+        let counter = self.counter % 7 + 1;
+        message.emit(counter, self.layout.out_len, &mut self.outgoing);
+        let written = w
+            .write(self.layout.station, self.layout.out_address, &self.outgoing)
+            .await;
+        if written != Ok(0) {
+            // The next request may find the mailbox full.
+            (self.counter, self.free) = (counter, false);
+        }
+        written
+    }
+
+    /// Queues an emergency or a notification, passes EoE on to the switch and drops any other
+    /// message.
     pub(super) fn set_aside<W: MailboxTransport>(&mut self, w: &W) {
+        let eoe = self.eoe.as_ref();
+        if eoe.is_some_and(|eoe| eoe.receive(w.now(), &self.incoming)) {
+            return;
+        }
         let emergency = match Message::parse(&self.incoming) {
             Ok(Message::Emergency(bytes)) => Some(Emergency::from_bytes(*bytes)),
             _ => match soe::Message::parse(&self.incoming) {

@@ -9,7 +9,7 @@ use ecaxis_axis::{CommandError, Mode, State, Statusword, Trip};
 
 use crate::config::{LimitConflict, UnitProblem};
 use crate::link::{LinkError, OpenError};
-use crate::mailbox::{DatagramError, IdnElement, InfoError, SdoError};
+use crate::mailbox::{DatagramError, EoeError, IdnElement, InfoError, SdoError};
 use crate::rt::gateway::NodeState;
 use crate::rt::image::{NotMapped, TooLarge};
 use crate::rt::setpoint_generator::GeneratorError;
@@ -105,6 +105,17 @@ pub enum Cause {
     WrongState { state: AlState },
     #[error("{}", .0.without_station())]
     Sdo(#[source] SdoError),
+    #[error("IP parameters by EoE ({parameters}): {source}")]
+    Eoe {
+        parameters: String,
+        source: EoeError,
+    },
+    #[error("the TAP interface `{name}`: {step}: {source}")]
+    Tap {
+        name: String,
+        step: &'static str,
+        source: std::io::Error,
+    },
     #[error("{}", .0.without_station())]
     Information(#[source] InfoError),
     /// The scan failed, and no device explains it.

@@ -11,7 +11,7 @@ use serde::Serialize;
 use super::bring_up::{Step, StepTime};
 use super::{DeviceRef, EmergencyReport, Error};
 use crate::clock::Nanos;
-use crate::config::{Machine, TorqueUnit};
+use crate::config::{Machine, TapSetup, TorqueUnit};
 use crate::link::NicWarning;
 use crate::link::redundant::RingStatus;
 use crate::mailbox::Mailboxes;
@@ -80,6 +80,8 @@ pub enum Progress {
         address: SocketAddr,
         write: bool,
     },
+    /// The TAP interface exists from now to the end of the run.
+    Tap(TapSetup),
     /// A group of axes has begun to stop. The machine continues without it.
     GroupStopped {
         group: String,

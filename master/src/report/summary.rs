@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use crate::clock::{Clock, Nanos};
 use crate::config::Machine;
+use crate::eoe::EthernetCounters;
 use crate::link::LinkStats;
 use crate::link::capture::RecordStats;
 use crate::rt::axis::RtAxis;
@@ -57,6 +58,8 @@ pub struct Summary {
     pub errors: Vec<DeviceErrors>,
     /// The CANopen gateways and the nodes behind them, in the order of the file.
     pub gateways: Vec<GatewaySummary>,
+    /// The ports of the virtual switch: devices with EoE in the order of the file, then the interface.
+    pub ethernet: Vec<EthernetCounters>,
     /// The last events of the cycle, oldest first.
     pub events: Vec<EventLine>,
     /// The emergencies of the devices, oldest first, up to a fixed number.
@@ -185,6 +188,7 @@ pub(crate) struct SummaryInputs {
     pub record: Option<RecordStats>,
     pub errors: Vec<DeviceErrors>,
     pub gateways: Vec<GatewaySummary>,
+    pub ethernet: Vec<EthernetCounters>,
     pub events: Vec<EventLine>,
     /// The kept emergencies and the number of further ones.
     pub emergencies: (Vec<EmergencyLine>, u64),
@@ -312,6 +316,7 @@ impl Summary {
             probes: aside.captures,
             errors: aside.errors,
             gateways: aside.gateways,
+            ethernet: aside.ethernet,
             events: aside.events,
             emergencies: aside.emergencies.0,
             more_emergencies: aside.emergencies.1,

@@ -17,6 +17,7 @@ use ecaxis_sim::FaultScript;
 use crate::cancel::CancelToken;
 use crate::clock::{Clock, Nanos};
 use crate::config::Machine;
+use crate::eoe::EthernetInterface;
 use crate::link::Link;
 use crate::mailbox_gateway::{BoundGateway, GatewayThread};
 use crate::post_mortem::FaultReport;
@@ -42,6 +43,7 @@ pub use crate::report::{
     NodeSummary, Observer, ProbeCapture, Progress, Status, StepRef, Summary, ThreadSummary,
 };
 use crate::sys::rights;
+use crate::sys::tap::{TapError, TapInterface};
 use crate::text::panic_text;
 pub use bus::{run_on_link, with_bus};
 use cycle_thread::CycleRun;
@@ -132,6 +134,8 @@ pub struct Attachments {
     pub link: Option<Box<dyn Link>>,
     /// Pauses the program and steps it.
     pub control: Arc<ProgramControl>,
+    /// The interface at the virtual switch in place of the file's `tap`.
+    pub ethernet: Option<Box<dyn EthernetInterface>>,
 }
 
 /// Runs a machine until its program, its time limit, `stop` ([`stop_on_signals`]) or an error ends
@@ -274,6 +278,30 @@ fn bind_gateway(
     Ok(Some(bound))
 }
 
+/// Opens the TAP interface before the first frame. `None` without the key, and in virtual time.
+fn open_tap(
+    machine: &Machine,
+    options: &Options,
+    progress: &Sender<Progress>,
+) -> Result<Option<Box<dyn EthernetInterface>>, Error> {
+    let Some(setup) = &machine.tap else {
+        return Ok(None);
+    };
+    if options.clock == Clock::Virtual {
+        let text = "virtual time has no TAP interface: programs of this computer wait in real time";
+        let _ = progress.send(Progress::Warning(text.to_owned()));
+        return Ok(None);
+    }
+    let tap = TapInterface::open(&setup.name, setup.address);
+    let tap = tap.map_err(|TapError { step, source }| Cause::Tap {
+        name: setup.name.clone(),
+        step,
+        source,
+    })?;
+    let _ = progress.send(Progress::Tap(setup.clone()));
+    Ok(Some(Box::new(tap)))
+}
+
 fn serve_gateway(bound: BoundGateway, supervisor: &mut Supervisor) -> Result<GatewayThread, Error> {
     let failed = |error: std::io::Error| Error::from(Cause::Thread(error.to_string()));
     let (address, write) = (bound.address().map_err(failed)?, bound.write());
@@ -302,6 +330,11 @@ fn run_on_link_thread(
         Ok(gateway) => gateway,
         Err(error) => return error.into(),
     };
+    match open_tap(machine, options, &progress) {
+        Ok(None) => {}
+        Ok(tap) => attachments.ethernet = attachments.ethernet.or(tap),
+        Err(error) => return error.into(),
+    }
     let mut seen = BringUpEvidence::default();
     let link = attachments.link.take();
     let job = RunBuilder {
@@ -337,6 +370,7 @@ fn run_on_link_thread(
     let places = fault_evidence::places(&supervisor.bus);
     let log = supervisor.log.clone();
     let device_log = supervisor.device_log.clone();
+    let ethernet = supervisor.ethernet.network.clone();
     let machine = &Arc::clone(&supervisor.machine);
     let CycleRun {
         remains,
@@ -409,6 +443,7 @@ fn run_on_link_thread(
         record,
         errors: summary::device_errors(machine, &diagnoses),
         gateways: summary::gateways(machine, &gateways),
+        ethernet: ethernet.counters(),
         events,
         emergencies: log.lines(started),
         started,

@@ -18,6 +18,7 @@ use crate::cancel::CancelToken;
 use crate::clock::{self, Clock, Nanos};
 use crate::config::{Machine, Signal};
 use crate::datagram::{CyclicMailboxTransport, DatagramClient};
+use crate::eoe::{EoeNetwork, Ethernet};
 use crate::link::Link;
 use crate::link::pdu_loop::{PduLoop, drive_pdu_loop, main_device};
 use crate::mailbox::Mailboxes;
@@ -133,6 +134,7 @@ impl RunBuilder<'_> {
                     bus_status.set_presence(device, false, true);
                 }
                 log.set_bus_status(Arc::clone(&bus_status));
+                let network = connect(machine, &mut bus);
                 let (mailboxes, workers) =
                     mailbox_workers(&mut bus, wire, &exchange, machine.bus.cycle_ns, &log);
                 let _ = progress.send(Progress::Topology(bus.places()));
@@ -146,6 +148,7 @@ impl RunBuilder<'_> {
                     samples,
                     link: _,
                     control,
+                    ethernet,
                 } = attachments;
                 let sim_inputs = link.take_sim_inputs();
                 let controlled = controller.is_some();
@@ -202,6 +205,11 @@ impl RunBuilder<'_> {
                     buttons: Buttons::default(),
                     mailbox_gateway: None,
                     resets: None,
+                    ethernet: Ethernet::new(
+                        network,
+                        ethernet,
+                        machine.tap.as_ref().map_or("interface", |tap| &tap.name),
+                    ),
                     ring_delays,
                     device_log: DeviceLog::default(),
                 };
@@ -235,6 +243,17 @@ impl RunBuilder<'_> {
             }
         }
     }
+}
+
+/// Connects the mailboxes of the devices with EoE with the virtual switch.
+fn connect(machine: &Machine, bus: &mut Bus) -> EoeNetwork {
+    let network = EoeNetwork::default();
+    for (config, device) in machine.devices.iter().zip(bus.devices.iter_mut()) {
+        if let (Some(_), Some(coe)) = (&config.eoe, device.coe.as_mut()) {
+            coe.connect(network.add_device(&config.name));
+        }
+    }
+    network
 }
 
 /// Creates a mailbox worker for every device of the bus.

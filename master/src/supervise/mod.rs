@@ -22,6 +22,7 @@ use crate::clock::{self, Nanos};
 use crate::config::Machine;
 use crate::config::steps::enables;
 use crate::datagram::{CyclicMailboxTransport, DatagramClient};
+use crate::eoe::Ethernet;
 use crate::link::sim::SimInputSender;
 use crate::mailbox::worker::{MailboxWorker, run_with_workers};
 use crate::mailbox::{DatagramError, Mailboxes};
@@ -132,6 +133,8 @@ pub struct Supervisor {
     pub(crate) mailbox_gateway: Option<LivePublisher>,
     /// The resets of Sercos drives.
     pub(crate) resets: Option<ResetQueue>,
+    /// The virtual switch between devices with EoE and an interface of this computer.
+    pub ethernet: Ethernet,
     /// The propagation delays in the closed ring, with cable redundancy.
     pub(crate) ring_delays: Option<Arc<std::sync::Mutex<RingDelays>>>,
 }
@@ -159,6 +162,7 @@ impl Supervisor {
         let workers = std::mem::take(&mut self.workers);
         let heartbeat = self.outer.heartbeat.clone();
         let latch = Arc::<Mutex<()>>::default();
+        let ethernet = self.ethernet.serve();
         // The futures are large, and nothing needs them on the stack.
         let (delays, returns, resets) = (
             Box::pin(self.keep_delays(Arc::clone(&latch))),
@@ -167,7 +171,7 @@ impl Supervisor {
         );
         let work = async {
             let aside = async {
-                tokio::join!(delays, returns, resets);
+                tokio::join!(delays, returns, resets, ethernet);
                 std::future::pending::<Infallible>().await
             };
             tokio::select! {

@@ -6,7 +6,8 @@
 //! - [`ring`]: the receive ring that is shared with the kernel;
 //! - [`process`]: the resource usage of a thread, and the settings of the heap;
 //! - [`shared_memory`]: memory that other processes can map;
-//! - [`signal`]: the signals that the process ignores.
+//! - [`signal`]: the signals that the process ignores;
+//! - [`tap`]: TAP interfaces.
 //!
 //! And what blocks or opens files, without unsafe code:
 //!
@@ -31,6 +32,7 @@ pub mod ring;
 pub mod rt_thread;
 pub mod shared_memory;
 pub mod signal;
+pub mod tap;
 
 use std::io;
 

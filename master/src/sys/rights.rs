@@ -30,7 +30,12 @@ const BRING_UP: CapabilitySet = FILES
 /// Folders that are read although no option names them.
 const SYSTEM: [&str; 7] = ["/proc", "/sys", "/dev", "/usr", "/lib", "/lib64", "/etc"];
 /// Files that are written although no option names them.
-const DEVICES: [&str; 3] = ["/dev/cpu_dma_latency", "/dev/null", "/dev/tty"];
+const DEVICES: [&str; 4] = [
+    "/dev/cpu_dma_latency",
+    "/dev/net/tun",
+    "/dev/null",
+    "/dev/tty",
+];
 
 static LIMITED: AtomicBool = AtomicBool::new(false);
 static ONE_BRING_UP: AtomicBool = AtomicBool::new(false);
@@ -44,6 +49,8 @@ pub struct NeededRights {
     pub write: Vec<PathBuf>,
     /// True if the process binds a port below 1024.
     pub low_port: bool,
+    /// True if the process creates a network interface.
+    pub interface: bool,
     /// True if the bus is brought up once. Otherwise the rights for that stay with the threads that
     /// bring it up again.
     pub one_bring_up: bool,
@@ -70,7 +77,11 @@ pub fn limit_process(needed: &NeededRights) -> Vec<RightsError> {
         true => CapabilitySet::NET_BIND_SERVICE,
         false => CapabilitySet::empty(),
     };
-    denied.extend(keep_capabilities(BRING_UP | low_port).err());
+    let interface = match needed.interface {
+        true => CapabilitySet::NET_ADMIN,
+        false => CapabilitySet::empty(),
+    };
+    denied.extend(keep_capabilities(BRING_UP | low_port | interface).err());
     denied.extend(limit_folders(needed).err().map(RightsError::Landlock));
     denied.extend(filter::limit_process().err().map(RightsError::Seccomp));
     ONE_BRING_UP.store(needed.one_bring_up, Ordering::Relaxed);

@@ -73,6 +73,7 @@ fn explain(machine: &Machine, only: Option<DeviceIndex>) -> Document {
         device(machine, index, &mut out);
     }
     wire(machine, &mut out);
+    ethernet(machine, &mut out);
     gantries(machine, &mut out);
     copies(machine, &mut out);
     stop::stop(machine, &mut out);
@@ -190,6 +191,25 @@ fn bus(machine: &Machine, out: &mut Document) {
     out.section("bus", table);
 }
 
+/// Shows the virtual switch and what is connected with it.
+fn ethernet(machine: &Machine, out: &mut Document) {
+    let connected = machine.devices.iter().filter(|device| device.eoe.is_some());
+    let names: Vec<_> = connected
+        .map(|device| format!("`{}`", device.name))
+        .collect();
+    if names.is_empty() {
+        return;
+    }
+    out.heading("Ethernet over EtherCAT (EoE)".to_owned());
+    out.line(format!("virtual switch: {}", names.join(", ")));
+    match &machine.tap {
+        Some(tap) => out.line(format!(
+            "TAP {tap}; exists during the run, needs CAP_NET_ADMIN"
+        )),
+        None => out.line("no TAP interface ([eoe]): the devices reach each other only".to_owned()),
+    }
+}
+
 fn device(machine: &Machine, index: DeviceIndex, out: &mut Document) {
     let device = &machine.devices[index];
     let selection = &device.selection;
@@ -203,6 +223,9 @@ fn device(machine: &Machine, index: DeviceIndex, out: &mut Document) {
     out.line(selection.identity.to_string());
     if device.optional {
         out.line("optional: may be absent, and appear at any port".to_owned());
+    }
+    if let Some(eoe) = &device.eoe {
+        out.line(format!("EoE, set in PreOp: {eoe}"));
     }
     if let Some(mode) = selection.mode {
         out.line(format!("mode {mode} (0x6060 = {})", mode.code()));

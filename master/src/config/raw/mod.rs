@@ -19,6 +19,7 @@ use super::{ExchangeMode, GroupStopScope, MailboxSource, SocketKind, Spin, Unkno
 
 mod axis;
 mod condition;
+mod eoe;
 mod number;
 mod path;
 mod startup;
@@ -28,6 +29,7 @@ pub(crate) use axis::{
     AxisTables, RawAxis, RawCompensation, RawHoming, RawLimits, RawSecondEncoder,
 };
 pub(crate) use condition::{Conditions, Levels, NamedValues, RawCondition, RawSignal, RawWhen};
+pub(crate) use eoe::{RawDeviceEoe, RawEoe};
 pub(crate) use number::{RawNumber, RawVariable};
 pub(crate) use path::{RawPath, RawPoint};
 pub(crate) use startup::{RawIdn, RawStartup};
@@ -62,6 +64,8 @@ table! { "the machine file",
         server: RawServer,
         /// Mailboxes for other vendors' tools
         mailbox_gateway: Option<RawMailboxGateway>,
+        /// Ethernet of the devices (EoE) as a network interface of this computer
+        eoe: Option<RawEoe>,
         /// The simulated bus: inputs that are switched by time
         sim: RawSimulation,
         /// Names of inputs and outputs, `start = "io.Input 1"`
@@ -271,6 +275,8 @@ table! { "[[device]]",
         can: RawCan,
         /// Drives behind a CANopen gateway (tables, `[[device.node]]`; default none)
         node: Vec<RawNode>,
+        /// Port at the virtual switch (EoE) and IP parameters, see below (table; default none)
+        eoe: Option<RawDeviceEoe>,
         /// Settings of the simulated bus
         sim: Option<RawSim>,
     }

@@ -27,6 +27,7 @@ fn config_reports_each_mistake_with_its_place() {
         ("nic = \"sim\"", "link = \"xyz\"", "`link` cannot be \"xyz\"", "there are: `ring`, `packet`", "\"xyz\""),
         ("[bus]", "[mailbox_gateway]\nbind = \"localhost\"\n[bus]", "\"localhost\" is not an IP address with a port", "127.0.0.1:34980", "\"localhost\""),
         ("[bus]", "[mailbox_gateway]\nwrite = 1\n[bus]", "expected true or false", "", "1"),
+        ("[bus]", "[eoe]\ntap = \"ecat0\"\n[bus]", "no device is connected with the TAP interface", "eoe = {", "\"ecat0\""),
         ("[bus]", "[buss]", "unknown key `buss`", "did you mean `bus`?", "buss"),
         ("[[step]]", "[[stpe]]", "unknown key `stpe`", "did you mean `step`?", "stpe"),
         ("repeat = 2", "repeat = 0", "a whole number from 1", "", "0"),

@@ -10,6 +10,7 @@ use std::task::{Context, Poll, Wake, Waker};
 use tokio::sync::mpsc;
 
 use super::{EmergencySink, Job, Request};
+use crate::mailbox::eoe::EoeSender;
 use crate::mailbox::{CoeClient, Emergencies, MailboxTransport, SdoError};
 
 /// Owns the mailbox of one device.
@@ -25,6 +26,9 @@ pub struct MailboxWorker<W> {
     /// Wakes `arrivals`, which in turn wakes `outer`.
     waker: Waker,
     outer: Option<Waker>,
+    eoe: EoeSender,
+    /// The last item was a message: a fragment in the other direction precedes the next one.
+    fragment_is_next: bool,
     pub(super) listener: Arc<dyn EmergencySink>,
 }
 
@@ -52,6 +56,8 @@ enum WorkItem {
     Job(Job),
     /// A message waits that belongs to no request.
     Message,
+    /// A fragment of an Ethernet frame is due.
+    Fragment,
     /// All senders are dropped.
     End,
 }
@@ -63,16 +69,19 @@ impl<W: MailboxTransport> MailboxWorker<W> {
             match self.next().await {
                 WorkItem::Job(job) => self.do_job(job).await,
                 WorkItem::Message => {
-                    let listening = self.coe.drain(&self.wire);
-                    // The cycle detects a device that is gone.
-                    let _ = forward_emergencies(
-                        &self.name,
-                        &self.emergencies,
-                        &*self.listener,
-                        listening,
-                    )
-                    .await;
+                    let listening = async {
+                        match self.coe.eoe_port() {
+                            // One at a time: a device that sends frames without end must not keep
+                            // requests waiting.
+                            Some(_) => self.coe.take_message(&self.wire).await,
+                            // The cycle detects a device that is gone.
+                            None => drop(self.coe.drain(&self.wire).await),
+                        }
+                    };
+                    forward_emergencies(&self.name, &self.emergencies, &*self.listener, listening)
+                        .await;
                 }
+                WorkItem::Fragment => self.coe.send_fragment(&self.wire, &mut self.eoe).await,
                 WorkItem::End => return,
             }
         }
@@ -83,11 +92,19 @@ impl<W: MailboxTransport> MailboxWorker<W> {
             if let Some(next) = self.arrived(context) {
                 return Poll::Ready(next);
             }
-            // No waker is registered for messages; every executor here polls again soon.
-            if self.coe.has_message(&self.wire) {
-                return Poll::Ready(WorkItem::Message);
-            }
-            Poll::Pending
+            // No waker is registered for messages and frames; every executor here polls again soon.
+            let (port, now) = (self.coe.eoe_port(), self.wire.now());
+            let message = self.coe.has_message(&self.wire)
+                || port.is_some_and(|port| port.is_assembling(now));
+            let fragment = port.is_some_and(|port| self.eoe.is_due(now, port));
+            let item = match (message, fragment) {
+                (true, false) => WorkItem::Message,
+                (true, true) if !self.fragment_is_next => WorkItem::Message,
+                (_, true) => WorkItem::Fragment,
+                (false, false) => return Poll::Pending,
+            };
+            self.fragment_is_next = matches!(item, WorkItem::Message);
+            Poll::Ready(item)
         })
         .await
     }
@@ -126,6 +143,7 @@ impl<W: MailboxTransport> MailboxWorker<W> {
                 if to.send(self.coe.restarted()).is_ok() {
                     let restarted = self.coe.restarted();
                     self.coe = back.await.unwrap_or(restarted);
+                    self.eoe.restart();
                 }
                 return;
             }
@@ -188,6 +206,8 @@ impl<W> MailboxWorker<W> {
             waker: Waker::from(Arc::clone(&arrivals)),
             arrivals,
             outer: None,
+            eoe: EoeSender::default(),
+            fragment_is_next: false,
             listener,
         }
     }

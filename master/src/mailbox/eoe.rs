@@ -1,0 +1,198 @@
+//! EoE at the mailbox of a device: its IP parameters, and Ethernet frames between the requests of
+//! others.
+
+use std::time::Duration;
+
+use ecaxis_ecat::mailbox::eoe::{
+    Fragments, IpParameters, Message, RESULT_OK, Service, result_text,
+};
+
+use super::error::CoeCause;
+use super::transfer::explain;
+use super::transport::{Deadline, Port, TransportError};
+use super::{CoeClient, MailboxTransport};
+use crate::clock::Nanos;
+use crate::eoe::EoePort;
+
+/// The first and the longest pause before a fragment is offered again to a full mailbox.
+const PAUSE_MIN: Nanos = 500_000;
+const PAUSE_MAX: Nanos = 20_000_000;
+/// A device that takes no fragment for this time in ns loses the frames that wait for it.
+const TAKES_NONE: Nanos = 1_000_000_000;
+
+/// Why a device has not taken its IP parameters.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum EoeError {
+    /// The result of the device.
+    #[error("the device refused them with result {:#06x}: {}", .0, result_text(*.0))]
+    Result(u16),
+    /// The mailbox.
+    #[error("{0}")]
+    Mailbox(CoeCause),
+}
+
+/// The frame that is on its way to a device in fragments.
+#[derive(Debug, Default)]
+pub(super) struct EoeSender {
+    frame: Vec<u8>,
+    /// The number of the frame, counted from the first one.
+    number: u8,
+    /// The fragments that the device has taken.
+    sent: usize,
+    /// The time of the first attempt that the device did not take, and the next attempt.
+    waits: Option<(Nanos, Nanos)>,
+    pause: Nanos,
+}
+
+impl EoeSender {
+    /// Returns true if a fragment is due.
+    pub(super) fn is_due(&self, now: Nanos, port: &EoePort) -> bool {
+        self.waits.is_none_or(|(_, next)| now >= next)
+            && (!self.frame.is_empty() || port.has_frame())
+    }
+
+    /// Forgets the frame: the device has restarted.
+    pub(super) fn restart(&mut self) {
+        *self = Self {
+            number: self.number,
+            ..Self::default()
+        };
+    }
+}
+
+impl CoeClient {
+    /// Sets the IP parameters of the device.
+    ///
+    /// # Errors
+    /// [`EoeError`].
+    pub async fn set_ip_parameters<W: MailboxTransport>(
+        &mut self,
+        w: &W,
+        parameters: &IpParameters,
+    ) -> Result<(), EoeError> {
+        let set_aside = self.port.forgotten;
+        let answered = self.ask_result(w, parameters).await;
+        match answered {
+            Ok(Ok(RESULT_OK)) => Ok(()),
+            Ok(Ok(result)) => Err(EoeError::Result(result)),
+            Ok(Err(code)) => Err(EoeError::Mailbox(CoeCause::Refused(code))),
+            Err(trouble) => {
+                let set_aside = self.port.forgotten.saturating_sub(set_aside);
+                Err(EoeError::Mailbox(explain(&self.port, trouble, set_aside)))
+            }
+        }
+    }
+
+    /// Returns the result, or the code with which the mailbox refused the request.
+    async fn ask_result<W: MailboxTransport>(
+        &mut self,
+        w: &W,
+        parameters: &IpParameters,
+    ) -> Result<Result<u16, u16>, TransportError> {
+        self.drain_after_failure(w).await?;
+        let request = Message::from(Service::SetIp(*parameters));
+        self.port.send(w, &request).await?;
+        let mut deadline = Deadline::after(w, self.port.timeouts.answer);
+        loop {
+            self.port.receive(w, &mut deadline).await?;
+            let answer = Message::parse(self.port.message()).map(|message| message.service);
+            let answer = match answer {
+                Ok(Service::SetIpResponse(result)) => Ok(result),
+                Ok(Service::Refused(code)) => Err(code),
+                _ => {
+                    self.port.set_aside(w);
+                    if deadline.passed(w) {
+                        return Err(TransportError::Timeout(super::Phase::Answer));
+                    }
+                    deadline.pause(w).await;
+                    continue;
+                }
+            };
+            self.port.free = true;
+            self.unsettled = false;
+            return Ok(answer);
+        }
+    }
+
+    /// Connects the mailbox with a port of the switch.
+    pub(crate) fn connect(&mut self, port: EoePort) {
+        self.port.eoe = Some(port);
+    }
+
+    pub(super) fn eoe_port(&self) -> Option<&EoePort> {
+        self.port.eoe.as_ref()
+    }
+
+    /// Offers the next fragment to the device once.
+    pub(super) async fn send_fragment<W: MailboxTransport>(
+        &mut self,
+        w: &W,
+        sender: &mut EoeSender,
+    ) {
+        let Some(port) = self.port.eoe.clone() else {
+            return;
+        };
+        if sender.frame.is_empty() {
+            let Some(frame) = port.next_frame() else {
+                return;
+            };
+            (sender.frame, sender.sent) = (frame, 0);
+            sender.number = sender.number.wrapping_add(1);
+        }
+        let out_len = self.port.layout.out_len;
+        let mut fragments = Fragments::new(&sender.frame, sender.number, out_len);
+        let Some(fragment) = fragments.nth(sender.sent) else {
+            // The mailbox is too small for a fragment.
+            sender.restart();
+            return port.drop_frames(1);
+        };
+        let turn = port.turn().await;
+        let offered = self
+            .port
+            .offer(w, &Service::Fragment(fragment).into())
+            .await;
+        drop(turn);
+        let now = w.now();
+        if offered {
+            (sender.waits, sender.pause) = (None, 0);
+            sender.sent += 1;
+            if fragment.last {
+                sender.frame.clear();
+                port.count_sent();
+            }
+            return;
+        }
+        sender.pause = (sender.pause * 2).clamp(PAUSE_MIN, PAUSE_MAX);
+        let since = sender.waits.map_or(now, |(since, _)| since);
+        sender.waits = Some((since, now.saturating_add(sender.pause)));
+        if now.saturating_sub(since) > TAKES_NONE {
+            sender.restart();
+            // Further frames find the pause that this one has left.
+            (sender.waits, sender.pause) = (Some((now, now + PAUSE_MAX)), PAUSE_MAX);
+            port.drop_frames(1);
+        }
+    }
+
+    /// Reads one message that belongs to no request, if there is one.
+    pub(super) async fn take_message<W: MailboxTransport>(&mut self, w: &W) {
+        let Some(port) = self.port.eoe.clone() else {
+            return;
+        };
+        let turn = port.turn().await;
+        // The cycle detects a device that is gone.
+        let _ = self.port.take_one(w).await;
+        drop(turn);
+        if port.is_assembling(w.now()) && !self.port.waits(w) {
+            w.delay(Duration::from_nanos(PAUSE_MIN)).await;
+        }
+    }
+}
+
+impl Port {
+    /// Writes a message into the device's mailbox once. Returns false if it was full, or if the
+    /// device is gone. A message whose frame was lost counts as taken: Ethernet repeats it.
+    async fn offer<W: MailboxTransport>(&mut self, w: &W, message: &Message<'_>) -> bool {
+        let written = self.write_once(w, message).await;
+        !matches!(written, Ok(0))
+    }
+}
