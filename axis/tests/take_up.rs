@@ -124,6 +124,37 @@ fn speed_and_override_apply_to_the_play() {
     }
 }
 
+/// A held source stands still within the play, and completes it after the hold.
+#[test]
+fn a_hold_of_set_points_from_outside_ends_the_ramp() {
+    for jerk_limited in [false, true] {
+        let mut rig = rig(jerk_limited);
+        rig.move_to(1.0, 1.0);
+        let mut position = 1.0;
+        for part in [1.0, 2.0, 2.0, 1.0] {
+            position -= 0.0005 * part;
+            rig.axis.set_point(position).unwrap();
+            rig.cycle(true);
+        }
+        rig.axis.set_rate(0.0);
+        let mut targets = Vec::new();
+        for _ in 0..300 {
+            rig.axis.set_point(position).unwrap();
+            rig.cycle(true);
+            targets.push(rig.out.target_position);
+        }
+        assert!(targets[100..].iter().all(|target| *target == targets[100]));
+        let short = target(&rig) - (position - BACKLASH);
+        assert!(short > BACKLASH * 0.1, "the play is taken up: {short}");
+        rig.axis.set_rate(1.0);
+        for _ in 0..1000 {
+            rig.axis.set_point(position).unwrap();
+            rig.cycle(true);
+        }
+        assert!((rig.real - position).abs() < 1e-5);
+    }
+}
+
 /// A line that ends within the take-up completes it; one that loses its way does not.
 #[test]
 fn set_points_from_outside_end_on_their_flank() {

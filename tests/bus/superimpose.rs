@@ -73,11 +73,11 @@ fn keeps_limits(seen: &[[i64; 2]], jerk_limit: f64, what: &str) {
     }
 }
 
-/// In parallel with the first steps, `x` is shifted by 0.75 once it is above 1.
-fn with_shift(base: &str) -> String {
+/// In parallel with the first steps, `x` is shifted by 0.75 once it is above a position.
+fn with_shift(base: &str, above: f64) -> String {
     format!(
         "[[step]]\nenable = true\n[[step]]\nparallel = [\n{{ step = [{base}] }},\n\
-         {{ step = [{{ wait = {{ x.position = {{ above = 1.0 }} }}, timeout = \"none\" }}, {{ superimpose = {{ x = 0.75 }} }}] }},\n]\n"
+         {{ step = [{{ wait = {{ x.position = {{ above = {above} }} }}, timeout = \"none\" }}, {{ superimpose = {{ x = 0.75 }} }}] }},\n]\n"
     )
 }
 
@@ -106,8 +106,13 @@ fn moves_are_added_to_every_kind_of_motion() {
             "{ move = { x = 2.5, y = 3.0 }, speed = 0.1, arrive = \"together\" }",
             [2.5, 3.0],
         ),
+        (
+            "square",
+            "{ square = { x = { amplitude = 1.5, frequency = 0.5, periods = 2 } } }",
+            [0.0, 0.0],
+        ),
         ("table", "{ table = { x = \"points.csv\" } }", [2.5, 0.0]),
-        ("path", "{ path = \"p\", }", [2.5, 3.0]),
+        ("path", "{ path = \"p\" }", [2.5, 3.0]),
         (
             "sine",
             "{ sine = { x = { amplitude = 1.5, frequency = 1.0, periods = 3 } } }",
@@ -121,31 +126,51 @@ fn moves_are_added_to_every_kind_of_motion() {
                 "{path}[[step]]\nenable = true\n[[step]]\nparallel = [{{ step = [{base}] }}, {{ step = [{{ dwell = \"1ms\" }}] }}]\n"
             ),
         );
-        let seen = run(&bench, &format!("{path}{}", with_shift(base)));
-        let shifted = [ends[0] + 0.75, ends[1]];
-        for (seen, end) in [(&alone, ends), (&seen, shifted)] {
-            let last = *seen.last().expect("cycles");
-            assert_eq!(
-                last.map(|counts| counts as f64 / COUNTS),
-                end,
-                "{what} ends"
-            );
+        // While it accelerates, and at constant velocity.
+        for above in [0.02, 1.0] {
+            let seen = run(&bench, &format!("{path}{}", with_shift(base, above)));
+            check(&alone, &seen, what, ends);
         }
-        let others = |seen: &[[i64; 2]]| {
-            let way = seen.iter().map(|[_, y]| *y).collect::<Vec<_>>();
-            let mut way = way;
-            way.dedup();
-            way
-        };
-        assert_eq!(others(&alone), others(&seen), "{what}: y");
-        // The jerk of both motions adds up; tables have their own.
-        let jerk = if what == "table" {
-            f64::INFINITY
-        } else {
-            2.0 * JERK
-        };
-        keeps_limits(&seen, jerk, what);
     }
+}
+
+/// Compares a run without and one with a shift.
+fn check(alone: &[[i64; 2]], seen: &[[i64; 2]], what: &str, ends: [f64; 2]) {
+    let shifted = [ends[0] + 0.75, ends[1]];
+    for (seen, end) in [(alone, ends), (seen, shifted)] {
+        let last = *seen.last().expect("cycles");
+        assert_eq!(
+            last.map(|counts| counts as f64 / COUNTS),
+            end,
+            "{what} ends"
+        );
+    }
+    // From its first motion to its last, in cycles.
+    let begins = |seen: &[[i64; 2]]| seen.iter().position(|[x, _]| *x != seen[0][0]);
+    let from = [alone, seen].map(|seen| begins(seen).expect("a motion"));
+    // Both have the same way below; the shift adds from 0 to 0.75.
+    for (cycle, ([before, _], [after, _])) in
+        (alone[from[0]..].iter()).zip(&seen[from[1]..]).enumerate()
+    {
+        let added = (after - before) as f64 / COUNTS;
+        assert!(
+            (-2.0 / COUNTS..=0.75 + 2.0 / COUNTS).contains(&added),
+            "{what} {cycle}: {added}"
+        );
+    }
+    let others = |seen: &[[i64; 2]]| {
+        let mut way: Vec<_> = seen.iter().map(|[_, y]| *y).collect();
+        way.dedup();
+        way
+    };
+    assert_eq!(others(alone), others(seen), "{what}: y");
+    // The jerk of both motions adds up. Tables have their own, and a square wave leaves no share
+    // of the limits for the shift.
+    let jerk = match what {
+        "table" | "square" => f64::INFINITY,
+        _ => 2.0 * JERK,
+    };
+    keeps_limits(seen, jerk, what);
 }
 
 /// A velocity goes on with its own ramp and its override; the position is ahead by exactly the

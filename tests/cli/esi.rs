@@ -204,8 +204,7 @@ fn esi_reads_vendor_files() {
 
     let drives = one("beckhoff/Beckhoff AX5xxx.xml");
     let (code, out, _) = ran(&["check", &drives]);
-    assert_eq!(code, 2);
-    assert!(out.contains("SoE"));
+    assert_eq!(code, 0, "{out}");
     let listed = json(&["list", folder.to_str().expect("UTF-8"), "--json"], 0);
     assert!(listed.as_array().expect("a list").len() > 300);
     let name = |entry: &Value| Path::new(entry["file"].as_str().unwrap_or("")).is_relative();

@@ -172,6 +172,12 @@ impl Axis {
         };
         let late_s = self.config.dead_time_s + filter_s;
         let strength = self.note_strength(before, late_s, dt_s);
+        if wanted == 0.0 {
+            // A braking torque ends with the slope as well.
+            let next = Ramp { target: 0.0, slope }.advance(before, dt_s);
+            (self.loop_state.holding, self.loop_state.reduction) = (0.0, torque - next);
+            return;
+        }
         // A quarter of the delay's bandwidth; the integral part is eight times slower.
         let bandwidth = 0.25 / (late_s + 2.0 * dt_s);
         let per_acceleration = limits.torque / limits.acceleration;

@@ -140,7 +140,9 @@ impl Axis {
     }
 
     fn may_take_up(&self) -> bool {
-        let held = self.rate == 0.0 && !matches!(self.plan, Plan::External);
+        // A follower in a hold still follows a master of another group.
+        let follows = matches!(self.plan, Plan::External) && self.motion.velocity != 0.0;
+        let held = self.rate == 0.0 && !follows;
         let stops = match &self.plan {
             Plan::Hold(_) => !self.correction.completes,
             Plan::Jerk(source) => source.request().goal == Goal::Velocity(0.0),

@@ -82,8 +82,8 @@ const TABLE_SLEW: f64 = 5.0;
 /// The smallest change of the slope per cycle, as a share of [`TABLE_SLEW`].
 const FINEST: f64 = 1.0 / 65_536.0;
 
-/// Most cycles from a slope to a constant rate.
-const LONGEST: f64 = 256.0;
+/// Most cycles from a slope to a constant rate. Each of them is checked in each cycle.
+const LONGEST: f64 = 96.0;
 
 /// The rate of tables that play in common time.
 ///
@@ -115,7 +115,17 @@ impl TableRate {
 
     /// Sets a constant rate while no table plays.
     pub const fn set(&mut self, value: f64) {
-        (self.value, self.slope) = (value, 0.0);
+        *self = Self {
+            value,
+            ..Self::WHOLE
+        };
+    }
+
+    /// True while the rate changes. A table that begins meanwhile must wait at its start, because
+    /// the way back to a constant rate was found without it.
+    #[must_use]
+    pub const fn changes(&self) -> bool {
+        self.slope != 0.0
     }
 
     /// Advances one cycle towards `wanted`, from 0 to 1. `keeps`: true if every table keeps its
@@ -205,12 +215,6 @@ impl RateCourse {
             dt_s,
             cycles,
         }
-    }
-
-    /// Returns the number of cycles left.
-    #[must_use]
-    pub const fn cycles(&self) -> u32 {
-        self.cycles
     }
 
     /// Returns the constant rate at the end.

@@ -65,9 +65,6 @@ pub enum TableProblem {
 /// Maximum number of rows; their pieces need 60 MB.
 const MOST_ROWS: usize = 1_000_000;
 
-/// Most steps of a course that are checked; a longer course is checked in steps of several cycles.
-const MOST_CHECKED: u32 = 64;
-
 /// Maximum length of fields quoted in errors.
 const QUOTED: usize = 40;
 
@@ -465,6 +462,12 @@ impl Playback {
         self.state != State::Playing && motion.velocity == 0.0
     }
 
+    /// True if the first cycle has been played.
+    #[must_use]
+    pub const fn has_begun(&self) -> bool {
+        self.index > 0 || self.elapsed > 0.0
+    }
+
     /// Returns the last set-point.
     #[must_use]
     pub const fn motion(&self) -> Motion {
@@ -472,7 +475,8 @@ impl Playback {
     }
 
     /// Returns true if the rates of a course keep the limits of velocity, acceleration and jerk.
-    /// The jerk may be as high as the table's own. RT: O([`MOST_CHECKED`] + rows on the course).
+    /// The jerk may be as high as the table's own. RT: O(cycles
+    /// and rows on the course).
     #[must_use]
     pub fn keeps(
         mut self,
@@ -481,45 +485,21 @@ impl Playback {
         course: RateCourse,
         dt_s: f64,
     ) -> bool {
-        let highest_jerk = limits.jerk.max(table.jerk);
-        let stride = course.cycles().div_ceil(MOST_CHECKED);
-        // Before the first step: its length, its distance from the one before, the motion.
-        let (mut step_s, mut distance_s, mut before) = (dt_s, dt_s, self.last);
-        let (mut cycles, mut passed_s) = (0, 0.0);
-        for (index, rate) in course.enumerate() {
-            cycles += 1;
-            passed_s += rate * dt_s;
-            // The first cycles become real, so they are checked one by one.
-            if index >= 2 && cycles < stride {
-                continue;
-            }
-            let step = f64::from(cycles) * dt_s;
-            let position = self.pass(table, passed_s) + self.offset;
-            let velocity = (position - before.position) / step;
-            let distance = (step + step_s) * 0.5;
-            let acceleration = (velocity - before.velocity) / distance;
-            let apart = (distance + distance_s) * 0.5;
-            let jerk = (acceleration - before.acceleration) / apart;
+        let highest_jerk = limits.jerk.max(table.jerk) + table.acceleration_step / dt_s;
+        let mut before = self.last;
+        for rate in course {
+            let position = self.pass(table, rate * dt_s) + self.offset;
+            let next = before.then(position, (position - before.position) / dt_s, dt_s);
+            let jerk = (next.acceleration - before.acceleration) / dt_s;
             // The rounding of positions.
-            let noise = 4.0 * f64::EPSILON * position.abs().max(before.position.abs());
-            let [noise, noise2, noise3] = [
-                noise,
-                noise * 2.0 / distance,
-                noise * 4.0 / (distance * apart),
-            ];
-            if velocity.abs() > limits.velocity + noise / step
-                || acceleration.abs() > limits.acceleration + noise2 / step
-                || jerk.abs() > highest_jerk + noise3 / step + table.acceleration_step / apart
+            let noise = 4.0 * f64::EPSILON * position.abs().max(before.position.abs()) / dt_s;
+            if next.velocity.abs() > limits.velocity + noise
+                || next.acceleration.abs() > limits.acceleration + noise * 2.0 / dt_s
+                || jerk.abs() > highest_jerk + noise * 4.0 / (dt_s * dt_s)
             {
                 return false;
             }
-            before = Motion {
-                position,
-                velocity,
-                acceleration,
-            };
-            (step_s, distance_s) = (step, distance);
-            (cycles, passed_s) = (0, 0.0);
+            before = next;
         }
         true
     }

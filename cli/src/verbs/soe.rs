@@ -31,6 +31,26 @@ Examples:
 Values follow the attribute that the drive reports: decimal places, lists,
 texts, IDNs, hexadecimal (0x10) and binary (0b1011) numbers.";
 
+const READ_EXAMPLES: &str = "\
+Examples:
+  ecaxis soe read machine.toml x S-0-0051 S-0-0091
+  ecaxis soe read --nic enp3s0 --position 0 S-0-0011 --json";
+
+const WRITE_EXAMPLES: &str = "\
+Examples:
+  ecaxis soe write machine.toml x S-0-0091 1500.5
+  ecaxis soe write machine.toml x P-0-0100 \"1, 2, 3\"     a list";
+
+const LIST_EXAMPLES: &str = "\
+Examples:
+  ecaxis soe list machine.toml x
+  ecaxis soe list --nic enp3s0 --position 0 --drive 1";
+
+const COMMAND_EXAMPLES: &str = "\
+Examples:
+  ecaxis soe command machine.toml x S-0-0099             clear the errors
+  ecaxis soe command machine.toml x S-0-0264 --timeout 30s";
+
 /// Read and write the IDNs of a Sercos drive (SoE), execute procedure commands
 ///
 /// Select the device by machine file and name, or by --nic with --position, --alias or --id. Its
@@ -47,20 +67,21 @@ pub(crate) struct Args {
 #[derive(Debug, Subcommand)]
 enum Command {
     /// Read IDNs with name, unit, limits and attribute
-    #[command(override_usage = "ecaxis soe read FILE DEVICE IDN...\n       \
+    #[command(after_help = READ_EXAMPLES, override_usage = "ecaxis soe read FILE DEVICE IDN...\n       \
         ecaxis soe read --nic IF --position N IDN...")]
     Read(Common),
     /// Write the value of an IDN; it is read back
-    #[command(override_usage = "ecaxis soe write FILE DEVICE IDN VALUE\n       \
+    #[command(after_help = WRITE_EXAMPLES, override_usage = "ecaxis soe write FILE DEVICE IDN VALUE\n       \
         ecaxis soe write --nic IF --position N IDN VALUE")]
     Write(Common),
     /// List the IDNs of a drive (S-0-0017) with names and values
-    #[command(override_usage = "ecaxis soe list FILE DEVICE\n       \
+    #[command(after_help = LIST_EXAMPLES, override_usage = "ecaxis soe list FILE DEVICE\n       \
         ecaxis soe list --nic IF --position N")]
     List(Common),
     /// Execute a procedure command and wait for its end
     #[command(
         name = "command",
+        after_help = COMMAND_EXAMPLES,
         override_usage = "ecaxis soe command FILE DEVICE IDN\n       \
         ecaxis soe command --nic IF --position N IDN"
     )]
@@ -70,7 +91,7 @@ enum Command {
 #[derive(Debug, clap::Args)]
 struct Common {
     /// Machine file, device, and IDNs or IDN and value
-    #[arg(required = true, value_name = "WORD", allow_negative_numbers = true)]
+    #[arg(value_name = "WORD", allow_negative_numbers = true)]
     words: Vec<String>,
     /// Drive of the device, from 0
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u8).range(0..=7))]

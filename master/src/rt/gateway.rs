@@ -295,6 +295,10 @@ impl Gateway {
             {
                 self.issue(END, status);
             }
+            // The gateway has acknowledged a command of an earlier run, and has ignored this one.
+            (Some([byte, _]), Stage::Starting) if (byte ^ status) & TOGGLE == 0 => {
+                self.issue(START, status);
+            }
             (Some(_), _) => {}
         }
         // Faster than the question, but it names the lowest node only.

@@ -262,10 +262,13 @@ impl SetpointGenerator {
         }
     }
 
-    /// True while the axis plays a table.
+    /// True while the axis plays a table. `begun`: only if its first cycle has been played.
     #[must_use]
-    pub fn plays(&self) -> bool {
-        matches!(self.source, Some(Source::Table { .. }))
+    pub fn plays(&self, begun: bool) -> bool {
+        match self.source {
+            Some(Source::Table { playback, .. }) => !begun || playback.has_begun(),
+            _ => false,
+        }
     }
 
     /// Returns true if the table keeps the limits of the axis on a course of rates. RT: as
@@ -373,7 +376,11 @@ impl SetpointGenerator {
                     limits: limits.motion(),
                     range: limits.position,
                 };
-                let below = commanded(&axis.status());
+                // A source that runs continues from its own motion, without the rounding of the axis.
+                let below = match self.source {
+                    Some(_) => self.resume_motion(axis, dt_s),
+                    None => commanded(&axis.status()),
+                };
                 let gear = Gear::new(config, below, below)?;
                 Superimposed { gear, below }
             }

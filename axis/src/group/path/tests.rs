@@ -116,7 +116,7 @@ proptest! {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(60))]
+    #![proptest_config(ProptestConfig::with_cases(100))]
     /// A rate that changes at any time keeps the limits of all axes, their common time and the end.
     #[test]
     fn rates_keep_the_limits_of_paths(
@@ -150,7 +150,7 @@ proptest! {
                     let next = play.advance(table, before, dt, value);
                     let jerk = (next.acceleration - before.acceleration) / dt;
                     prop_assert!(next.velocity.abs() <= limits.velocity * 1.000_001);
-                    prop_assert!(next.acceleration.abs() <= limits.acceleration * 1.000_001);
+                    prop_assert!(next.acceleration.abs() <= limits.acceleration * 1.000_001, "{} of {}", next.acceleration, limits.acceleration);
                     prop_assert!(jerk.abs() <= limits.jerk * 1.01, "{} of {}", jerk, limits.jerk);
                     ended &= play.finished(next);
                 }

@@ -148,6 +148,12 @@ pub(super) fn velocity_unit(
     if let Some(unit) = raw.velocity_unit.value() {
         return Some((unit, UnitSource::File));
     }
+    if selection.is_some_and(|selection| selection.layout.idns) {
+        let message = "`velocity_unit` is missing: a Sercos drive has it in S-0-0044 to S-0-0046";
+        let hint = "write `velocity_unit = \"rpm\"`, \"mrpm\", \"counts/s\" or \"turns/s\"";
+        p.add_hint(raw.span.clone(), message, hint);
+        return None;
+    }
     let Some((code, from)) = startup_value(SI_UNIT_VELOCITY, sdos, selection) else {
         return Some((VelocityUnit::default(), UnitSource::Nothing));
     };

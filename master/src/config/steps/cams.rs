@@ -107,7 +107,11 @@ impl ProgramChecker<'_> {
                     let target = targets.iter().find(|(of, _)| *of == axis);
                     target.map(|(_, n)| self.largest(step, NumberPlace::Target(axis), *n))
                 }
-                Action::Wave { .. } | Action::Table { .. } | Action::Gear { .. } => None,
+                Action::Wave { .. }
+                | Action::Table { .. }
+                | Action::Gear { .. }
+                | Action::Superimpose { .. }
+                | Action::Torque { .. } => None,
                 // The axis stands before or after them, or decelerates.
                 _ => Some(0.0),
             };

@@ -89,14 +89,18 @@ impl Engine {
     }
 
     fn shift(&mut self, axis: AxisIndex, distance: f64, superimpose: bool) {
+        if self.stopping().is_some() {
+            return;
+        }
+        let allowed = self.check_generator(axis);
         let Some(slot) = self.axes.get_mut(axis) else {
             return;
         };
         let dt_s = slot.dt_s(self.config.cycle_ns);
-        let done = match superimpose {
+        let done = allowed.and_then(|()| match superimpose {
             true => slot.generator.superimpose(&slot.axis, distance, dt_s),
             false => slot.generator.shift(distance, dt_s),
-        };
+        });
         if let Err(reason) = done {
             let cycle = self.stats.counters.cycles;
             self.report(Event::Refused {
@@ -300,6 +304,16 @@ impl Engine {
         }
     }
 
+    /// Fails if the group of an axis has stopped, or its gantry permits no motion.
+    fn check_generator(&self, axis: AxisIndex) -> Result<(), CommandError> {
+        let group = self.axes.get(axis).map(|slot| slot.group);
+        let group = group.and_then(|group| self.groups.get(group));
+        if group.is_some_and(|group| group.stop().is_some()) {
+            return Err(CommandError::GroupStopped);
+        }
+        gantry::check_motion(&self.gantries, axis)
+    }
+
     fn start_generator(&mut self, axis: AxisIndex, start: GeneratorRequest) {
         if self.stopping().is_some() {
             return;
@@ -319,13 +333,9 @@ impl Engine {
         };
         let ring =
             matches!(start, GeneratorRequest::Gear { master, .. } if self.follows(master, axis));
+        let allowed = self.check_generator(axis);
         if let Some(slot) = self.axes.get_mut(axis) {
-            let stopped = |group: &ReactionGroup| group.stop().is_some();
-            if self.groups.get(slot.group).is_some_and(stopped) {
-                slot.generator.refuse(CommandError::GroupStopped);
-                return;
-            }
-            if let Err(reason) = gantry::check_motion(&self.gantries, axis) {
+            if let Err(reason) = allowed {
                 slot.generator.refuse(reason);
                 return;
             }

@@ -44,21 +44,23 @@ impl Engine {
         let Some(rate) = self.overrides.tables.get_mut(group) else {
             return;
         };
-        let plays = |slot: &&RtAxis| slot.group == group && slot.generator.plays();
-        if !self.axes.iter().any(|slot| plays(&slot)) {
+        // New tables wait at their start while the rate changes.
+        let begun = rate.changes();
+        let plays = |slot: &RtAxis| slot.group == group && slot.generator.plays(begun);
+        if !self.axes.iter().any(plays) {
             rate.set(wanted);
             return;
         }
         let cycle_s = self.config.cycle_ns as f64 * 1e-9;
         let value = rate.advance(wanted, cycle_s, |course| {
-            let mut players = self.axes.iter().filter(plays);
+            let mut players = self.axes.iter().filter(|slot| plays(slot));
             players.all(|slot| {
                 slot.generator
                     .keeps(&slot.axis, &self.tables, course, cycle_s)
             })
         });
         for slot in &mut self.axes {
-            if slot.group == group {
+            if plays(slot) {
                 slot.generator.play(&self.tables, value, cycle_s);
             }
         }
