@@ -369,5 +369,5 @@ fn every_vendor_device_reaches_op_or_is_refused_with_its_reason() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
     let expected: Vec<usize> = REFUSED.iter().map(|row| row.3).collect();
     assert_eq!(refused, expected);
-    assert_eq!((moved, done), (832, 636));
+    assert_eq!((moved, done), (2212, 636));
 }
