@@ -249,6 +249,12 @@ fn ethernet(ports: &[EthernetCounters], out: &mut Document) {
     }
     out.gap();
     out.table(table);
+    for port in ports.iter().filter(|port| port.unsupported) {
+        out.line(format!(
+            "`{}` has refused EoE with mailbox error 0x0002: omit `eoe`, or use the ESI file of its firmware",
+            port.name
+        ));
+    }
 }
 
 fn emergencies(emergencies: &[EmergencyLine], more: u64, out: &mut Document) {

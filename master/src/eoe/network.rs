@@ -5,8 +5,8 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use ecaxis_ecat::mailbox::TYPE_EOE;
 use ecaxis_ecat::mailbox::eoe::{Message, Reassembler, Service};
+use ecaxis_ecat::mailbox::{ERROR_UNSUPPORTED_PROTOCOL, TYPE_EOE};
 use serde::Serialize;
 
 use super::switch::{Destination, PortNumber, Switch};
@@ -30,6 +30,10 @@ pub struct EthernetCounters {
     pub overflows: u64,
     /// Frames dropped because the device or interface did not take them.
     pub not_taken: u64,
+    /// Mailbox errors of the device for fragments.
+    pub refused: u64,
+    /// A mailbox error said that the device has no EoE. It gets no frames until it restarts.
+    pub unsupported: bool,
     /// Frames from the port with a wrong length or sender.
     pub invalid: u64,
     /// Frames from the port that were dropped because fragments were missing or contradictory.
@@ -57,7 +61,17 @@ impl Port {
         self.queues.iter().map(VecDeque::len).sum()
     }
 
+    /// Drops the frames that wait, and counts them.
+    fn clear(&mut self) {
+        self.counters.not_taken += self.waiting() as u64;
+        self.queues.iter_mut().for_each(VecDeque::clear);
+    }
+
     fn enqueue(&mut self, flooded: bool, frame: &[u8]) {
+        if self.counters.unsupported {
+            self.counters.not_taken += 1;
+            return;
+        }
         let [own, floods] = &mut self.queues;
         let queue = if flooded { floods } else { own };
         if queue.len() >= FRAMES_PER_PORT {
@@ -226,10 +240,30 @@ impl EoePort {
     /// in part. Its addresses are forgotten.
     pub fn drop_frames(&self, begun: u64) {
         self.network.with_port(self.number, |port| {
-            port.counters.not_taken += port.waiting() as u64 + begun;
-            port.queues.iter_mut().for_each(VecDeque::clear);
+            port.counters.not_taken += begun;
+            port.clear();
         });
         self.network.lock().switch.forget(self.number);
+    }
+
+    /// Counts a mailbox error of the device for a fragment. A device without EoE loses the frames
+    /// that wait, and gets no more.
+    pub fn refuse(&self, code: u16) {
+        let lacks_eoe = code == ERROR_UNSUPPORTED_PROTOCOL;
+        self.network.with_port(self.number, |port| {
+            port.counters.refused += 1;
+            port.counters.unsupported |= lacks_eoe;
+        });
+        if lacks_eoe {
+            self.drop_frames(0);
+        }
+    }
+
+    /// Returns true if the device has refused EoE as such.
+    #[must_use]
+    pub fn is_unsupported(&self) -> bool {
+        self.network
+            .with_port(self.number, |port| port.counters.unsupported)
     }
 
     /// Drops the frame in progress and the addresses of a device that has restarted.
@@ -237,6 +271,7 @@ impl EoePort {
         self.network.with_port(self.number, |port| {
             port.reassembler.reset();
             port.assembling = None;
+            port.counters.unsupported = false;
         });
         self.network.lock().switch.forget(self.number);
     }

@@ -108,7 +108,7 @@ impl CoeClient {
                     continue;
                 }
             };
-            self.port.free = true;
+            self.port.answered();
             self.unsettled = false;
             return Ok(answer);
         }
@@ -132,6 +132,9 @@ impl CoeClient {
         let Some(port) = self.port.eoe.clone() else {
             return;
         };
+        if port.is_unsupported() {
+            return sender.restart();
+        }
         if sender.frame.is_empty() {
             let Some(frame) = port.next_frame() else {
                 return;
@@ -187,6 +190,9 @@ impl CoeClient {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;
 
 impl Port {
     /// Writes a message into the device's mailbox once. Returns false if it was full, or if the

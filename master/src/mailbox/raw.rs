@@ -278,7 +278,7 @@ impl CoeClient {
             let received = self.receive_raw(w, request, &mut messages).await;
             let set_aside = self.port.forgotten.saturating_sub(set_aside);
             received.map_err(|trouble| self.raw_error(trouble, set_aside))?;
-            self.port.free = true;
+            self.port.answered();
         }
         self.unsettled = false;
         *open = open.after(request, &messages, &self.port.layout);

@@ -511,12 +511,12 @@ impl CoeClient {
                 Ok(Message::Sdo(Answer::Abort { index, code, .. }))
                     if in_segments || index == transfer.index =>
                 {
-                    self.port.free = true;
+                    self.port.answered();
                     return Err(transfer.failure(CoeCause::Abort(code)));
                 }
                 Ok(Message::Sdo(answer)) if transfer.fits(&answer) => {
                     if let Some(value) = expected(&answer) {
-                        self.port.free = true;
+                        self.port.answered();
                         return Ok(value);
                     }
                 }

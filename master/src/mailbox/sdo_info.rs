@@ -335,7 +335,7 @@ impl CoeClient {
             }
             answer = Deadline::after(w, self.port.timeouts.answer);
         }
-        self.port.free = true;
+        self.port.answered();
         self.unsettled = false;
         Ok(data)
     }
@@ -351,7 +351,7 @@ impl CoeClient {
     }
 
     fn aborted(&mut self, asked: InfoRequest, code: u32) -> InfoError {
-        self.port.free = true;
+        self.port.answered();
         self.unsettled = false;
         self.failure(asked, CoeCause::Abort(code))
     }

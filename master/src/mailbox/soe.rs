@@ -308,7 +308,7 @@ impl CoeClient {
                         _ => {
                             data.extend_from_slice(answer.data);
                             let (incomplete, follow) = (answer.incomplete, answer.left());
-                            self.port.free = true;
+                            self.port.answered();
                             if !incomplete {
                                 return Ok(data);
                             }

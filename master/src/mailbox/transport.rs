@@ -5,7 +5,7 @@ use std::mem;
 use std::time::Duration;
 
 use ecaxis_ecat::mailbox::coe::Message;
-use ecaxis_ecat::mailbox::{Encode, MIN_LENGTH, soe};
+use ecaxis_ecat::mailbox::{Encode, MIN_LENGTH, eoe, soe};
 
 use super::emergency::{Emergencies, Emergency};
 use super::error::Phase;
@@ -90,9 +90,11 @@ pub(super) struct Port {
     /// The time when the mailbox was last read; a status from before this time is obsolete.
     read_at: u64,
     /// The SubDevice has fetched the last request, so the next message fills an empty mailbox.
-    pub(super) free: bool,
+    free: bool,
     /// 1 to 7; the SubDevice distinguishes a new message from a repetition by it.
     counter: u8,
+    /// A fragment of EoE was written since the last answer: a mailbox error may mean it.
+    fragment_sent: bool,
     /// The port of the switch that takes EoE messages.
     pub(super) eoe: Option<EoePort>,
 }
@@ -112,6 +114,7 @@ impl Port {
             read_at: 0,
             free: false,
             counter: 0,
+            fragment_sent: false,
             eoe: None,
         }
     }
@@ -142,6 +145,11 @@ impl Port {
     /// Returns the message that [`Port::receive`] has read.
     pub(super) fn message(&self) -> &[u8] {
         &self.incoming
+    }
+
+    /// Notes that the answer to the last request has arrived.
+    pub(super) fn answered(&mut self) {
+        (self.free, self.fragment_sent) = (true, false);
     }
 
     /// Puts a request into the SubDevice's mailbox. Messages that arrive meanwhile are read and set
@@ -186,7 +194,7 @@ impl Port {
         }
     }
 
-    /// Waits for the next message of any kind.
+    /// Waits for the next message that may belong to a request.
     pub(super) async fn receive<W: MailboxTransport>(
         &mut self,
         w: &W,
@@ -196,6 +204,7 @@ impl Port {
         let mut repeats = 0;
         loop {
             match self.look(w, &mut budget).await? {
+                ReadOutcome::Message if self.take_refusal() => {}
                 ReadOutcome::Message => return Ok(()),
                 ReadOutcome::Lost if repeats < REPEATS => {
                     repeats += 1;
@@ -386,7 +395,7 @@ impl Port {
         Ok(())
     }
 
-    /// Writes a message once, with a counter of its own. Returns the working counter, 0 if the
+    /// Writes a fragment of EoE once, with a counter of its own. Returns the working counter, 0 if the
     /// mailbox is full.
     pub(super) async fn write_once<W: MailboxTransport>(
         &mut self,
@@ -401,13 +410,34 @@ impl Port {
         if written != Ok(0) {
             // The next request may find the mailbox full.
             (self.counter, self.free) = (counter, false);
+            self.fragment_sent = true;
         }
         written
+    }
+
+    /// Counts a mailbox error that may mean a fragment. Returns false for other messages.
+    fn take_refusal(&self) -> bool {
+        let Some(eoe) = self.eoe.as_ref().filter(|_| self.fragment_sent) else {
+            return false;
+        };
+        match eoe::Message::parse(&self.incoming) {
+            Ok(eoe::Message {
+                service: eoe::Service::Refused(code),
+                ..
+            }) => {
+                eoe.refuse(code);
+                true
+            }
+            _ => false,
+        }
     }
 
     /// Queues an emergency or a notification, passes EoE on to the switch and drops any other
     /// message.
     pub(super) fn set_aside<W: MailboxTransport>(&mut self, w: &W) {
+        if self.take_refusal() {
+            return;
+        }
         let eoe = self.eoe.as_ref();
         if eoe.is_some_and(|eoe| eoe.receive(w.now(), &self.incoming)) {
             return;

@@ -378,7 +378,7 @@ impl FoeClient {
                 Ok(Message::Busy { done, entire }) => Some(Answer::Busy { done, entire }),
                 Ok(Message::Error { code, text }) => {
                     let text = words(text);
-                    self.port.free = true;
+                    self.port.answered();
                     return Err(transfer.refused(code, text).into());
                 }
                 Ok(Message::Refused(code)) => return Err(transfer.mailbox(code)),
@@ -397,7 +397,7 @@ impl FoeClient {
                 Err(flaw) => return Err(transfer.malformed(flaw)),
             };
             if let Some(answer) = answer {
-                self.port.free = true;
+                self.port.answered();
                 return Ok(answer);
             }
             self.port.set_aside(w);

@@ -1,0 +1,217 @@
+//! Fragments next to the requests of others, at a device in memory.
+
+use std::cell::{Cell, RefCell};
+use std::collections::VecDeque;
+use std::pin::pin;
+use std::task::{Context, Poll, Waker};
+
+use super::*;
+use crate::eoe::{EoeNetwork, HostPort};
+use crate::mailbox::{DatagramError, MailboxLayout};
+
+const LENGTH: u16 = 128;
+const LAYOUT: MailboxLayout = MailboxLayout {
+    station: 0x1001,
+    out_address: 0x1000,
+    out_len: LENGTH,
+    in_address: 0x1400,
+    in_len: LENGTH,
+    out_sm: 0,
+    in_sm: 1,
+};
+const MS: u64 = 1_000_000;
+const ANSWER: [u8; 4] = [1, 2, 3, 4];
+
+/// A device with the object 0x1000 and one message at a time in each mailbox.
+#[derive(Default)]
+struct Device {
+    now: Cell<u64>,
+    /// The mailbox error for fragments, and messages that precede each answer.
+    error: Cell<u16>,
+    before_answer: RefCell<Vec<Vec<u8>>>,
+    /// The time that the device takes for a fragment.
+    slow: Cell<u64>,
+    /// The wire repeats the next write; the reply to the first one is lost.
+    repeats_write: Cell<bool>,
+    /// No reply to a write arrives.
+    loses_writes: Cell<bool>,
+    /// The out mailbox is full, and the device does not read it.
+    stuck: Cell<bool>,
+    out: RefCell<Option<(u64, Vec<u8>)>>,
+    counter: Cell<u8>,
+    fragments: Cell<u32>,
+    incoming: RefCell<VecDeque<Vec<u8>>>,
+}
+
+fn mailbox(protocol: u8, body: &[u8]) -> Vec<u8> {
+    let mut message = vec![u8::try_from(body.len()).unwrap(), 0, 0, 0, 0, protocol];
+    message.extend(body);
+    message.resize(LENGTH.into(), 0);
+    message
+}
+
+impl Device {
+    fn work(&self) {
+        let now = self.now.get();
+        let message = self.out.borrow_mut().take_if(|(due, _)| now >= *due);
+        let Some((_, message)) = message else { return };
+        let counter = message[5] >> 4;
+        if self.counter.replace(counter) == counter {
+            return;
+        }
+        let mut incoming = self.incoming.borrow_mut();
+        match message[5] & 0x0f {
+            2 => {
+                self.fragments.set(self.fragments.get() + 1);
+                let [low, high] = self.error.get().to_le_bytes();
+                if (low, high) != (0, 0) {
+                    incoming.push_back(mailbox(0, &[1, 0, low, high]));
+                }
+            }
+            3 => {
+                incoming.extend(self.before_answer.borrow_mut().drain(..));
+                let mut body = vec![0, 0x30, 0x43, 0x00, 0x10, 0];
+                body.extend(ANSWER);
+                incoming.push_back(mailbox(3, &body));
+            }
+            other => panic!("protocol {other}"),
+        }
+    }
+}
+
+impl MailboxTransport for Device {
+    async fn read(&self, _: u16, register: u16, bytes: &mut [u8]) -> Result<u16, DatagramError> {
+        self.delay(Duration::from_micros(100)).await;
+        let full = |full| 8 * u8::from(full);
+        match register {
+            0x1400 => match self.incoming.borrow_mut().pop_front() {
+                Some(message) => bytes.copy_from_slice(&message),
+                None => return Ok(0),
+            },
+            0x0805 => bytes[0] = full(self.stuck.get() || self.out.borrow().is_some()),
+            0x080d => bytes[0] = full(!self.incoming.borrow().is_empty()),
+            other => panic!("register {other:#06x}"),
+        }
+        Ok(1)
+    }
+
+    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, DatagramError> {
+        self.delay(Duration::from_micros(100)).await;
+        assert_eq!(register, 0x1000);
+        if self.loses_writes.get() {
+            return Err(DatagramError::Timeout { station, register });
+        }
+        if self.stuck.get() || self.out.borrow().is_some() {
+            return Ok(0);
+        }
+        let slow = match data[5] & 0x0f {
+            2 => self.slow.get(),
+            _ => MS,
+        };
+        *self.out.borrow_mut() = Some((self.now.get() + slow, data.to_vec()));
+        Ok(u16::from(!self.repeats_write.take()))
+    }
+
+    async fn delay(&self, duration: Duration) {
+        let nanos = u64::try_from(duration.as_nanos()).unwrap();
+        self.now.set(self.now.get() + nanos);
+        self.work();
+    }
+
+    fn now(&self) -> u64 {
+        self.now.get()
+    }
+}
+
+/// Nothing at the device waits.
+fn ready<T>(future: impl Future<Output = T>) -> T {
+    let mut context = Context::from_waker(Waker::noop());
+    match pin!(future).poll(&mut context) {
+        Poll::Ready(done) => done,
+        Poll::Pending => panic!("it waits"),
+    }
+}
+
+struct Bench {
+    device: Device,
+    coe: CoeClient,
+    sender: EoeSender,
+    network: EoeNetwork,
+    host: HostPort,
+}
+
+impl Bench {
+    fn new() -> Self {
+        let network = EoeNetwork::default();
+        let mut coe = CoeClient::new(LAYOUT);
+        coe.connect(network.add_device("a0"));
+        let mut bench = Self {
+            device: Device::default(),
+            coe,
+            sender: EoeSender::default(),
+            host: network.add_host("ecat0"),
+            network,
+        };
+        bench.device.slow.set(MS);
+        assert_eq!(bench.upload(), Ok(ANSWER.to_vec()));
+        bench
+    }
+
+    fn frame(&self) {
+        let mut frame = [0xff; 60];
+        frame[6..12].copy_from_slice(&[2, 0, 0, 0, 0, 1]);
+        self.host.receive(self.device.now(), &frame);
+    }
+
+    fn send(&mut self) {
+        ready(self.coe.send_fragment(&self.device, &mut self.sender));
+    }
+
+    fn upload(&mut self) -> Result<Vec<u8>, String> {
+        let done = ready(self.coe.upload(&self.device, 0x1000, 0, false));
+        done.map_err(|error| error.to_string())
+    }
+
+    fn counters(&self) -> crate::eoe::EthernetCounters {
+        self.network.counters().swap_remove(0)
+    }
+}
+
+#[test]
+fn mailbox_error_for_a_fragment_does_not_fail_an_sdo() {
+    let mut bench = Bench::new();
+    bench.device.error.set(0x0005);
+    for n in 1..=3 {
+        bench.frame();
+        bench.send();
+        assert_eq!(bench.upload(), Ok(ANSWER.to_vec()), "{n}");
+        assert_eq!(bench.counters().refused, n);
+    }
+    assert_eq!(bench.device.fragments.get(), 3);
+    // Without a fragment, the error belongs to the SDO.
+    let error = mailbox(0, &[1, 0, 5, 0]);
+    bench.device.before_answer.borrow_mut().push(error);
+    let failed = bench.upload().expect_err("refused");
+    assert!(failed.contains("0x0005"), "{failed}");
+}
+
+#[test]
+fn device_without_eoe_gets_no_more_frames() {
+    let mut bench = Bench::new();
+    bench.device.error.set(0x0002);
+    bench.frame();
+    bench.frame();
+    bench.send();
+    assert_eq!(bench.upload(), Ok(ANSWER.to_vec()));
+    for _ in 0..3 {
+        bench.frame();
+        bench.send();
+    }
+    assert_eq!(bench.device.fragments.get(), 1);
+    let counters = bench.counters();
+    assert!(counters.unsupported, "{counters:?}");
+    assert_eq!((counters.refused, counters.not_taken), (1, 4));
+    // A device that has restarted may have another firmware.
+    bench.coe = bench.coe.restarted();
+    assert!(!bench.counters().unsupported);
+}
