@@ -167,6 +167,8 @@ impl fmt::Display for LostDatagram<'_> {
 pub enum Phase {
     /// The mailbox stayed full: the SubDevice did not fetch the previous message.
     Request,
+    /// The SubDevice did not fetch the Ethernet frame (EoE) before the request.
+    Fragment,
     /// The SubDevice fetched the request but did not answer it.
     Answer,
     /// An answer was lost, and the SubDevice did not repeat it.
@@ -181,6 +183,7 @@ impl fmt::Display for Phase {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Request => "the mailbox was not free",
+            Self::Fragment => "the device did not take an Ethernet frame (EoE)",
             Self::Answer => "no answer came",
             Self::Repeat => "a lost answer was not repeated",
             Self::Transfer => "the transfer was not complete",

@@ -114,7 +114,7 @@ impl Timeouts {
     fn of(&self, phase: Phase) -> Duration {
         match phase {
             Phase::Request | Phase::Repeat => self.request,
-            Phase::Answer => self.answer,
+            Phase::Answer | Phase::Fragment => self.answer,
             Phase::Transfer | Phase::Command => self.transfer,
         }
     }

@@ -95,6 +95,8 @@ pub(super) struct Port {
     counter: u8,
     /// A fragment of EoE was written since the last answer: a mailbox error may mean it.
     fragment_sent: bool,
+    /// The last message written was a fragment. Devices may take it as late as they may answer.
+    fragment_last: bool,
     /// The port of the switch that takes EoE messages.
     pub(super) eoe: Option<EoePort>,
 }
@@ -115,6 +117,7 @@ impl Port {
             free: false,
             counter: 0,
             fragment_sent: false,
+            fragment_last: false,
             eoe: None,
         }
     }
@@ -161,7 +164,11 @@ impl Port {
     ) -> Result<(), TransportError> {
         self.counter = self.counter % 7 + 1;
         request.emit(self.counter, self.layout.out_len, &mut self.outgoing);
-        let mut deadline = Deadline::after(w, self.timeouts.request);
+        let (time, phase) = match mem::take(&mut self.fragment_last) {
+            true => (self.timeouts.answer, Phase::Fragment),
+            false => (self.timeouts.request, Phase::Request),
+        };
+        let mut deadline = Deadline::after(w, time);
         let mut budget = RetryBudget::default();
         let mut arrived = mem::take(&mut self.free);
         loop {
@@ -188,7 +195,7 @@ impl Port {
                 WriteOutcome::Lost => arrived = true,
             }
             if deadline.passed(w) {
-                return Err(TransportError::Timeout(Phase::Request));
+                return Err(TransportError::Timeout(phase));
             }
             deadline.pause(w).await;
         }
@@ -410,7 +417,7 @@ impl Port {
         if written != Ok(0) {
             // The next request may find the mailbox full.
             (self.counter, self.free) = (counter, false);
-            self.fragment_sent = true;
+            (self.fragment_sent, self.fragment_last) = (true, true);
         }
         written
     }

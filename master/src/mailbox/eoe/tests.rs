@@ -215,3 +215,13 @@ fn device_without_eoe_gets_no_more_frames() {
     bench.coe = bench.coe.restarted();
     assert!(!bench.counters().unsupported);
 }
+
+#[test]
+fn sdo_waits_for_a_device_that_is_busy_with_a_fragment() {
+    let mut bench = Bench::new();
+    bench.device.slow.set(800 * MS);
+    bench.frame();
+    bench.send();
+    assert_eq!(bench.upload(), Ok(ANSWER.to_vec()));
+    assert_eq!(bench.device.fragments.get(), 1);
+}

@@ -425,7 +425,9 @@ impl Transfer<'_> {
                     phase,
                     after: match phase {
                         Phase::Request | Phase::Repeat => port.timeouts.request,
-                        Phase::Answer | Phase::Transfer | Phase::Command => port.timeouts.answer,
+                        Phase::Answer | Phase::Fragment | Phase::Transfer | Phase::Command => {
+                            port.timeouts.answer
+                        }
                     },
                 };
                 return self.failure(cause, NOT_DEFINED);
