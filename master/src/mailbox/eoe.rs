@@ -169,6 +169,7 @@ impl CoeClient {
         let since = sender.waits.map_or(now, |(since, _)| since);
         sender.waits = Some((since, now.saturating_add(sender.pause)));
         if now.saturating_sub(since) > TAKES_NONE {
+            self.port.withdraw();
             sender.restart();
             // Further frames find the pause that this one has left.
             (sender.waits, sender.pause) = (Some((now, now + PAUSE_MAX)), PAUSE_MAX);

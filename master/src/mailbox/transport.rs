@@ -97,6 +97,9 @@ pub(super) struct Port {
     fragment_sent: bool,
     /// The last message written was a fragment. Devices may take it as late as they may answer.
     fragment_last: bool,
+    /// The mailbox was full for the last fragment. If the wire has repeated the write, the device has
+    /// it nevertheless, and another message needs another counter.
+    offered: bool,
     /// The port of the switch that takes EoE messages.
     pub(super) eoe: Option<EoePort>,
 }
@@ -118,6 +121,7 @@ impl Port {
             counter: 0,
             fragment_sent: false,
             fragment_last: false,
+            offered: false,
             eoe: None,
         }
     }
@@ -162,6 +166,7 @@ impl Port {
         w: &W,
         request: &impl Encode,
     ) -> Result<(), TransportError> {
+        self.withdraw();
         self.counter = self.counter % 7 + 1;
         request.emit(self.counter, self.layout.out_len, &mut self.outgoing);
         let (time, phase) = match mem::take(&mut self.fragment_last) {
@@ -414,12 +419,20 @@ impl Port {
         let written = w
             .write(self.layout.station, self.layout.out_address, &self.outgoing)
             .await;
-        if written != Ok(0) {
-            // The next request may find the mailbox full.
-            (self.counter, self.free) = (counter, false);
-            (self.fragment_sent, self.fragment_last) = (true, true);
+        // The next request may find the mailbox full.
+        (self.free, self.fragment_sent) = (false, true);
+        self.offered = written == Ok(0);
+        if !self.offered {
+            (self.counter, self.fragment_last) = (counter, true);
         }
         written
+    }
+
+    /// Gives up the fragment for which the mailbox was full.
+    pub(super) fn withdraw(&mut self) {
+        if mem::take(&mut self.offered) {
+            self.counter = self.counter % 7 + 1;
+        }
     }
 
     /// Counts a mailbox error that may mean a fragment. Returns false for other messages.

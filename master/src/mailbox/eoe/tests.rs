@@ -225,3 +225,25 @@ fn sdo_waits_for_a_device_that_is_busy_with_a_fragment() {
     assert_eq!(bench.upload(), Ok(ANSWER.to_vec()));
     assert_eq!(bench.device.fragments.get(), 1);
 }
+
+#[test]
+fn counter_of_a_repeated_write_is_not_used_again() {
+    let mut bench = Bench::new();
+    bench.frame();
+    bench.device.repeats_write.set(true);
+    bench.send();
+    assert_eq!(bench.upload(), Ok(ANSWER.to_vec()));
+    // The fragment comes again, after the request.
+    bench.send();
+    assert_eq!(bench.upload(), Ok(ANSWER.to_vec()));
+    assert_eq!(bench.device.fragments.get(), 2);
+    // The same fragment has the same counter, and the device takes it once.
+    bench.frame();
+    bench.device.repeats_write.set(true);
+    bench.send();
+    ready(bench.device.delay(Duration::from_millis(50)));
+    bench.send();
+    ready(bench.device.delay(Duration::from_millis(50)));
+    assert_eq!(bench.upload(), Ok(ANSWER.to_vec()));
+    assert_eq!(bench.device.fragments.get(), 3);
+}
