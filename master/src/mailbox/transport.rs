@@ -216,7 +216,7 @@ impl Port {
         let mut repeats = 0;
         loop {
             match self.look(w, &mut budget).await? {
-                ReadOutcome::Message if self.take_refusal() => {}
+                ReadOutcome::Message if self.take_refusal() || self.take_fragment(w) => {}
                 ReadOutcome::Message => return Ok(()),
                 ReadOutcome::Lost if repeats < REPEATS => {
                     repeats += 1;
@@ -426,6 +426,16 @@ impl Port {
             (self.counter, self.fragment_last) = (counter, true);
         }
         written
+    }
+
+    /// Passes a fragment on to the switch, or EoE that makes no sense. Returns false for others.
+    fn take_fragment<W: MailboxTransport>(&self, w: &W) -> bool {
+        let other = matches!(
+            eoe::Message::parse(&self.incoming),
+            Ok(message) if !matches!(message.service, eoe::Service::Fragment(_))
+        );
+        let eoe = self.eoe.as_ref().filter(|_| !other);
+        eoe.is_some_and(|eoe| eoe.receive(w.now(), &self.incoming))
     }
 
     /// Gives up the fragment for which the mailbox was full.

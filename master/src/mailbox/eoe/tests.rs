@@ -247,3 +247,13 @@ fn counter_of_a_repeated_write_is_not_used_again() {
     assert_eq!(bench.upload(), Ok(ANSWER.to_vec()));
     assert_eq!(bench.device.fragments.get(), 3);
 }
+
+#[test]
+fn damaged_eoe_does_not_fail_an_sdo() {
+    let mut bench = Bench::new();
+    let mut damaged = mailbox(2, &[0; 20]);
+    damaged[..2].copy_from_slice(&[0xff, 0xff]);
+    bench.device.before_answer.borrow_mut().push(damaged);
+    assert_eq!(bench.upload(), Ok(ANSWER.to_vec()));
+    assert_eq!(bench.counters().invalid, 1);
+}
