@@ -93,10 +93,13 @@ impl<W: MailboxTransport> MailboxWorker<W> {
                 return Poll::Ready(next);
             }
             // No waker is registered for messages and frames; every executor here polls again soon.
-            let (port, now) = (self.coe.eoe_port(), self.wire.now());
-            let message = self.coe.has_message(&self.wire)
-                || port.is_some_and(|port| port.is_assembling(now));
-            let fragment = port.is_some_and(|port| self.eoe.is_due(now, port));
+            let message = self.coe.has_message(&self.wire);
+            // Without EoE, this costs nothing.
+            let (message, fragment) = self.coe.eoe_port().map_or((message, false), |port| {
+                let now = self.wire.now();
+                let message = message || port.is_assembling(now);
+                (message, self.eoe.is_due(now, port))
+            });
             let item = match (message, fragment) {
                 (true, false) => WorkItem::Message,
                 (true, true) if !self.fragment_is_next => WorkItem::Message,
