@@ -61,6 +61,13 @@ impl Port {
         self.queues.iter().map(VecDeque::len).sum()
     }
 
+    fn count(&mut self, taken: bool) {
+        match taken {
+            true => self.counters.to_port += 1,
+            false => self.counters.not_taken += 1,
+        }
+    }
+
     /// Drops the frames that wait, and counts them.
     fn clear(&mut self) {
         self.counters.not_taken += self.waiting() as u64;
@@ -207,12 +214,15 @@ impl EoePort {
         true
     }
 
-    /// Returns true if a frame has begun and its next fragment is due.
+    /// Returns true if a frame has begun and its next fragment is due. Drops a frame whose next
+    /// fragment is late.
     #[must_use]
     pub fn is_assembling(&self, now: Nanos) -> bool {
         let recent = |at: Nanos| now.saturating_sub(at) < FRAGMENT_TIMEOUT;
         self.network.with_port(self.number, |port| {
-            port.assembling = port.assembling.filter(|at| recent(*at));
+            if port.assembling.take_if(|at| !recent(*at)).is_some() {
+                port.reassembler.reset();
+            }
             port.assembling.is_some()
         })
     }
@@ -230,10 +240,10 @@ impl EoePort {
             .with_port(self.number, |port| port.waiting() > 0)
     }
 
-    /// Counts a frame that the device has taken.
-    pub fn count_sent(&self) {
+    /// Counts a frame that the device has taken, or not.
+    pub fn count(&self, taken: bool) {
         self.network
-            .with_port(self.number, |port| port.counters.to_port += 1);
+            .with_port(self.number, |port| port.count(taken));
     }
 
     /// Drops the frames for a device that takes none, and `begun` frames whose fragments it has seen
@@ -266,12 +276,13 @@ impl EoePort {
             .with_port(self.number, |port| port.counters.unsupported)
     }
 
-    /// Drops the frame in progress and the addresses of a device that has restarted.
+    /// Drops all frames and the addresses of a device that has restarted.
     pub fn restart(&self) {
         self.network.with_port(self.number, |port| {
             port.reassembler.reset();
             port.assembling = None;
             port.counters.unsupported = false;
+            port.clear();
         });
         self.network.lock().switch.forget(self.number);
     }
@@ -304,10 +315,8 @@ impl HostPort {
 
     /// Counts a frame that the interface has taken, or not.
     pub fn count(&self, taken: bool) {
-        self.network.with_port(self.number, |port| match taken {
-            true => port.counters.to_port += 1,
-            false => port.counters.not_taken += 1,
-        });
+        self.network
+            .with_port(self.number, |port| port.count(taken));
     }
 }
 
@@ -403,13 +412,18 @@ mod tests {
         x.receive(1, &long[0]);
         assert!(x.is_assembling(2));
         assert!(!x.is_assembling(2 + FRAGMENT_TIMEOUT));
-        x.receive(3, &long[1]);
+        assert_eq!(network.counters()[0].incomplete, 1);
+        x.receive(3, &long[0]);
+        y.receive(4, &mailboxes(&frame(1, 9, 60), 1)[0]);
+        assert!(x.has_frame());
         x.restart();
-        assert!(!x.is_assembling(4));
-        x.receive(5, &long[2]);
-        assert_eq!(network.counters()[0].incomplete, 2);
-        assert!(network.lock().switch.is_empty());
+        assert!(!x.is_assembling(5) && !x.has_frame());
+        x.receive(6, &long[1]);
+        let counters = &network.counters()[0];
+        assert_eq!((counters.incomplete, counters.not_taken), (3, 1));
         assert!(y.has_frame());
+        y.restart();
+        assert!(network.lock().switch.is_empty());
     }
 
     proptest! {

@@ -9,7 +9,7 @@ use ecaxis_ecat::mailbox::eoe::{
 
 use super::error::CoeCause;
 use super::transfer::explain;
-use super::transport::{Deadline, Port, TransportError};
+use super::transport::{Deadline, TransportError};
 use super::{CoeClient, MailboxTransport};
 use crate::clock::Nanos;
 use crate::eoe::EoePort;
@@ -150,20 +150,26 @@ impl CoeClient {
             return port.drop_frames(1);
         };
         let turn = port.turn().await;
-        let offered = self
-            .port
-            .offer(w, &Service::Fragment(fragment).into())
-            .await;
+        let message = Message::from(Service::Fragment(fragment));
+        let written = self.port.write_once(w, &message).await;
         drop(turn);
         let now = w.now();
-        if offered {
-            (sender.waits, sender.pause) = (None, 0);
-            sender.sent += 1;
-            if fragment.last {
-                sender.frame.clear();
-                port.count_sent();
+        match written {
+            Ok(0) => {}
+            Ok(_) => {
+                (sender.waits, sender.pause) = (None, 0);
+                sender.sent += 1;
+                if fragment.last {
+                    sender.frame.clear();
+                    port.count(true);
+                }
+                return;
             }
-            return;
+            // Ethernet repeats the frame.
+            Err(_) => {
+                sender.restart();
+                return port.count(false);
+            }
         }
         sender.pause = (sender.pause * 2).clamp(PAUSE_MIN, PAUSE_MAX);
         let since = sender.waits.map_or(now, |(since, _)| since);
@@ -172,7 +178,7 @@ impl CoeClient {
             self.port.withdraw();
             sender.restart();
             // Further frames find the pause that this one has left.
-            (sender.waits, sender.pause) = (Some((now, now + PAUSE_MAX)), PAUSE_MAX);
+            sender.pause = PAUSE_MAX;
             port.drop_frames(1);
         }
     }
@@ -186,7 +192,7 @@ impl CoeClient {
         // The cycle detects a device that is gone.
         let _ = self.port.take_one(w).await;
         drop(turn);
-        if port.is_assembling(w.now()) && !self.port.waits(w) {
+        if !self.port.waits(w) && port.is_assembling(w.now()) {
             w.delay(Duration::from_nanos(PAUSE_MIN)).await;
         }
     }
@@ -194,12 +200,3 @@ impl CoeClient {
 
 #[cfg(test)]
 mod tests;
-
-impl Port {
-    /// Writes a message into the device's mailbox once. Returns false if it was full, or if the
-    /// device is gone. A message whose frame was lost counts as taken: Ethernet repeats it.
-    async fn offer<W: MailboxTransport>(&mut self, w: &W, message: &Message<'_>) -> bool {
-        let written = self.write_once(w, message).await;
-        !matches!(written, Ok(0))
-    }
-}

@@ -257,3 +257,33 @@ fn damaged_eoe_does_not_fail_an_sdo() {
     assert_eq!(bench.upload(), Ok(ANSWER.to_vec()));
     assert_eq!(bench.counters().invalid, 1);
 }
+
+#[test]
+fn frames_that_a_device_does_not_take_are_counted() {
+    let mut bench = Bench::new();
+    bench.frame();
+    bench.device.loses_writes.set(true);
+    bench.send();
+    bench.device.loses_writes.set(false);
+    assert_eq!(bench.counters().not_taken, 1);
+    bench.device.stuck.set(true);
+    bench.frame();
+    let before = bench.device.now();
+    while bench.counters().not_taken == 1 {
+        bench.send();
+        ready(bench.device.delay(Duration::from_millis(20)));
+    }
+    assert!(bench.device.now() - before > TAKES_NONE);
+    // A frame after a long pause is offered again and again, too.
+    ready(bench.device.delay(Duration::from_secs(10)));
+    bench.frame();
+    bench.send();
+    bench.send();
+    assert_eq!(bench.counters().not_taken, 2);
+    bench.device.stuck.set(false);
+    bench.send();
+    assert_eq!(
+        (bench.counters().not_taken, bench.counters().to_port),
+        (2, 1)
+    );
+}
