@@ -19,7 +19,7 @@ mod network;
 pub mod switch;
 
 pub use interface::Ethernet;
-pub use network::{EoeNetwork, EoePort, EthernetCounters, FRAMES_PER_PORT, HostPort};
+pub use network::{EoeNetwork, EoePort, EthernetCounters, FRAMES_PER_PORT, HostPort, Turn};
 
 /// A network interface: the far side of the switch's port for the operating system.
 pub trait EthernetInterface: fmt::Debug + Send {

@@ -119,6 +119,9 @@ impl Network {
     }
 }
 
+/// The right to send one datagram of EoE; its end is that of the datagram.
+pub type Turn = tokio::sync::OwnedMutexGuard<()>;
+
 /// The virtual switch with its ports. Clones share it.
 #[derive(Debug, Clone, Default)]
 pub struct EoeNetwork {
@@ -287,10 +290,11 @@ impl EoePort {
         self.network.lock().switch.forget(self.number);
     }
 
-    /// Waits for the turn of this port: EoE has one datagram of the whole bus in flight, so that the
+    /// Takes the turn, unless another port has it: EoE has one datagram of the whole bus in flight, so that the
     /// requests of other mailboxes keep their share of each cycle.
-    pub async fn turn(&self) -> tokio::sync::OwnedMutexGuard<()> {
-        Arc::clone(&self.network.turn).lock_owned().await
+    #[must_use]
+    pub fn try_turn(&self) -> Option<Turn> {
+        Arc::clone(&self.network.turn).try_lock_owned().ok()
     }
 }
 

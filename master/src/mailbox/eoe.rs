@@ -12,7 +12,7 @@ use super::transfer::explain;
 use super::transport::{Deadline, TransportError};
 use super::{CoeClient, MailboxTransport};
 use crate::clock::Nanos;
-use crate::eoe::EoePort;
+use crate::eoe::{EoePort, Turn};
 
 /// The first and the longest pause before a fragment is offered again to a full mailbox.
 const PAUSE_MIN: Nanos = 500_000;
@@ -128,6 +128,7 @@ impl CoeClient {
         &mut self,
         w: &W,
         sender: &mut EoeSender,
+        turn: Turn,
     ) {
         let Some(port) = self.port.eoe.clone() else {
             return;
@@ -149,7 +150,6 @@ impl CoeClient {
             sender.restart();
             return port.drop_frames(1);
         };
-        let turn = port.turn().await;
         let message = Message::from(Service::Fragment(fragment));
         let written = self.port.write_once(w, &message).await;
         drop(turn);
@@ -184,14 +184,12 @@ impl CoeClient {
     }
 
     /// Reads one message that belongs to no request, if there is one.
-    pub(super) async fn take_message<W: MailboxTransport>(&mut self, w: &W) {
+    pub(super) async fn take_message<W: MailboxTransport>(&mut self, w: &W, turn: Turn) {
         let Some(port) = self.port.eoe.clone() else {
             return;
         };
-        let turn = port.turn().await;
         // The cycle detects a device that is gone.
-        let _ = self.port.take_one(w).await;
-        drop(turn);
+        let _ = self.port.take_one(w, turn).await;
         if !self.port.waits(w) && port.is_assembling(w.now()) {
             w.delay(Duration::from_nanos(PAUSE_MIN)).await;
         }

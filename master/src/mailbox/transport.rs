@@ -10,7 +10,7 @@ use ecaxis_ecat::mailbox::{Encode, MIN_LENGTH, eoe, soe};
 use super::emergency::{Emergencies, Emergency};
 use super::error::Phase;
 use super::{DatagramError, MailboxLayout, MailboxTransport, Timeouts};
-use crate::eoe::EoePort;
+use crate::eoe::{EoePort, Turn};
 use crate::link::MAX_DATA;
 use ecaxis_ecat::registers;
 
@@ -385,16 +385,19 @@ impl Port {
         Ok(count)
     }
 
-    /// Reads one message, if there is one, and sets it aside.
+    /// Reads one message, if there is one, and sets it aside. The turn ends once it is read: a device
+    /// that does not repeat a lost message must not delay the others.
     pub(super) async fn take_one<W: MailboxTransport>(
         &mut self,
         w: &W,
+        turn: Turn,
     ) -> Result<(), TransportError> {
         let mut budget = RetryBudget::default();
         let read = match self.waits(w) {
             true => self.read(w, &mut budget).await?,
             false => self.fetch(w, &mut budget).await?,
         };
+        drop(turn);
         match read {
             ReadOutcome::Message => self.set_aside(w),
             ReadOutcome::Lost => match self.repeat(w, &mut budget).await {

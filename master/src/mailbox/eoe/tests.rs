@@ -3,11 +3,13 @@
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
 use std::pin::pin;
+use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 
 use super::*;
 use crate::eoe::{EoeNetwork, HostPort};
-use crate::mailbox::{DatagramError, MailboxLayout};
+use crate::mailbox::worker::{EmergencySink, MailboxWorker, WorkerConfig, open, run_with_workers};
+use crate::mailbox::{DatagramError, Emergencies, MailboxLayout, Mailboxes};
 
 const LENGTH: u16 = 128;
 const LAYOUT: MailboxLayout = MailboxLayout {
@@ -40,6 +42,11 @@ struct Device {
     out: RefCell<Option<(u64, Vec<u8>)>>,
     counter: Cell<u8>,
     fragments: Cell<u32>,
+    /// The next message is lost on its way, and is not repeated.
+    loses_read: Cell<bool>,
+    /// Another port, and whether it could have the turn while a message was to be repeated.
+    other: RefCell<Option<EoePort>>,
+    turn_was_free: Cell<Option<bool>>,
     incoming: RefCell<VecDeque<Vec<u8>>>,
 }
 
@@ -80,9 +87,18 @@ impl Device {
 }
 
 impl MailboxTransport for Device {
-    async fn read(&self, _: u16, register: u16, bytes: &mut [u8]) -> Result<u16, DatagramError> {
+    async fn read(
+        &self,
+        station: u16,
+        register: u16,
+        bytes: &mut [u8],
+    ) -> Result<u16, DatagramError> {
         self.delay(Duration::from_micros(100)).await;
         let full = |full| 8 * u8::from(full);
+        if register == 0x1400 && self.loses_read.take() {
+            self.incoming.borrow_mut().clear();
+            return Err(DatagramError::Timeout { station, register });
+        }
         match register {
             0x1400 => match self.incoming.borrow_mut().pop_front() {
                 Some(message) => bytes.copy_from_slice(&message),
@@ -90,6 +106,12 @@ impl MailboxTransport for Device {
             },
             0x0805 => bytes[0] = full(self.stuck.get() || self.out.borrow().is_some()),
             0x080d => bytes[0] = full(!self.incoming.borrow().is_empty()),
+            0x080e | 0x080f => {
+                let other = self.other.borrow();
+                let turn = other.as_ref().and_then(EoePort::try_turn);
+                self.turn_was_free.set(Some(turn.is_some()));
+                bytes[0] = 0;
+            }
             other => panic!("register {other:#06x}"),
         }
         Ok(1)
@@ -97,6 +119,9 @@ impl MailboxTransport for Device {
 
     async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, DatagramError> {
         self.delay(Duration::from_micros(100)).await;
+        if register == 0x080e {
+            return Ok(1);
+        }
         assert_eq!(register, 0x1000);
         if self.loses_writes.get() {
             return Err(DatagramError::Timeout { station, register });
@@ -121,6 +146,22 @@ impl MailboxTransport for Device {
     fn now(&self) -> u64 {
         self.now.get()
     }
+}
+
+#[derive(Debug)]
+struct Ignore;
+
+impl EmergencySink for Ignore {
+    fn listen(&self, _: &str, _: &Emergencies) {}
+}
+
+fn open_one(device: Device, coe: CoeClient) -> (Mailboxes, Vec<MailboxWorker<Device>>) {
+    let only = WorkerConfig {
+        name: "a0".to_owned(),
+        mailbox: Some((device, coe)),
+    };
+    let sink: Arc<dyn EmergencySink> = Arc::new(Ignore);
+    open([only], &sink)
 }
 
 /// Nothing at the device waits.
@@ -164,7 +205,9 @@ impl Bench {
     }
 
     fn send(&mut self) {
-        ready(self.coe.send_fragment(&self.device, &mut self.sender));
+        let turn = self.coe.port.eoe.as_ref().and_then(EoePort::try_turn);
+        let turn = turn.expect("no other has it");
+        ready(self.coe.send_fragment(&self.device, &mut self.sender, turn));
     }
 
     fn upload(&mut self) -> Result<Vec<u8>, String> {
@@ -286,4 +329,39 @@ fn frames_that_a_device_does_not_take_are_counted() {
         (bench.counters().not_taken, bench.counters().to_port),
         (2, 1)
     );
+}
+
+#[test]
+fn device_that_repeats_nothing_leaves_the_turn_to_others() {
+    let mut bench = Bench::new();
+    let other = bench.network.add_device("a1");
+    bench.device.other.replace(Some(other.clone()));
+    bench.device.loses_read.set(true);
+    let lost = mailbox(2, &[0; 20]);
+    bench.device.incoming.borrow_mut().push_back(lost);
+    let turn = other.try_turn().expect("no other has it");
+    ready(bench.coe.take_message(&bench.device, turn));
+    assert_eq!(bench.device.turn_was_free.get(), Some(true));
+}
+
+#[test]
+fn sdo_is_served_while_another_device_has_the_turn() {
+    let bench = Bench::new();
+    let other = bench.network.add_device("a1");
+    bench.frame();
+    let (mailboxes, workers) = open_one(bench.device, bench.coe);
+    let _turn = other.try_turn().expect("no other has it");
+    let upload = async {
+        // The worker waits for the turn.
+        tokio::task::yield_now().await;
+        mailboxes.upload("a0", 0x1000, 0).await
+    };
+    let mut upload = pin!(run_with_workers(workers, upload));
+    let mut context = Context::from_waker(Waker::noop());
+    let answer = (0..5).find_map(|_| match upload.as_mut().poll(&mut context) {
+        Poll::Ready(answer) => Some(answer),
+        Poll::Pending => None,
+    });
+    assert_eq!(answer, Some(Ok(ANSWER.to_vec())));
+    assert_eq!(bench.network.counters()[0].to_port, 0);
 }

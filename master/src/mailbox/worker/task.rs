@@ -2,6 +2,7 @@
 //! between.
 
 use std::future::{Future, poll_fn};
+use std::mem;
 use std::pin::{Pin, pin};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -10,6 +11,7 @@ use std::task::{Context, Poll, Wake, Waker};
 use tokio::sync::mpsc;
 
 use super::{EmergencySink, Job, Request};
+use crate::eoe::Turn;
 use crate::mailbox::eoe::EoeSender;
 use crate::mailbox::{CoeClient, Emergencies, MailboxTransport, SdoError};
 
@@ -29,6 +31,8 @@ pub struct MailboxWorker<W> {
     eoe: EoeSender,
     /// The last item was a message: a fragment in the other direction precedes the next one.
     fragment_is_next: bool,
+    /// The last item had the turn: the next poll leaves it to others.
+    had_turn: bool,
     pub(super) listener: Arc<dyn EmergencySink>,
 }
 
@@ -54,10 +58,10 @@ impl Wake for Arrivals {
 
 enum WorkItem {
     Job(Job),
-    /// A message waits that belongs to no request.
-    Message,
+    /// A message waits that belongs to no request. With EoE, reading it needs the turn.
+    Message(Option<Turn>),
     /// A fragment of an Ethernet frame is due.
-    Fragment,
+    Fragment(Turn),
     /// All senders are dropped.
     End,
 }
@@ -68,12 +72,12 @@ impl<W: MailboxTransport> MailboxWorker<W> {
         loop {
             match self.next().await {
                 WorkItem::Job(job) => self.do_job(job).await,
-                WorkItem::Message => {
+                WorkItem::Message(turn) => {
                     let listening = async {
-                        match self.coe.eoe_port() {
+                        match turn {
                             // One at a time: a device that sends frames without end must not keep
                             // requests waiting.
-                            Some(_) => self.coe.take_message(&self.wire).await,
+                            Some(turn) => self.coe.take_message(&self.wire, turn).await,
                             // The cycle detects a device that is gone.
                             None => drop(self.coe.drain(&self.wire).await),
                         }
@@ -81,7 +85,11 @@ impl<W: MailboxTransport> MailboxWorker<W> {
                     forward_emergencies(&self.name, &self.emergencies, &*self.listener, listening)
                         .await;
                 }
-                WorkItem::Fragment => self.coe.send_fragment(&self.wire, &mut self.eoe).await,
+                WorkItem::Fragment(turn) => {
+                    self.coe
+                        .send_fragment(&self.wire, &mut self.eoe, turn)
+                        .await;
+                }
                 WorkItem::End => return,
             }
         }
@@ -92,22 +100,34 @@ impl<W: MailboxTransport> MailboxWorker<W> {
             if let Some(next) = self.arrived(context) {
                 return Poll::Ready(next);
             }
-            // No waker is registered for messages and frames; every executor here polls again soon.
+            // No waker is registered for messages, frames and turns; every executor here polls again
+            // soon.
             let message = self.coe.has_message(&self.wire);
             // Without EoE, this costs nothing.
-            let (message, fragment) = self.coe.eoe_port().map_or((message, false), |port| {
-                let now = self.wire.now();
-                let message = message || port.is_assembling(now);
-                (message, self.eoe.is_due(now, port))
-            });
-            let item = match (message, fragment) {
-                (true, false) => WorkItem::Message,
-                (true, true) if !self.fragment_is_next => WorkItem::Message,
-                (_, true) => WorkItem::Fragment,
-                (false, false) => return Poll::Pending,
+            let Some(port) = self.coe.eoe_port() else {
+                return match message {
+                    true => Poll::Ready(WorkItem::Message(None)),
+                    false => Poll::Pending,
+                };
             };
-            self.fragment_is_next = matches!(item, WorkItem::Message);
-            Poll::Ready(item)
+            if mem::take(&mut self.had_turn) {
+                return Poll::Pending;
+            }
+            let now = self.wire.now();
+            let message = message || port.is_assembling(now);
+            let fragment = self.eoe.is_due(now, port);
+            if !message && !fragment {
+                return Poll::Pending;
+            }
+            let Some(turn) = port.try_turn() else {
+                return Poll::Pending;
+            };
+            self.had_turn = true;
+            self.fragment_is_next = message && !(fragment && self.fragment_is_next);
+            Poll::Ready(match self.fragment_is_next {
+                true => WorkItem::Message(Some(turn)),
+                false => WorkItem::Fragment(turn),
+            })
         })
         .await
     }
@@ -211,6 +231,7 @@ impl<W> MailboxWorker<W> {
             outer: None,
             eoe: EoeSender::default(),
             fragment_is_next: false,
+            had_turn: false,
             listener,
         }
     }
