@@ -81,7 +81,7 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         }
         Cause::WrongState { .. } => "bring it to Init first, or switch it off and on".to_owned(),
         Cause::Eoe { source, .. } => eoe(source),
-        Cause::Tap { source, name, .. } => tap(source, name),
+        Cause::Tap { source, step, name } => tap(source, *step, name),
         Cause::Sdo(source) if error.is_in_bring_up() => sdo(source, "bring-up"),
         Cause::Sdo(source) => parameter(source),
         Cause::Information(source) => information(source).to_owned(),

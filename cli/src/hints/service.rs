@@ -8,6 +8,7 @@ use ecaxis_master::acyclic::eeprom::EepromError;
 use ecaxis_master::acyclic::image::WriteError;
 use ecaxis_master::acyclic::parameters::restore::RestoreError;
 use ecaxis_master::config::Nic;
+use ecaxis_master::eoe::TapStep;
 use ecaxis_master::mailbox::{CoeCause, EoeError, InfoError, SdoError};
 use ecaxis_master::report::{Cause, Error};
 
@@ -137,15 +138,24 @@ pub(super) fn eoe(error: &EoeError) -> String {
 }
 
 /// Returns the hint for a TAP interface that cannot be opened.
-pub(super) fn tap(error: &std::io::Error, name: &str) -> String {
-    match error.kind() {
-        ErrorKind::PermissionDenied => format!(
+pub(super) fn tap(error: &std::io::Error, step: TapStep, name: &str) -> String {
+    // A device file without its module: ENODEV has no kind of its own.
+    let missing = error.kind() == ErrorKind::NotFound || error.raw_os_error() == Some(libc::ENODEV);
+    match (step, error.kind()) {
+        (TapStep::Open, _) if missing => "load the module: `modprobe tun`".to_owned(),
+        (TapStep::Open, _) => "give this user access to /dev/net/tun (docs/eoe.md)".to_owned(),
+        (TapStep::Create, ErrorKind::PermissionDenied) => format!(
             "grant CAP_NET_ADMIN (docs/eoe.md), or create it beforehand: `ip tuntap add {name} mode tap user $USER`"
         ),
-        ErrorKind::ResourceBusy => {
+        (TapStep::Create, ErrorKind::ResourceBusy) => {
             "another program uses it: write another name for `tap`".to_owned()
         }
-        ErrorKind::NotFound => "load the module: `modprobe tun`".to_owned(),
+        (TapStep::Address | TapStep::Netmask, ErrorKind::PermissionDenied) => format!(
+            "grant CAP_NET_ADMIN (docs/eoe.md), or omit `address` and set it beforehand: `ip addr add ADDRESS dev {name}`"
+        ),
+        (TapStep::SwitchOn, ErrorKind::PermissionDenied) => format!(
+            "grant CAP_NET_ADMIN (docs/eoe.md), or switch it on beforehand: `ip link set {name} up`"
+        ),
         _ => format!("an interface `{name}` of another kind may exist: `ip link show {name}`"),
     }
 }

@@ -1,4 +1,5 @@
 use ecaxis_master::acyclic::{AlState, DeviceRef};
+use ecaxis_master::eoe::TapStep;
 use ecaxis_master::link::OpenError;
 use ecaxis_master::mailbox::{NamedObject, Subject};
 
@@ -338,5 +339,24 @@ fn firmware_error_names_its_device_once() {
         );
         assert_eq!(text.matches("0x1001").count(), 1, "{text}");
         assert!(text.ends_with("; the device does not answer"), "{text}");
+    }
+}
+
+/// The remedy depends on the step at which the TAP interface fails.
+#[test]
+fn tap_hints_name_the_step() {
+    for (step, code, part) in [
+        (TapStep::Open, libc::ENOENT, "modprobe tun"),
+        (TapStep::Open, libc::ENODEV, "modprobe tun"),
+        (TapStep::Open, libc::EACCES, "/dev/net/tun"),
+        (TapStep::Create, libc::EPERM, "ip tuntap add ecat0"),
+        (TapStep::Create, libc::EBUSY, "another name"),
+        (TapStep::Create, libc::EINVAL, "ip link show ecat0"),
+        (TapStep::Address, libc::EPERM, "omit `address`"),
+        (TapStep::SwitchOn, libc::EPERM, "ip link set ecat0 up"),
+    ] {
+        let error = std::io::Error::from_raw_os_error(code);
+        let hint = service::tap(&error, step, "ecat0");
+        assert!(hint.contains(part), "{step} {code}: {hint}");
     }
 }

@@ -10,7 +10,7 @@ use sha2::{Digest as _, Sha256};
 
 use super::fields::{Key, KeyExt as _};
 use super::problem::Problems;
-use super::raw::{RawDevice, RawEoe};
+use super::raw::{RawDevice, RawDeviceEoe, RawEoe};
 use super::{Bus, DeviceConfig, Nic};
 
 /// The length of the longest name of an interface (linux/if.h: IFNAMSIZ).
@@ -320,23 +320,31 @@ fn derived_mac(name: &str) -> MacAddress {
     [0x02, 0x45, 0x43, a, b, c]
 }
 
+/// An address as a number, and its text.
+type Address<'d> = (u64, &'d toml::Spanned<String>);
+
+fn ip_of(eoe: &RawDeviceEoe) -> Option<Address<'_>> {
+    let text = eoe.ip.as_ref()?;
+    let ip: Ipv4Addr = text.get_ref().parse().ok()?;
+    Some((ip.to_bits().into(), text))
+}
+
+fn mac_of(eoe: &RawDeviceEoe) -> Option<Address<'_>> {
+    let text = eoe.mac.as_ref()?;
+    let [a, b, c, d, e, f] = parse_mac(text.get_ref())?;
+    Some((u64::from_be_bytes([0, 0, a, b, c, d, e, f]), text))
+}
+
 /// Reports devices with the same address.
 pub(super) fn unique(devices: &[RawDevice], p: &mut Problems<'_>) {
     let eoe = || devices.iter().filter_map(|device| device.eoe.as_ref());
     for (n, device) in eoe().enumerate() {
-        for (key, of) in [
-            (
-                &device.ip,
-                (|eoe| &eoe.ip) as fn(&super::raw::RawDeviceEoe) -> &Key<String>,
-            ),
-            (&device.mac, |eoe| &eoe.mac),
-        ] {
-            let Some(text) = key else { continue };
-            let mut others = eoe().take(n).filter_map(|other| of(other).as_ref());
-            let same = |other: &&toml::Spanned<String>| {
-                other.get_ref().eq_ignore_ascii_case(text.get_ref())
+        for of in [ip_of as fn(&RawDeviceEoe) -> Option<Address<'_>>, mac_of] {
+            let Some((address, text)) = of(device) else {
+                continue;
             };
-            if others.any(|other| same(&other)) {
+            let mut others = eoe().take(n).filter_map(of);
+            if others.any(|(other, _)| other == address) {
                 let message = format!("two devices have the address {}", text.get_ref());
                 p.add_hint(
                     text.span(),

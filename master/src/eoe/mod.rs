@@ -18,6 +18,7 @@ mod interface;
 mod network;
 pub mod switch;
 
+pub use crate::sys::tap::TapStep;
 pub use interface::Ethernet;
 pub use network::{EoeNetwork, EoePort, EthernetCounters, FRAMES_PER_PORT, HostPort, Turn};
 

@@ -113,7 +113,7 @@ pub enum Cause {
     #[error("the TAP interface `{name}`: {step}: {source}")]
     Tap {
         name: String,
-        step: &'static str,
+        step: crate::eoe::TapStep,
         source: std::io::Error,
     },
     #[error("{}", .0.without_station())]

@@ -19,8 +19,34 @@ pub struct TapInterface {
 /// The step at which a TAP interface could not be opened.
 #[derive(Debug)]
 pub struct TapError {
-    pub step: &'static str,
+    pub step: TapStep,
     pub source: io::Error,
+}
+
+/// A step of opening a TAP interface.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum TapStep {
+    /// Opening the device of the kernel.
+    #[error("opening /dev/net/tun")]
+    Open,
+    /// Writing its name.
+    #[error("its name")]
+    Name,
+    /// Creating it, or attaching to it.
+    #[error("creating it")]
+    Create,
+    /// Opening a socket for the next steps.
+    #[error("opening a socket")]
+    Socket,
+    /// Setting its address.
+    #[error("its address")]
+    Address,
+    /// Setting its subnet mask.
+    #[error("its netmask")]
+    Netmask,
+    /// Switching it on.
+    #[error("switching it on")]
+    SwitchOn,
 }
 
 impl TapInterface {
@@ -33,23 +59,23 @@ impl TapInterface {
         let at = |step| move |source| TapError { step, source };
         let flags = OFlags::RDWR | OFlags::NONBLOCK | OFlags::CLOEXEC;
         let fd = rustix::fs::open("/dev/net/tun", flags, Mode::empty())
-            .map_err(|error| at("opening /dev/net/tun")(error.into()))?;
-        let mut request = request(name).map_err(at("its name"))?;
+            .map_err(|error| at(TapStep::Open)(error.into()))?;
+        let mut request = request(name).map_err(at(TapStep::Name))?;
         // The constants fit: IFF_TAP is 2, IFF_NO_PI is 0x1000.
         request.ifr_ifru.ifru_flags = (libc::IFF_TAP | libc::IFF_NO_PI) as libc::c_short;
         // SAFETY: `request` is a valid ifreq that outlives the call.
         let set = unsafe { libc::ioctl(fd.as_raw_fd(), libc::TUNSETIFF, &raw mut request) };
-        checked(set).map_err(at("creating it"))?;
-        let socket = control_socket().map_err(at("opening a socket"))?;
+        checked(set).map_err(at(TapStep::Create))?;
+        let socket = control_socket().map_err(at(TapStep::Socket))?;
         if let Some((address, prefix)) = address {
             let mask = u32::MAX.checked_shl(32 - u32::from(prefix)).unwrap_or(0);
             set_address(&socket, name, libc::SIOCSIFADDR as libc::Ioctl, address)
-                .map_err(at("its address"))?;
+                .map_err(at(TapStep::Address))?;
             let mask = Ipv4Addr::from_bits(mask);
             set_address(&socket, name, libc::SIOCSIFNETMASK as libc::Ioctl, mask)
-                .map_err(at("its netmask"))?;
+                .map_err(at(TapStep::Netmask))?;
         }
-        switch_on(&socket, name).map_err(at("switching it on"))?;
+        switch_on(&socket, name).map_err(at(TapStep::SwitchOn))?;
         Ok(Self { fd })
     }
 

@@ -365,6 +365,9 @@ fn wrong_keys_have_a_message_and_a_remedy() {
         assert!(problem.contains(hint), "{keys} {tap}: {problem}");
         assert!(problem.contains("machine.toml:"), "{problem}");
     }
+    let twice = good.replace(".11\" }", ".11\", mac = \"02-00-00-00-00-0A\" }").replace(".12\" }", ".12\", mac = \"02:00:00:00:00:0a\" }");
+    let problem = bench.parse(&twice).expect_err("one MAC address for two");
+    assert!(problem.contains("two devices have the address 02:00:00:00:00:0a"), "{problem}");
     let other = good.replace("esi/SV1.xml", "esi/IDX.xml");
     let problem = bench.parse(&other).expect_err("no EoE");
     assert!(problem.contains("has no EoE") && problem.contains("omit `eoe`"), "{problem}");
