@@ -317,6 +317,7 @@ fn programs_of_every_kind_allocate_nothing() {
         "loops.toml",
         "program.toml",
         "mixed.toml",
+        "web.toml",
     ] {
         let (counted, _, result) = metered(load(file), &virtual_time(), None, 20_000);
         assert!(matches!(result, Some(Ok(()))), "{file}: {result:?}");
