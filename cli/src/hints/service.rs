@@ -140,7 +140,8 @@ pub(super) fn eoe(error: &EoeError) -> String {
 /// Returns the hint for a TAP interface that cannot be opened.
 pub(super) fn tap(error: &std::io::Error, step: TapStep, name: &str) -> String {
     // A device file without its module: ENODEV has no kind of its own.
-    let missing = error.kind() == ErrorKind::NotFound || error.raw_os_error() == Some(libc::ENODEV);
+    let no_module = rustix::io::Errno::NODEV.raw_os_error();
+    let missing = error.kind() == ErrorKind::NotFound || error.raw_os_error() == Some(no_module);
     match (step, error.kind()) {
         (TapStep::Open, _) if missing => "load the module: `modprobe tun`".to_owned(),
         (TapStep::Open, _) => "give this user access to /dev/net/tun (docs/eoe.md)".to_owned(),
