@@ -377,6 +377,7 @@ impl Axis {
             power,
             reset_fault: self.reset,
             hold: !self.mode_confirmed(),
+            quick_stop_ends: self.config.quick_stop_ends,
             without_transition_16: self.config.quick_stop.is_some_and(|option| !option.stays()),
         };
         // While frames are lost, timers of the drive's state and of reset pulses stand still.

@@ -13,6 +13,8 @@
 //! | fault reset | 0, and the procedure command S-0-0099 | clears errors of class 1 |
 //!
 //! S-0-0135 does not distinguish the states before "Operation enabled". The last command decides.
+//! A status word is at least one cycle old, and a brake takes time to close: torque after "drive on"
+//! has ended is "Quick stop active", whatever the command, until the drive has no torque.
 
 use crate::cia402::Statusword;
 
@@ -76,6 +78,8 @@ pub struct SercosWords {
     /// Bit 7 of the last Controlword.
     reset: bool,
     sync: bool,
+    /// "Drive on" has ended, and the drive has had torque since.
+    stopping: bool,
     /// The drive has bit 3 of S-0-0135.
     follows_bit: bool,
 }
@@ -89,11 +93,13 @@ impl SercosWords {
             order: Order::DisableVoltage,
             reset: false,
             sync: false,
+            stopping: false,
             follows_bit,
         }
     }
 
-    const fn statusword(self, word: u16) -> u16 {
+    const fn statusword(&mut self, word: u16) -> u16 {
+        self.stopping &= word >> 14 == 3;
         let follows = !self.follows_bit || word & FOLLOWS != 0;
         let state = match (word & SHUT_DOWN != 0, word >> 14) {
             // Fault reaction active.
@@ -112,6 +118,7 @@ impl SercosWords {
             // Torque: Quick stop active, or Operation enabled.
             (false, _) => match self.order {
                 Order::QuickStop => 0x0007,
+                _ if self.stopping => 0x0007,
                 _ if follows => 0x0027 | Statusword::FOLLOWS_COMMAND.bits(),
                 _ => 0x0027,
             },
@@ -137,6 +144,9 @@ impl SercosWords {
         let reset = controlword & FAULT_RESET != 0;
         let reset_rose = reset && !self.reset;
         let sync = !self.sync;
+        let ended = matches!(self.order, Order::EnableOperation | Order::QuickStop)
+            && !matches!(order, Order::EnableOperation);
+        self.stopping |= ended;
         self.order = order;
         self.reset = reset;
         self.sync = sync;
@@ -157,9 +167,9 @@ pub struct ControlOutput {
 }
 
 impl DriveWords {
-    /// Returns the Statusword for a word of the drive. RT: O(1).
+    /// Returns the Statusword for a word of the drive. Call it once per cycle. RT: O(1).
     #[must_use]
-    pub const fn statusword(&self, word: u16) -> u16 {
+    pub const fn statusword(&mut self, word: u16) -> u16 {
         match self {
             Self::Cia402 => word,
             Self::Sercos(words) => words.statusword(word),
@@ -183,7 +193,7 @@ mod tests {
     use super::*;
     use crate::cia402::{Controlword, State};
 
-    fn state(words: &DriveWords, raw: u16) -> State {
+    fn state(words: &mut DriveWords, raw: u16) -> State {
         State::from_statusword(Statusword::from_bits_retain(words.statusword(raw)))
     }
 
@@ -247,7 +257,7 @@ mod tests {
             for (command, expected) in commands.into_iter().zip(expected) {
                 let mut words = DriveWords::Sercos(SercosWords::new(true));
                 words.control(command.bits());
-                assert_eq!(state(&words, raw), expected, "{raw:#06x} {command}");
+                assert_eq!(state(&mut words, raw), expected, "{raw:#06x} {command}");
             }
         }
     }
@@ -256,14 +266,36 @@ mod tests {
     fn other_bits_of_the_status_word() {
         let mut words = DriveWords::Sercos(SercosWords::new(true));
         words.control(0x000f);
-        let status = |words: &DriveWords, raw| Statusword::from_bits_retain(words.statusword(raw));
-        assert!(status(&words, 0xc008).contains(Statusword::FOLLOWS_COMMAND));
-        assert!(!status(&words, 0xc000).contains(Statusword::FOLLOWS_COMMAND));
-        assert!(status(&words, 0xd000).contains(Statusword::WARNING));
-        assert!(!status(&words, 0x4000).contains(Statusword::VOLTAGE_ENABLED));
+        let status =
+            |words: &mut DriveWords, raw| Statusword::from_bits_retain(words.statusword(raw));
+        assert!(status(&mut words, 0xc008).contains(Statusword::FOLLOWS_COMMAND));
+        assert!(!status(&mut words, 0xc000).contains(Statusword::FOLLOWS_COMMAND));
+        assert!(status(&mut words, 0xd000).contains(Statusword::WARNING));
+        assert!(!status(&mut words, 0x4000).contains(Statusword::VOLTAGE_ENABLED));
         let mut without = DriveWords::Sercos(SercosWords::new(false));
         without.control(0x000f);
-        assert!(status(&without, 0xc000).contains(Statusword::FOLLOWS_COMMAND));
+        assert!(status(&mut without, 0xc000).contains(Statusword::FOLLOWS_COMMAND));
+    }
+
+    /// Torque after "drive on" stays a quick stop until the drive reports that it has none.
+    #[test]
+    fn torque_after_drive_on_is_a_quick_stop() {
+        use Controlword as C;
+        for end in [
+            C::QUICK_STOP_COMMAND,
+            C::SHUTDOWN_COMMAND,
+            C::DISABLE_VOLTAGE_COMMAND,
+        ] {
+            let mut words = DriveWords::Sercos(SercosWords::new(false));
+            words.control(C::ENABLE_OPERATION_COMMAND.bits());
+            assert_eq!(state(&mut words, 0xc000), State::OperationEnabled);
+            for order in [end, C::DISABLE_VOLTAGE_COMMAND, C::ENABLE_OPERATION_COMMAND] {
+                words.control(order.bits());
+                assert_eq!(state(&mut words, 0xc000), State::QuickStopActive, "{order}");
+            }
+            assert_ne!(state(&mut words, 0x8000), State::QuickStopActive);
+            assert_eq!(state(&mut words, 0xc000), State::OperationEnabled);
+        }
     }
 
     /// No word of a drive and no command panics, and only "drive on" with "enable" gives torque.
@@ -275,7 +307,7 @@ mod tests {
             assert_eq!(sent & ON != 0, word & 0x8f == 0x0f, "{word:#06x}");
             assert!(sent & ON == 0 || sent & ENABLE != 0);
             assert!(
-                !matches!(state(&words, word), State::Unknown(_)),
+                !matches!(state(&mut words, word), State::Unknown(_)),
                 "{word:#06x}"
             );
             assert_eq!(DriveWords::Cia402.control(word).word, word);

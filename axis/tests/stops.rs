@@ -388,3 +388,59 @@ fn late_reply_keeps_the_cycles_planned_without_an_answer() {
         position = target;
     }
 }
+
+/// A Sercos drive that keeps its torque for 300 ms after the quick stop, seen two cycles late:
+/// 0x6000 stays until the torque leaves, and "enable" waits for it. A drive that keeps its torque
+/// has no voltage after 2 s.
+#[test]
+fn a_quick_stop_of_a_sercos_drive_keeps_the_time_of_its_brake() {
+    use ecaxis_axis::{DriveWords, QuickStopOption, SercosWords};
+    for (hold, again) in [(300, false), (300, true), (usize::MAX, false)] {
+        let mut axis = Axis::new(AxisConfig {
+            quick_stop: Some(QuickStopOption(2)),
+            quick_stop_ends: true,
+            ..config(Mode::Csp)
+        })
+        .unwrap();
+        let mut words = DriveWords::Sercos(SercosWords::new(false));
+        let (mut late, mut torque, mut sent) = ([0x8000_u16; 2], 0_usize, Vec::new());
+        for n in 0..4000 {
+            match n {
+                0 => axis.command(Command::Enable).unwrap(),
+                100 => {
+                    assert!(axis.status().enabled);
+                    axis.stop_by(StopMethod::QuickStop);
+                }
+                // At standstill, in the first cycles after the request to remove the power.
+                260 if again => axis.command(Command::Enable).unwrap(),
+                _ => {}
+            }
+            let seen = words.statusword(late[0]);
+            let out = axis.step(&inputs(seen, 0, 8), DT);
+            let word = words.control(out.controlword).word & !0x0400;
+            torque = match word {
+                0xe000 => 1,
+                0x6000 if (1..hold).contains(&torque) => torque + 1,
+                _ => 0,
+            };
+            late = [late[1], if torque > 0 { 0xc000 } else { 0x8000 }];
+            if sent.last().is_none_or(|(last, _)| *last != word) {
+                sent.push((word, 0));
+            }
+            sent.last_mut().unwrap().1 += 1;
+            assert_eq!(axis.status().trip, None, "{n}");
+        }
+        let stopped = sent.iter().position(|(word, _)| *word == 0xe000).unwrap() + 1;
+        println!("{sent:04x?}");
+        let (word, cycles) = sent[stopped];
+        assert_eq!(word, 0x6000);
+        if hold == usize::MAX {
+            assert!((2000..2300).contains(&cycles), "{cycles}");
+        } else {
+            assert!(cycles >= hold, "{cycles}");
+        }
+        let last = if again { 0xe000 } else { 0x0000 };
+        assert_eq!(sent.last().unwrap().0, last);
+        assert_eq!(axis.status().enabled, again);
+    }
+}

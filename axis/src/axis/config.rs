@@ -41,6 +41,9 @@ pub struct AxisConfig {
     /// The drive's 0x605A, if known. Without transition 16 the axis is enabled again via Switch on
     /// disabled.
     pub quick_stop: Option<QuickStopOption>,
+    /// True if a quick stop of the drive ends without power and its brake must close in that time
+    /// (Sercos, S-0-0207). "Disable voltage" then follows at a time-out only.
+    pub quick_stop_ends: bool,
     /// Further supervision.
     pub supervision: Supervision,
     /// The holding brake.
@@ -84,6 +87,7 @@ impl AxisConfig {
             answers_late: 0,
             mode_time_s: 1.0,
             quick_stop: None,
+            quick_stop_ends: false,
             supervision: Supervision::default(),
             brake: Brake::default(),
             fault_reset: FaultReset::default(),

@@ -19,6 +19,9 @@ use crate::supervision::{FaultReset, StopMethod};
 const SETTLE_S: f64 = 0.1;
 /// After the time-out, an axis that has not slowed down for this long is not decelerating.
 const UNSLOWED_S: f64 = 1.0;
+/// A drive whose quick stop ends by itself has this time for its brake (S-0-0207); then its voltage
+/// is removed.
+const DRIVE_OFF_S: f64 = 2.0;
 /// A drive that still reports power this long after the request does not obey.
 const POWER_OFF_S: f64 = 3.0;
 /// After this time enabled without a fault, all automatic resets are available again.
@@ -171,6 +174,10 @@ impl Axis {
             (stop.slowest, stop.unslowed_s) = (speed, 0.0);
         }
         if stop.removing_power {
+            let late = stop.elapsed_s.min(stop.unslowed_s) > DRIVE_OFF_S;
+            if self.config.quick_stop_ends && !self.state.is_fault() && late {
+                stop.method = StopMethod::DisableVoltage;
+            }
             self.goal = PowerGoal::Stopping(stop);
             return;
         }

@@ -36,6 +36,9 @@ pub struct Request {
     pub reset_fault: bool,
     /// The drive's quick stop option code does not allow transition 16.
     pub without_transition_16: bool,
+    /// A quick stop of the drive ends without power: "disable voltage" would only cut the time of
+    /// its brake short.
+    pub quick_stop_ends: bool,
     /// Takes the drive only as far as Switched on.
     pub hold: bool,
 }
@@ -245,6 +248,9 @@ pub fn step_in(
     let mut word = controlword(state, request.power, waited_s);
     if request.hold && state == State::SwitchedOn && request.power == Power::Enabled {
         word = Controlword::SWITCH_ON_COMMAND;
+    }
+    if request.quick_stop_ends && state == State::QuickStopActive && request.power != Power::Off {
+        word = Controlword::QUICK_STOP_COMMAND;
     }
     if matches!(reset, FaultResetPulse::High { .. }) {
         word |= Controlword::FAULT_RESET_COMMAND;

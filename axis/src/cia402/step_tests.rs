@@ -284,6 +284,7 @@ fn no_word_gets_power_without_request() {
                     power,
                     reset_fault,
                     without_transition_16: bits & 1 == 0,
+                    quick_stop_ends: bits & 2 == 0,
                     hold: false,
                 };
                 let mut memory = PowerState::new();

@@ -47,7 +47,8 @@ pub(crate) fn setup(
     config.jerk_limited = raw.limits.jerk.is_some();
     config.loops = control::loops(raw, shown, selection, p)?;
     control::guards(raw, &mut config, &torque, shown, p)?;
-    config.quick_stop = match selection.is_some_and(|selection| selection.layout.idns) {
+    config.quick_stop_ends = selection.is_some_and(|selection| selection.layout.idns);
+    config.quick_stop = match config.quick_stop_ends {
         // A falling edge of "drive on" decelerates, then removes the torque.
         true => Some(QuickStopOption(2)),
         false => quick_stop(sdos, selection),

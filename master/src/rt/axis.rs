@@ -116,7 +116,7 @@ impl RtAxis {
         Ok(())
     }
 
-    pub(super) fn read(&self, image: &[u8], fresh: bool, late: bool) -> Inputs {
+    pub(super) fn read(&mut self, image: &[u8], fresh: bool, late: bool) -> Inputs {
         let bits = &self.bits;
         Inputs {
             statusword: self.words.statusword(bits.statusword.get(image) as u16),

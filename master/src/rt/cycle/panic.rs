@@ -2,11 +2,12 @@
 //!
 //! After the first panic the cycle continues and stops the machine as for any other cause. After a
 //! second panic the axis state is no longer trusted. The drives then receive "quick stop" in plain
-//! frames, and "disable voltage" once they stand still.
+//! frames, and "disable voltage" once they stand still. Sercos drives keep "quick stop" until they have
+//! no torque.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-use ecaxis_axis::{Controlword, State, Statusword};
+use ecaxis_axis::{Controlword, DriveWords, State, Statusword};
 
 use super::{Engine, Nanos};
 use crate::clock;
@@ -138,7 +139,9 @@ impl Engine {
                 _ => *rest = (position.unwrap_or(i64::MAX), now),
             }
             let stands = now.saturating_sub(rest.1) > STANDING && self.answer.inputs_fresh;
-            let word = if !powered || stands || over {
+            // A Sercos drive removes its torque itself, once its brake has closed.
+            let ends = matches!(slot.words, DriveWords::Sercos(_));
+            let word = if !powered || stands && !ends || over {
                 Controlword::DISABLE_VOLTAGE_COMMAND
             } else {
                 Controlword::QUICK_STOP_COMMAND
