@@ -397,3 +397,30 @@ fn torque_control_is_another_operation_mode() {
         "the other drive has no torque command"
     );
 }
+
+/// An IDN that follows from other keys would give the process data another meaning.
+#[test]
+fn derived_idns_and_a_missing_unit_are_refused() {
+    let text = with_program(MOVE);
+    let refused = |from: &str, to: &str, parts: &[&str]| {
+        assert!(text.contains(from));
+        let path = root().join("configs/sercos.toml");
+        let text = text.replacen(from, to, 1);
+        let error = ecaxis_master::config::parse(&path, &text).expect_err(to);
+        assert_contains(&error.to_string(), parts);
+    };
+    for (idn, from) in [
+        ("S-0-0032", "`mode`"),
+        ("S-0-0024", "`pdo.rx`"),
+        ("S-0-0002", "`bus.cycle`"),
+        ("S-0-0134", "the cycle"),
+    ] {
+        let own = format!("\"{idn}\"");
+        refused("\"S-0-0091\"", &own, &[idn, from, "remove it"]);
+    }
+    refused(
+        "velocity_unit = \"mrpm\"",
+        "",
+        &["S-0-0044", "velocity_unit"],
+    );
+}

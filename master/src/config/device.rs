@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
+use ecaxis_ecat::mailbox::soe::Idn;
 use ecaxis_esi as esi;
 use ecaxis_esi::{Field, Layout};
 use toml::Spanned;
@@ -407,7 +408,7 @@ impl DeviceQuery<'_> {
                 p.add_hint(raw.span.clone(), message, "write objects with `sdo`");
                 return None;
             }
-            let Ok(idn) = raw.idn.get_ref().parse() else {
+            let Ok(idn) = raw.idn.get_ref().parse::<Idn>() else {
                 let message = format!("`{}` is not an IDN", raw.idn.get_ref());
                 p.add_hint(
                     raw.idn.span(),
@@ -416,6 +417,21 @@ impl DeviceQuery<'_> {
                 );
                 return None;
             };
+            let derived = match idn {
+                Idn::CONTROL_CYCLE | Idn::COMMUNICATION_CYCLE => "`bus.cycle`",
+                Idn::OPERATION_MODE => "`mode`",
+                Idn::TELEGRAM_TYPE | Idn::AT_LIST | Idn::MDT_LIST => {
+                    "`mode`, `pdo.rx` and `pdo.tx`"
+                }
+                Idn::MASTER_CONTROL_WORD => "the cycle",
+                _ => "",
+            };
+            if !derived.is_empty() {
+                // Another value would give the process data another meaning.
+                let message = format!("`{idn}` follows from {derived}");
+                p.add_hint(raw.idn.span(), message, "remove it from `idn`");
+                return None;
+            }
             idns.push(esi::StartupIdn {
                 transition: "PS",
                 drive: raw.drive.value().unwrap_or(0),
