@@ -356,7 +356,7 @@ fn tap_hints_name_the_step() {
         (TapStep::SwitchOn, libc::EPERM, "ip link set ecat0 up"),
     ] {
         let error = std::io::Error::from_raw_os_error(code);
-        let hint = super::service::tap(&error, step, "ecat0");
+        let hint = tap(&error, step, "ecat0");
         assert!(hint.contains(part), "{step} {code}: {hint}");
     }
 }

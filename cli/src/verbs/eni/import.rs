@@ -88,7 +88,7 @@ pub(crate) fn machine_of(path: &Path, esi: Option<&Path>) -> Result<Option<Machi
     Ok(imported.map(|(machine, _)| machine))
 }
 
-/// Returns the machine of an ENI file as [`eni::import`] does, with the text of its machine file;
+/// Returns the machine of an ENI file as `eni::import` does, with the text of its machine file;
 /// `None` if the file is not XML.
 pub(crate) fn expected(
     path: &Path,
