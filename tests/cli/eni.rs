@@ -299,6 +299,8 @@ fn scan_writes_the_machine_of_an_eni() {
     program::run(["run", &machine, "--sim", "--virtual", "--for", "200ms"]).exits(0);
     scan("configs/demo.toml", &["--eni", &bus]).fails(2, &["is there already"]);
     scan("configs/demo.toml", &["--force", "--eni", &machine]).fails(2, &["is not an ENI file"]);
+    let missing = path("missing.xml");
+    scan("configs/demo.toml", &["--force", "--eni", &missing]).fails(2, &["cannot read"]);
 }
 
 /// The machine of a foreign ENI runs on the simulated bus.

@@ -141,7 +141,10 @@ impl Args {
         match verbs::eni::expected(eni, self.esi.as_deref(), path, nic)? {
             Some((machine, text)) => Ok(Some((eni, machine, text))),
             None => {
-                let message = format!("{} is not an ENI file", eni.display());
+                let message = match std::fs::metadata(eni) {
+                    Ok(_) => format!("{} is not an ENI file", eni.display()),
+                    Err(error) => format!("cannot read {}: {error}", eni.display()),
+                };
                 Err(Failure::new(hints::WRONG, message)
                     .hint("name the XML file of the configuration tool"))
             }
