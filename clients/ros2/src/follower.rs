@@ -84,6 +84,10 @@ pub enum Refusal {
 }
 
 #[derive(Debug, Clone)]
+#[allow(
+    clippy::large_enum_variant,
+    reason = "nothing is allocated in the cycle, and each axis has one source"
+)]
 enum Source {
     Free,
     Position {
