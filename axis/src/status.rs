@@ -365,6 +365,9 @@ pub enum CommandError {
     /// The axis follows a gear, stream or other source.
     #[error("the axis follows something else; stop it first")]
     Following,
+    /// A touch probe waits for the edge that stops the axis.
+    #[error("a touch probe is to stop the axis; wait for its edge")]
+    Probing,
     /// A parameter is not finite.
     #[error("{what} is {value}: not a finite number")]
     NotFinite {

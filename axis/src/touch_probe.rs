@@ -144,6 +144,12 @@ impl Probes {
         }
     }
 
+    /// True while an edge would stop the axis.
+    pub fn may_stop(&self) -> bool {
+        let waits = |one: &ProbeChannel| !matches!(one.phase, Phase::Off | Phase::Captured(_));
+        self.0.iter().any(|one| one.stop && waits(one))
+    }
+
     /// Runs one fresh cycle. `status`: 0x60B9. `position`: returns 0x60BA, 0x60BB, 0x60BC or 0x60BD
     /// (index 0 to 3) in user units. Returns true at a new edge that is to stop the axis.
     pub fn step(&mut self, status: u16, position: impl Fn(usize) -> Option<f64>) -> bool {

@@ -121,12 +121,16 @@ impl Axis {
     /// Returns the motion in progress as a source, for a motion on top of it.
     ///
     /// # Errors
-    /// Fails if the axis commands no position, or may not move.
+    /// Fails if the axis commands no position, may not move, follows external set-points, or if a
+    /// probe is to stop it: external set-points would go on after the edge.
     pub fn source(&self) -> Result<Source, CommandError> {
         self.check_control("a superimposed move", Mode::Csp, |c, _| {
             c == ControlledQuantity::Position
         })?;
         self.check_ready()?;
+        if self.probes.may_stop() {
+            return Err(CommandError::Probing);
+        }
         let limits = &self.config.limits;
         Ok(match self.plan {
             Plan::Jerk(source) => Source::JerkLimited(source),
@@ -143,9 +147,10 @@ impl Axis {
                 };
                 Source::JerkLimited(JerkLimited::new(request, self.motion, self.dt_s)?)
             }
-            _ => Source::Hold(Hold {
-                acceleration: limits.acceleration,
-            }),
+            Plan::Hold(hold) => Source::Hold(hold),
+            Plan::Torque(_) | Plan::DriveProfile | Plan::External => {
+                return Err(CommandError::Following);
+            }
         })
     }
 
