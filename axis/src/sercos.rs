@@ -31,6 +31,8 @@ const SYNC: u16 = 1 << 10;
 const SHUT_DOWN: u16 = 1 << 13;
 /// The diagnostics of class 2, warnings, have changed.
 const WARNING_CHANGED: u16 = 1 << 12;
+/// The operation mode that is active; 0 is the primary one (S-0-0032).
+const MODE: u16 = 7 << 8;
 /// The drive follows its command values.
 const FOLLOWS: u16 = 1 << 3;
 
@@ -100,7 +102,7 @@ impl SercosWords {
 
     const fn statusword(&mut self, word: u16) -> u16 {
         self.stopping &= word >> 14 == 3;
-        let follows = !self.follows_bit || word & FOLLOWS != 0;
+        let follows = word & MODE == 0 && (!self.follows_bit || word & FOLLOWS != 0);
         let state = match (word & SHUT_DOWN != 0, word >> 14) {
             // Fault reaction active.
             (true, 3) => 0x000f,
@@ -184,6 +186,13 @@ impl DriveWords {
                 reset: false,
             },
             Self::Sercos(words) => words.control(controlword),
+        }
+    }
+
+    /// Takes back the last word, which was never sent: its successor replaces it. RT: O(1).
+    pub const fn take_back(&mut self) {
+        if let Self::Sercos(words) = self {
+            words.sync = !words.sync;
         }
     }
 }
@@ -270,6 +279,11 @@ mod tests {
             |words: &mut DriveWords, raw| Statusword::from_bits_retain(words.statusword(raw));
         assert!(status(&mut words, 0xc008).contains(Statusword::FOLLOWS_COMMAND));
         assert!(!status(&mut words, 0xc000).contains(Statusword::FOLLOWS_COMMAND));
+        // Another operation mode is active.
+        for mode in 1..8 {
+            let raw = 0xc008 | mode << 8;
+            assert!(!status(&mut words, raw).contains(Statusword::FOLLOWS_COMMAND));
+        }
         assert!(status(&mut words, 0xd000).contains(Statusword::WARNING));
         assert!(!status(&mut words, 0x4000).contains(Statusword::VOLTAGE_ENABLED));
         let mut without = DriveWords::Sercos(SercosWords::new(false));
@@ -296,6 +310,18 @@ mod tests {
             assert_ne!(state(&mut words, 0x8000), State::QuickStopActive);
             assert_eq!(state(&mut words, 0xc000), State::OperationEnabled);
         }
+    }
+
+    /// A word that replaces one that was not sent has the same toggle bit.
+    #[test]
+    fn a_replaced_word_toggles_once() {
+        let mut words = DriveWords::Sercos(SercosWords::new(true));
+        let sent = words.control(0x000f).word;
+        let staged = words.control(0x000f).word;
+        words.take_back();
+        let replaced = words.control(0x0002).word;
+        assert_eq!((sent ^ staged) & SYNC, SYNC);
+        assert_eq!((staged ^ replaced) & SYNC, 0);
     }
 
     /// No word of a drive and no command panics, and only "drive on" with "enable" gives torque.

@@ -444,3 +444,105 @@ fn a_quick_stop_of_a_sercos_drive_keeps_the_time_of_its_brake() {
         assert_eq!(axis.status().enabled, again);
     }
 }
+
+/// "Disable voltage" reaches a Sercos drive in every phase of its reaction to a fault, and an axis
+/// whose power is already being removed.
+#[test]
+fn disable_voltage_is_the_hardest_stop_at_any_time() {
+    use ecaxis_axis::{DriveWords, SercosWords};
+    for (method, at) in [
+        (None, 150),
+        (None, 151),
+        (None, 160),
+        (Some(StopMethod::Ramp), 102),
+        (Some(StopMethod::Ramp), 300),
+        (Some(StopMethod::QuickStop), 102),
+        (Some(StopMethod::QuickStop), 300),
+    ] {
+        let mut axis = Axis::new(AxisConfig {
+            quick_stop_ends: true,
+            ..config(Mode::Csp)
+        })
+        .unwrap();
+        let mut words = DriveWords::Sercos(SercosWords::new(false));
+        let mut raw = 0x8000;
+        for n in 0..600 {
+            match n {
+                0 => axis.command(Command::Enable).unwrap(),
+                100 => {
+                    assert!(axis.status().enabled);
+                    if let Some(method) = method {
+                        axis.stop_by(method);
+                    }
+                }
+                _ => {}
+            }
+            if n == at {
+                axis.stop_by(StopMethod::DisableVoltage);
+            }
+            let seen = words.statusword(raw);
+            let out = axis.step(&inputs(seen, 0, 8), DT);
+            let word = words.control(out.controlword).word & !0x0400;
+            // The drive keeps its torque as long as it is enabled; at 150 it reacts to a fault.
+            let torque = raw & 0xc000 == 0xc000;
+            raw = match word {
+                0xe000 => 0xc000,
+                0x6000 if torque => raw & 0xe000,
+                _ => 0x8000 | raw & 0x2000,
+            };
+            if method.is_none() && n >= 149 {
+                raw |= 0x2000;
+            }
+            if n >= at {
+                assert_eq!(word, 0, "{method:?} {at} {n}");
+            } else if method.is_none() && n > 150 {
+                assert_eq!(word, 0x6000, "{method:?} {at} {n}");
+            }
+        }
+    }
+}
+
+/// A move cannot be superimposed on what the axis does not plan, nor on a move to a probe.
+#[test]
+fn only_own_motions_have_a_source() {
+    use ecaxis_axis::{Edge, Probe, Source};
+    let mut axis = Axis::new(config(Mode::Csp)).unwrap();
+    let drive = |axis: &mut Axis| {
+        axis.step(
+            &Inputs {
+                touch_probe_status: Some(1),
+                ..inputs(0x1237, 0, 8)
+            },
+            DT,
+        )
+    };
+    assert!(matches!(
+        axis.source(),
+        Err(CommandError::NotEnabled { .. })
+    ));
+    axis.command(Command::Enable).unwrap();
+    drive(&mut axis);
+    drive(&mut axis);
+    assert!(axis.status().enabled, "{:?}", axis.status());
+    assert!(axis.source().is_ok());
+    axis.set_point(0.0).unwrap();
+    assert_eq!(axis.source(), Err(CommandError::Following));
+    drive(&mut axis);
+    drive(&mut axis);
+    assert!(axis.source().is_ok());
+    for stop in [false, true] {
+        axis.command(Command::ArmProbe {
+            probe: Probe::First,
+            edge: Edge::Positive,
+            source: Source::Input,
+            stop,
+        })
+        .unwrap();
+        assert_eq!(axis.source().is_err(), stop);
+    }
+    axis.command(Command::DisarmProbe {
+        probe: Probe::First,
+    })
+    .unwrap();
+    assert!(axis.source().is_ok());
+}

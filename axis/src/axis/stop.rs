@@ -104,7 +104,11 @@ impl Axis {
         };
         match &mut self.goal {
             PowerGoal::Off => return,
-            PowerGoal::Stopping(stop) if stop.removing_power || stop.method >= method => {
+            // While the power is removed, only its immediate removal is harder.
+            PowerGoal::Stopping(stop)
+                if stop.method >= method
+                    || stop.removing_power && method != StopMethod::DisableVoltage =>
+            {
                 stop.stays &= stays;
                 return;
             }
@@ -232,8 +236,13 @@ impl Axis {
         }
     }
 
-    /// Handles a fault of the drive: its fault reaction brakes, and it removes the power itself.
+    /// Handles a fault of the drive: its fault reaction brakes, and it removes the power itself. An
+    /// immediate removal of the power goes on.
     pub(super) fn stop_by_fault(&mut self) {
+        if matches!(self.goal, PowerGoal::Stopping(stop) if stop.method == StopMethod::DisableVoltage)
+        {
+            return;
+        }
         self.goal = if self.state.has_power() {
             let stop = self.new_stop(StopMethod::QuickStop);
             PowerGoal::Stopping(Stop {

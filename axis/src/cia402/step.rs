@@ -37,7 +37,7 @@ pub struct Request {
     /// The drive's quick stop option code does not allow transition 16.
     pub without_transition_16: bool,
     /// A quick stop of the drive ends without power: "disable voltage" would only cut the time of
-    /// its brake short.
+    /// its brake short. In its fault reaction the drive obeys "disable voltage".
     pub quick_stop_ends: bool,
     /// Takes the drive only as far as Switched on.
     pub hold: bool,
@@ -249,8 +249,14 @@ pub fn step_in(
     if request.hold && state == State::SwitchedOn && request.power == Power::Enabled {
         word = Controlword::SWITCH_ON_COMMAND;
     }
-    if request.quick_stop_ends && state == State::QuickStopActive && request.power != Power::Off {
-        word = Controlword::QUICK_STOP_COMMAND;
+    if request.quick_stop_ends {
+        word = match (state, request.power) {
+            (State::FaultReactionActive, Power::Off) => Controlword::DISABLE_VOLTAGE_COMMAND,
+            (State::QuickStopActive, power) if power != Power::Off => {
+                Controlword::QUICK_STOP_COMMAND
+            }
+            _ => word,
+        };
     }
     if matches!(reset, FaultResetPulse::High { .. }) {
         word |= Controlword::FAULT_RESET_COMMAND;

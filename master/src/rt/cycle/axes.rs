@@ -57,6 +57,7 @@ impl Engine {
         let skipped = u32::try_from(silent - 1).unwrap_or(u32::MAX);
         for slot in &mut self.axes {
             let outputs = slot.axis.skipped(skipped / slot.cycles.max(1));
+            slot.words.take_back();
             slot.write(self.exchange.outputs_mut(), &outputs);
         }
         self.exchange.refresh_outputs();
