@@ -1,6 +1,7 @@
 //! Sercos drives outside the cycle: the reset of their errors (S-0-0099), and what they say about a
 //! failure.
 
+use std::collections::VecDeque;
 use std::sync::mpsc::Sender;
 use std::time::Duration;
 
@@ -83,7 +84,7 @@ impl Supervisor {
 
     pub(super) fn request_reset(&self, axis: AxisIndex) {
         if let Some(queue) = &self.resets {
-            // A full queue contains a request of this axis already.
+            // A full queue contains a request of each axis already.
             let _ = queue.requests.try_send(axis);
         }
     }
@@ -93,18 +94,41 @@ impl ResetTask {
     /// Executes S-0-0099 for each request. A failure is a warning: the axis reports that its fault
     /// stays.
     pub(super) async fn run(mut self) {
-        while let Some(axis) = self.requests.recv().await {
-            let Some((device, drive)) = drive_of(&self.machine, axis) else {
-                continue;
+        let mut waiting = VecDeque::new();
+        loop {
+            let axis = match waiting.pop_front() {
+                Some(axis) => axis,
+                None => match self.requests.recv().await {
+                    Some(axis) => axis,
+                    None => return,
+                },
             };
-            let Some(mailbox) = self.mailboxes.urgent(device) else {
-                continue;
-            };
-            let reset = (drive, Idn::RESET_CLASS_1);
-            if let Err(error) = mailbox.execute_command(reset, RESET_TIMEOUT).await {
-                let warning = format!("the reset of a Sercos drive failed: {error}");
-                let _ = self.progress.send(Progress::Warning(warning));
+            self.execute(axis).await;
+            // A request during the command belongs to the same reset: an axis sends several pulses.
+            while let Ok(other) = self.requests.try_recv() {
+                if other != axis && !waiting.contains(&other) {
+                    waiting.push_back(other);
+                }
             }
         }
+    }
+
+    async fn execute(&self, axis: AxisIndex) {
+        let Some((device, drive)) = drive_of(&self.machine, axis) else {
+            return;
+        };
+        let Some(mailbox) = self.mailboxes.urgent(device) else {
+            return;
+        };
+        let reset = mailbox.execute_command((drive, Idn::RESET_CLASS_1), RESET_TIMEOUT);
+        // A silent device must not delay the resets of others for longer.
+        let failed = match clock::timeout(RESET_TIMEOUT, reset).await {
+            Some(Ok(())) => return,
+            Some(Err(error)) => error.to_string(),
+            None => "the drive does not answer".to_owned(),
+        };
+        let name = &self.machine.axes[axis].name;
+        let warning = format!("`{name}`: the reset of its Sercos drive failed: {failed}");
+        let _ = self.progress.send(Progress::Warning(warning));
     }
 }
