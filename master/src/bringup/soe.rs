@@ -1,6 +1,6 @@
 //! The start-up IDNs of a Sercos drive (SoE).
 
-use ecaxis_ecat::mailbox::soe::{Attribute, DataLength, Element, List, parse_value};
+use ecaxis_ecat::mailbox::soe::{Attribute, DataLength, Element, Idn, List, parse_value};
 use ecaxis_esi::{IdnValue, StartupIdn};
 
 use super::device::StartupPhase;
@@ -56,7 +56,10 @@ async fn write(
     let at = IdnElement::value(idn.drive, idn.idn);
     let failed = |source: SdoError| failure(device, idn, at, source);
     let (value, is_list) = match &idn.value {
-        IdnValue::Bytes(bytes) => (bytes.clone(), false),
+        IdnValue::Bytes(bytes) => {
+            let is_list = matches!(idn.idn, Idn::AT_LIST | Idn::MDT_LIST);
+            (bytes.clone(), is_list)
+        }
         IdnValue::Text(text) => {
             let attribute = client.read_idn(wire, at.with(Element::Attribute)).await;
             let attribute = attribute.map_err(failed)?;
@@ -102,7 +105,7 @@ fn holds(value: &[u8], now: &[u8], is_list: bool) -> bool {
         (Some(a), Some(b)) => a.data == b.data,
         _ => false,
     };
-    value == now || is_list && same_list() || value.len() > List::HEADER && same_list()
+    value == now || is_list && same_list()
 }
 
 fn failure(device: &DeviceRef, idn: &StartupIdn, at: IdnElement, source: SdoError) -> Error {
