@@ -22,6 +22,7 @@ mod condition;
 mod eoe;
 mod number;
 mod path;
+mod server;
 mod startup;
 mod step;
 
@@ -32,6 +33,7 @@ pub(crate) use condition::{Conditions, Levels, NamedValues, RawCondition, RawSig
 pub(crate) use eoe::{RawDeviceEoe, RawEoe};
 pub(crate) use number::{RawNumber, RawVariable};
 pub(crate) use path::{RawPath, RawPoint};
+pub(crate) use server::{RawMailboxGateway, RawServer};
 pub(crate) use startup::{RawIdn, RawStartup};
 pub(crate) use step::{Named, RawAction, RawAxes, RawGear, RawProbe, RawStep, RawWave, TimeLimit};
 
@@ -537,26 +539,6 @@ table! { "[override]",
         zero: Key<f64>,
         /// Value of the input at 100 % (number, required with `input`)
         full: Key<f64>,
-    }
-}
-
-table! { "[server]",
-    table RawServer {
-        /// Cycles without a new set-point of a real-time client, after which its axes stop (1 to
-        /// 1000; default 10)
-        stale_cycles: Key<u32> [1..=1000],
-        /// The longest silence of the owner, unless it asks for another (time, 100 ms to 60 s;
-        /// default `"500ms"`)
-        lease: Key<Ns> [100 * MS..=60 * S],
-    }
-}
-
-table! { "[mailbox_gateway]",
-    table RawMailboxGateway {
-        /// IP address and port of UDP and TCP (text; default `"127.0.0.1:34980"`)
-        bind: Key<String>,
-        /// Clients may write objects and files (`true`, `false`; default `false`)
-        write: Key<bool>,
     }
 }
 
