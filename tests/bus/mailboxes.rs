@@ -198,8 +198,16 @@ impl Drop for EndsTheRun {
     }
 }
 
-/// Runs a machine with this number of axes at rest until the user is done, at most one hour.
+/// Runs a machine with this number of axes at rest until the user is done.
 fn with_user<F>(axis_count: usize, options: Options, user: F) -> (Outcome, Heard)
+where
+    F: AsyncFnOnce(Mailboxes) + Send + 'static,
+{
+    with_user_of(machine(&axes(axis_count)), options, user)
+}
+
+/// Runs a machine at rest until the user is done, at most one hour.
+pub(crate) fn with_user_of<F>(machine: Machine, options: Options, user: F) -> (Outcome, Heard)
 where
     F: AsyncFnOnce(Mailboxes) + Send + 'static,
 {
@@ -215,7 +223,7 @@ where
         enable: false,
         ..options
     };
-    let outcome = session::run(machine(&axes(axis_count)), options, stop, &mut observer);
+    let outcome = session::run(machine, options, stop, &mut observer);
     let thread = observer.thread.expect("the user was asked");
     thread.join().expect("the user's expectations hold");
     (outcome, observer.heard)

@@ -1,78 +1,40 @@
 //! IDNs of a Sercos drive during operation and at start-up.
 
 use std::fmt::Write as _;
-use std::sync::Arc;
 use std::time::Duration;
 
 use ecaxis_ecat::mailbox::soe::{
     Attribute, ERROR_CODES, Element, Idn, List, Message, format_value,
 };
-use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::mailbox::{IdnElement, MailboxError, Mailboxes};
-use ecaxis_master::session::{self, Observer, Options, Progress};
+use ecaxis_master::session::Options;
 use ecaxis_test_support::recordings::{FPRD, FPWR, frames};
 use ecaxis_test_support::{
     Heard, assert_contains, faults, load, recorded, run_badly, run_well, skip, virtual_time,
 };
 
-/// Gives the mailboxes to a user on another thread and ends the run when the user is done.
-struct WithUser<F> {
-    user: Option<F>,
-    stop: Arc<CancelToken>,
-    thread: Option<std::thread::JoinHandle<()>>,
-    heard: Heard,
-}
-
-impl<F> Observer for WithUser<F>
-where
-    F: AsyncFnOnce(Mailboxes) + Send + 'static,
-{
-    fn progress(&mut self, progress: &Progress) {
-        self.heard.progress(progress);
-        if let Progress::Mailboxes(mailboxes) = progress
-            && let Some(user) = self.user.take()
-        {
-            let (mailboxes, stop) = (mailboxes.clone(), Arc::clone(&self.stop));
-            self.thread = Some(std::thread::spawn(move || {
-                let runtime = tokio::runtime::Builder::new_current_thread();
-                let runtime = { runtime }.build().expect("a runtime");
-                let _ended = EndsTheRun(stop);
-                runtime.block_on(user(mailboxes));
-            }));
-        }
-    }
-}
-
-struct EndsTheRun(Arc<CancelToken>);
-
-impl Drop for EndsTheRun {
-    fn drop(&mut self) {
-        self.0.cancel();
-    }
-}
+use crate::mailboxes::with_user_of;
 
 /// Runs the sample machine at rest until the user is done.
 fn with_user<F>(options: Options, user: F) -> Heard
 where
     F: AsyncFnOnce(Mailboxes) + Send + 'static,
 {
-    let stop = Arc::<CancelToken>::default();
-    let mut observer = WithUser {
-        user: Some(user),
-        stop: Arc::clone(&stop),
-        thread: None,
-        heard: Heard::default(),
-    };
-    let options = Options {
-        limit: Some(3_600_000_000_000),
-        enable: false,
-        ..options
-    };
-    let outcome = session::run(load("sercos.toml"), options, stop, &mut observer);
-    let thread = observer.thread.expect("the user was asked");
-    thread.join().expect("the user's expectations hold");
+    let (outcome, heard) = with_user_of(load("sercos.toml"), options, user);
     outcome.result.expect("an undisturbed run");
-    observer.heard
+    heard
+}
+
+/// Returns the value of a list of numbers.
+fn list_of(numbers: impl Iterator<Item = i32>) -> Vec<u8> {
+    let data: Vec<u8> = numbers.flat_map(i32::to_le_bytes).collect();
+    let max = u16::try_from(data.len()).expect("short");
+    [&List { max, data: &data }.header()[..], &data].concat()
+}
+
+/// Returns the elements of a list.
+fn data(list: &[u8]) -> &[u8] {
+    List::parse(list).expect("a list").data
 }
 
 fn code(result: Result<impl std::fmt::Debug, MailboxError>) -> u16 {
@@ -88,24 +50,12 @@ fn idns_are_read_and_written_during_operation() {
         let mailbox = mailboxes.device("sercos").expect("it is there");
         let at = |idn: &str| IdnElement::value(1, idn.parse().expect("an IDN"));
         // A list of 1,024 numbers, in fragments both ways.
-        let numbers: Vec<u8> = (0..1024_i32)
-            .flat_map(|n| (n * n - 7).to_le_bytes())
-            .collect();
-        let max = u16::try_from(numbers.len()).expect("short");
-        let list = [
-            &List {
-                max,
-                data: &numbers,
-            }
-            .header()[..],
-            &numbers,
-        ]
-        .concat();
+        let list = list_of((0..1024).map(|n| n * n - 7));
         let table = at("P-0-0100");
         for _ in 0..3 {
             mailbox.write_idn(table, &list).await.expect("written");
             let read = mailbox.read_idn(table).await.expect("read");
-            assert_eq!(List::parse(&read).expect("a list").data, numbers);
+            assert_eq!(data(&read), data(&list));
         }
         let attribute = mailbox
             .read_idn(table.with(Element::Attribute))
@@ -121,9 +71,7 @@ fn idns_are_read_and_written_during_operation() {
             "{text}"
         );
         // One more element than the drive holds.
-        let longer = [&numbers[..], &[0; 4]].concat();
-        let max = max + 4;
-        let longer = [&List { max, data: &longer }.header()[..], &longer].concat();
+        let longer = list_of(0..1025);
         assert_eq!(code(mailbox.write_idn(table, &longer).await), 0x7003);
         // The start-up IDNs have set both drives: 1 ms, position control, 1500.000 rpm.
         for drive in 0..2 {
@@ -183,22 +131,10 @@ fn lists_survive_lost_frames() {
         let mailbox = mailboxes.device("sercos").expect("it is there");
         let table = IdnElement::value(0, Idn::product(100));
         for round in 0..20_i32 {
-            let numbers: Vec<u8> = (0..1000_i32)
-                .flat_map(|n| (n ^ round).to_le_bytes())
-                .collect();
-            let max = u16::try_from(numbers.len()).expect("short");
-            let list = [
-                &List {
-                    max,
-                    data: &numbers,
-                }
-                .header()[..],
-                &numbers,
-            ]
-            .concat();
+            let list = list_of((0..1000).map(|n| n ^ round));
             mailbox.write_idn(table, &list).await.expect("written");
             let read = mailbox.read_idn(table).await.expect("read");
-            assert_eq!(List::parse(&read).expect("a list").data, numbers);
+            assert_eq!(data(&read), data(&list));
         }
     });
 }
