@@ -112,8 +112,8 @@ const KINDS: [Kind; 10] = [
     ),
     kind(
         "velocity",
-        "[[step]]\nvelocity = { x = 8.0 }\n[[step]]\nwait = { x.position = { above = 8.0 } }\ntimeout = \"none\"\n[[step]]\nvelocity = { x = -8.0 }\n[[step]]\nwait = { x.position = { below = 4.0 } }\ntimeout = \"none\"\n[[step]]\nstop = [\"x\"]\n[[step]]\nmove = { x = 0.0 }\n",
-        false,
+        "[[step]]\nvelocity = { x = 8.0 }\n[[step]]\nwait = { x.position = { above = 8.0 } }\ntimeout = \"none\"\n[[step]]\nvelocity = { x = -8.0 }\n[[step]]\nwait = { x.position = { below = 4.0 } }\ntimeout = \"none\"\n[[step]]\nvelocity = { x = 0.0 }\n[[step]]\nmove = { x = 0.0 }\n",
+        true,
         [0.0, 0.0, 0.0],
     ),
 ];

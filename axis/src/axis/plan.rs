@@ -245,7 +245,7 @@ impl Axis {
                 };
                 self.motion = trapezoid.advance(before, dt_s);
             }
-            Plan::Velocity(ramp) => self.motion = self.run(self.at_rate(ramp), before, dt_s),
+            Plan::Velocity(ramp) => self.motion = self.run(ramp, before, dt_s),
             Plan::Torque(ramp) => {
                 let before = self.loop_state.limited_torque();
                 self.loop_state.torque = ramp.advance(self.loop_state.torque, dt_s);
@@ -327,15 +327,27 @@ impl Axis {
         self.rate == 0.0 && velocity != 0.0
     }
 
-    fn run(&mut self, ramp: Ramp, before: Motion, dt_s: f64) -> Motion {
+    fn run(&mut self, nominal: Ramp, before: Motion, dt_s: f64) -> Motion {
         let [lowest, highest] = self.allowed_by_range();
-        let asked = ramp.advance(before.velocity, dt_s);
+        let limits = self.config.limits;
+        let ramp = self.at_rate(nominal);
+        // In CSV the target 0 is also the stop, which is not slower for the jerk.
+        let commands_position = self.controlled_quantity() == ControlledQuantity::Position;
+        let smooth = self.config.jerk_limited && (commands_position || nominal.target != 0.0);
+        let asked = if smooth {
+            let (velocity, acceleration) = (before.velocity, before.acceleration);
+            let asked = ramp.advance_smoothly(velocity, acceleration, limits.jerk(), dt_s);
+            // A motion taken over with a steep slope would pass the limit.
+            bounded(asked, limits.velocity)
+        } else {
+            ramp.advance(before.velocity, dt_s)
+        };
         // Braking at the end of the range may be steeper than the requested ramp.
         let wanted = asked.min(highest).max(lowest);
         self.held_by_range = wanted != asked || ramp.target > highest || ramp.target < lowest;
         let steepest = Ramp {
             target: wanted,
-            slope: self.config.limits.acceleration,
+            slope: limits.acceleration,
         };
         let velocity = steepest.advance(before.velocity, dt_s);
         before.then(before.position + velocity * dt_s, velocity, dt_s)
