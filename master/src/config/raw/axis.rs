@@ -159,7 +159,7 @@ table! { "`limits`",
         velocity: Key<f64> = "200.0",
         /// Also applies to stops; a stop may last an hour at most (above 0, unit/s²)
         acceleration: Key<f64> = "2000.0",
-        /// Applies to jerk-limited moves (above 0, unit/s³; default full acceleration in 50 ms)
+        /// Bounds lines, waves and paths; if written, also moves and velocities (above 0, unit/s³; default full acceleration in 50 ms)
         jerk: Key<f64>,
         /// (above 0, `torque_unit`; default rated torque)
         torque: Key<f64>,
