@@ -40,6 +40,7 @@ mod samples;
 mod several_axes;
 mod soe;
 mod soe_idns;
+mod soe_stops;
 mod states;
 mod superimpose;
 mod units;

@@ -18,27 +18,27 @@ use ecaxis_test_support::{
 const SERCOS: DeviceIndex = DeviceIndex(0);
 
 /// Returns the sample machine with another program.
-fn with_program(program: &str) -> String {
+pub(crate) fn with_program(program: &str) -> String {
     let text = std::fs::read_to_string(root().join("configs/sercos.toml")).expect("our file");
     let end = text.find("[[step]]").expect("a program");
     format!("{}{program}", &text[..end])
 }
 
-const MOVE: &str = "[[step]]\nmove = { x = 50.0, y = -50.0, z = 50.0 }\nspeed = 0.5\n";
+pub(crate) const MOVE: &str = "[[step]]\nmove = { x = 50.0, y = -50.0, z = 50.0 }\nspeed = 0.5\n";
 
 /// The words and values of one cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Cycle {
+pub(crate) struct Cycle {
     /// S-0-0134 of both drives, without the toggle bit.
-    control: [u16; 2],
+    pub(crate) control: [u16; 2],
     /// S-0-0047 of both drives.
-    command: [i32; 2],
+    pub(crate) command: [i32; 2],
     /// S-0-0135 of both drives.
-    status: [u16; 2],
+    pub(crate) status: [u16; 2],
     /// S-0-0051 of both drives.
-    feedback: [i32; 2],
+    pub(crate) feedback: [i32; 2],
     /// 0x6040 of the CiA 402 drive.
-    controlword: u16,
+    pub(crate) controlword: u16,
 }
 
 fn word(bytes: &[u8], at: usize) -> u16 {
@@ -51,7 +51,7 @@ fn number(bytes: &[u8], at: usize) -> i32 {
 
 /// Returns every cycle of a recording. MDT: word and command of each drive. AT: word, feedback and
 /// following distance of each drive.
-fn cycles(machine: &Machine, recording: &Path) -> Vec<Cycle> {
+pub(crate) fn cycles(machine: &Machine, recording: &Path) -> Vec<Cycle> {
     const TOGGLE: u16 = 1 << 10;
     let plan = image::of(&machine.rt_config()).expect("fits");
     // Devices are in the order of their positions.
@@ -80,7 +80,7 @@ fn cycles(machine: &Machine, recording: &Path) -> Vec<Cycle> {
 }
 
 /// Returns the different control words of a drive in order.
-fn words(cycles: &[Cycle], drive: usize) -> Vec<u16> {
+pub(crate) fn words(cycles: &[Cycle], drive: usize) -> Vec<u16> {
     let mut words: Vec<u16> = cycles.iter().map(|cycle| cycle.control[drive]).collect();
     words.dedup();
     words
