@@ -417,16 +417,7 @@ impl DeviceQuery<'_> {
                 );
                 return None;
             };
-            let derived = match idn {
-                Idn::CONTROL_CYCLE | Idn::COMMUNICATION_CYCLE => "`bus.cycle`",
-                Idn::OPERATION_MODE => "`mode`",
-                Idn::TELEGRAM_TYPE | Idn::AT_LIST | Idn::MDT_LIST => {
-                    "`mode`, `pdo.rx` and `pdo.tx`"
-                }
-                Idn::MASTER_CONTROL_WORD => "the cycle",
-                _ => "",
-            };
-            if !derived.is_empty() {
+            if let Some(derived) = keys_of_idn(idn) {
                 // Another value would give the process data another meaning.
                 let message = format!("`{idn}` follows from {derived}");
                 p.add_hint(raw.idn.span(), message, "remove it from `idn`");
@@ -507,5 +498,17 @@ impl DeviceQuery<'_> {
             ),
             _ => p.add(at, e.to_string()),
         }
+    }
+}
+
+/// Returns the keys from which the value of an IDN follows.
+#[must_use]
+pub fn keys_of_idn(idn: Idn) -> Option<&'static str> {
+    match idn {
+        Idn::CONTROL_CYCLE | Idn::COMMUNICATION_CYCLE => Some("`bus.cycle`"),
+        Idn::OPERATION_MODE => Some("`mode`"),
+        Idn::TELEGRAM_TYPE | Idn::AT_LIST | Idn::MDT_LIST => Some("`mode`, `pdo.rx` and `pdo.tx`"),
+        Idn::MASTER_CONTROL_WORD => Some("the cycle"),
+        _ => None,
     }
 }

@@ -90,6 +90,7 @@ pub(crate) use axis::is_maxon;
 pub use axis_setup::{AxisSetup, HomingSetup, TorqueSetup, TorqueUnit, UnitSource};
 pub use cam::NamedCam;
 pub use copy::{BitRange, CopySetup};
+pub use device::keys_of_idn;
 pub(crate) use device::unused_axis;
 pub use drive_limits::LimitConflict;
 pub use drive_units::{AdoptedUnits, UnitProblem};

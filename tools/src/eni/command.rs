@@ -182,23 +182,74 @@ const DOWNLOAD: u8 = 1;
 
 impl CoeCommand {
     pub fn to_element(&self) -> Element {
-        let mut element = Element::new("InitCmd");
+        let mut element = start(&self.transitions, &self.comment, self.timeout_ms);
         if self.complete_access {
             // Some readers know no other spelling of true.
             element = element.with_attribute("CompleteAccess", 1);
         }
-        for transition in &self.transitions {
-            element = element.with("Transition", transition);
-        }
         element
-            .with_some("Comment", Some(&self.comment).filter(|c| !c.is_empty()))
-            .with("Timeout", self.timeout_ms)
             .with("Ccs", DOWNLOAD)
             .with("Index", self.index)
             .with("SubIndex", self.sub)
             .with("Data", hex(&self.data))
             .with_some("Disabled", self.disabled.then_some(1))
     }
+}
+
+/// A write of an IDN at state transitions (`SoE/InitCmds/InitCmd`).
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(super) struct SoeCommand {
+    pub transitions: Vec<String>,
+    pub comment: String,
+    pub timeout_ms: u32,
+    pub op_code: u8,
+    pub drive: u8,
+    pub idn: u16,
+    /// The flags of the elements.
+    pub elements: u8,
+    pub data: Vec<u8>,
+    /// Part of the file, but not sent.
+    pub disabled: bool,
+}
+
+impl SoeCommand {
+    /// `OpCode` of a write request (ETG.1000.6 clause 5.7).
+    pub const WRITE: u8 = 3;
+    /// The element of the value.
+    pub const VALUE: u8 = 1 << 6;
+
+    pub fn to_element(&self) -> Element {
+        start(&self.transitions, &self.comment, self.timeout_ms)
+            .with("OpCode", self.op_code)
+            .with("DriveNo", self.drive)
+            .with("IDN", self.idn)
+            .with("Elements", self.elements)
+            .with("Attribute", 0)
+            .with("Data", hex(&self.data))
+            .with_some("Disabled", self.disabled.then_some(1))
+    }
+}
+
+/// Returns an `InitCmd` with a message of a mailbox (`MailboxCmdType`). `data` begins after the
+/// mailbox header.
+pub(super) fn mailbox_command(
+    transitions: &[String],
+    comment: &str,
+    timeout_ms: u32,
+    data: &[u8],
+) -> Element {
+    start(transitions, comment, timeout_ms).with("Data", hex(data))
+}
+
+/// Returns an `InitCmd` with what each mailbox command begins with.
+fn start(transitions: &[String], comment: &str, timeout_ms: u32) -> Element {
+    let mut element = Element::new("InitCmd");
+    for transition in transitions {
+        element = element.with("Transition", transition);
+    }
+    element
+        .with_some("Comment", Some(comment).filter(|c| !c.is_empty()))
+        .with("Timeout", timeout_ms)
 }
 
 /// Returns `xs:hexBinary`.

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 
 use ecaxis_esi::{Direction, Identity, Position};
 
-use super::command::{CoeCommand, CommandTarget, EcatCommand, Payload, Validate};
+use super::command::{CoeCommand, CommandTarget, EcatCommand, Payload, SoeCommand, Validate};
 use super::value::error;
 use super::xml::{Element, EniError};
 
@@ -34,8 +34,9 @@ pub(super) struct NetworkDevice {
     /// The PDOs with a SyncManager, in the order of the assignment.
     pub pdos: Vec<NetworkPdo>,
     pub sdos: Vec<(Position, CoeCommand)>,
-    /// Init commands of other mailbox protocols.
-    pub others: Vec<(Position, String)>,
+    pub idns: Vec<(Position, SoeCommand)>,
+    /// Init commands of other mailbox protocols, with their data behind the mailbox header.
+    pub others: Vec<(Position, &'static str, Vec<u8>)>,
     pub commands: Vec<(Position, EcatCommand)>,
     /// Cycle 0, cycle 1 and shift in ns.
     pub clock: Option<(u32, u32, i32)>,
@@ -146,10 +147,18 @@ impl NetworkDevice {
                 let read = CoeCommand::read(command)?;
                 device.sdos.push((command.position, read));
             }
-            for protocol in ["SoE", "AoE", "EoE", "FoE", "VoE"] {
-                let commands = mailbox.at(&[protocol, "InitCmds", "InitCmd"]);
-                let each = commands.iter().map(|c| (c.position, protocol.to_owned()));
-                device.others.extend(each);
+            for command in mailbox.at(&["SoE", "InitCmds", "InitCmd"]) {
+                device
+                    .idns
+                    .push((command.position, SoeCommand::read(command)?));
+            }
+            for protocol in ["AoE", "EoE", "FoE", "VoE"] {
+                for command in mailbox.at(&[protocol, "InitCmds", "InitCmd"]) {
+                    let data = command.bytes_of("Data")?.unwrap_or_default();
+                    if !command.is_set("Disabled") {
+                        device.others.push((command.position, protocol, data));
+                    }
+                }
             }
         }
         if let Some(clock) = slave.get("DC") {
@@ -271,6 +280,22 @@ impl CoeCommand {
             index: element.needed("Index")?,
             sub: element.number_of("SubIndex")?.unwrap_or(0),
             complete_access: element.has_flag("CompleteAccess"),
+            data: element.bytes_of("Data")?.unwrap_or_default(),
+            disabled: element.is_set("Disabled"),
+        })
+    }
+}
+
+impl SoeCommand {
+    pub fn read(element: &Element) -> Result<Self, EniError> {
+        Ok(Self {
+            transitions: transitions(element),
+            comment: element.text_of("Comment").to_owned(),
+            timeout_ms: element.number_of("Timeout")?.unwrap_or(0),
+            op_code: element.needed("OpCode")?,
+            drive: element.needed("DriveNo")?,
+            idn: element.needed("IDN")?,
+            elements: element.needed("Elements")?,
             data: element.bytes_of("Data")?.unwrap_or_default(),
             disabled: element.is_set("Disabled"),
         })

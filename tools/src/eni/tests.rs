@@ -299,3 +299,57 @@ proptest! {
         }
     }
 }
+
+/// The export has the IDNs that need no attribute and the IP parameters; the import keeps other
+/// IDNs, and lists those that follow from keys.
+#[test]
+fn idns_and_ip_parameters_are_init_commands() {
+    let sercos = std::fs::read_to_string(root().join("configs/sercos.toml")).expect("our file");
+    let entry = "{ idn = \"S-0-0091\", drive = 1, value = \"1500\" }";
+    let bytes = "{ idn = \"P-0-0100\", drive = 1, value = [4, 0, 8, 0, 1, 0, 0, 0] }";
+    assert!(sercos.contains(entry));
+    let text = sercos.replacen(entry, &format!("{entry}, {bytes}"), 1);
+    let folder = root().join("configs");
+    let machine = config::parse(&folder.join("sercos.toml"), &text).expect("a machine");
+    let exported = export(&machine).expect("an ENI");
+    let missing: Vec<_> = exported
+        .notes
+        .iter()
+        .filter(|n| n.contains("S-0-"))
+        .collect();
+    assert_eq!(missing.len(), 2, "{:?}", exported.notes);
+    // S-0-0016 of channel 0: S-0-0051 and what the ESI adds, behind both lengths of the list.
+    let at_list = "<OpCode>3</OpCode><DriveNo>0</DriveNo><IDN>16</IDN><Elements>64</Elements><Attribute>0</Attribute><Data>";
+    let dense: String = exported.text.lines().map(str::trim).collect();
+    let place = dense.find(at_list).expect("S-0-0016") + at_list.len();
+    let data = dense[place..].split('<').next().expect("data");
+    assert_eq!(&data[8..12], "3300", "{data}");
+
+    let back = import_with(exported.text.as_bytes(), &folder.join("esi"));
+    assert!(back.text.contains(bytes), "{}", back.text);
+    assert!(!back.text.contains("S-0-0016"), "{}", back.text);
+    let changed = data.replacen("3300", "2800", 1);
+    let (data, changed) = (format!(">{data}<"), format!(">{changed}<"));
+    let other = exported.text.replacen(&data, &changed, 1);
+    let back = import_with(other.as_bytes(), &folder.join("esi"));
+    let unsent: Vec<_> = back
+        .unsent
+        .iter()
+        .map(|u| (&u.command, &u.reason))
+        .collect();
+    assert_eq!(unsent.len(), 1, "{unsent:?}");
+    assert_eq!(unsent[0].0, "SoE write of S-0-0016, drive 0");
+    assert!(unsent[0].1.contains("`mode`"), "{unsent:?}");
+
+    let web = config::load(&folder.join("web.toml")).expect("our file");
+    let exported = export(&web).expect("an ENI");
+    let back = import_with(exported.text.as_bytes(), &folder.join("esi"));
+    let imported = back.machine.expect("a machine");
+    let parameters = |machine: &Machine| {
+        let devices = machine.devices.iter();
+        let each = devices.map(|d| d.eoe.as_ref().and_then(|eoe| eoe.parameters));
+        each.collect::<Vec<_>>()
+    };
+    assert!(parameters(&web).iter().any(Option::is_some));
+    assert_eq!(parameters(&imported), parameters(&web));
+}

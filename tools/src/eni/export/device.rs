@@ -1,10 +1,13 @@
 //! The `Slave` element: one SubDevice.
 
+use ecaxis_ecat::mailbox::eoe::{Message, Service};
+use ecaxis_ecat::mailbox::{Encode, HEADER};
 use ecaxis_esi::model::{Direction, Entry, Pdo, SmUse, SyncManager};
+use ecaxis_esi::{IdnValue, StartupIdn};
 use ecaxis_master::bringup::mailbox_registers;
 use ecaxis_master::config::state_timeouts::mailbox_timeouts;
 
-use super::super::command::{CoeCommand, EcatCommand, code, signed};
+use super::super::command::{CoeCommand, EcatCommand, SoeCommand, code, mailbox_command, signed};
 use super::super::xml::Element;
 use super::{Network, PlacedDevice, alias, followers};
 use ecaxis_ecat::registers;
@@ -13,6 +16,9 @@ use ecaxis_ecat::registers;
 const DESCRIBED_SYNC_MANAGERS: usize = 4;
 /// How often a MainDevice looks for mailbox messages, in ms.
 const POLL_TIME_MS: u16 = 5;
+
+/// A mailbox that holds each request of EoE.
+const MAX_REQUEST: u16 = 128;
 
 impl PlacedDevice<'_> {
     pub(super) fn element(&self, network: &Network<'_>) -> Element {
@@ -137,6 +143,12 @@ impl PlacedDevice<'_> {
             let commands = Element::new("InitCmds").with_children(commands);
             element = element.child(Element::new("CoE").child(commands));
         }
+        for (name, commands) in [("SoE", self.start_up_idns()), ("EoE", self.ip_parameters())] {
+            if !commands.is_empty() {
+                let commands = Element::new("InitCmds").with_children(commands);
+                element = element.child(Element::new(name).child(commands));
+            }
+        }
         Some(element)
     }
 
@@ -148,10 +160,57 @@ impl PlacedDevice<'_> {
         (filled(out) && filled(inp)).then_some([*out, *inp])
     }
 
-    /// Returns the start-up SDOs.
-    fn start_up(&self) -> Vec<CoeCommand> {
+    /// Returns the time for a request and its answer.
+    fn mailbox_timeout_ms(&self) -> u32 {
         let timeouts = mailbox_timeouts(&self.config.device.info);
         let timeout = timeouts.request + timeouts.answer;
+        u32::try_from(timeout.as_millis()).unwrap_or(u32::MAX >> 1)
+    }
+
+    /// Returns the start-up IDNs whose bytes do not depend on what the drive reports.
+    fn start_up_idns(&self) -> Vec<Element> {
+        let command = |idn: &StartupIdn| {
+            let IdnValue::Bytes(data) = &idn.value else {
+                return None;
+            };
+            let command = SoeCommand {
+                // The mailbox works from PreOp on; the schema has no other transition before.
+                transitions: vec![idn.transition.replace("IP", "PS")],
+                comment: format!("{}: {}", idn.idn, idn.origin),
+                timeout_ms: self.mailbox_timeout_ms(),
+                op_code: SoeCommand::WRITE,
+                drive: idn.drive,
+                idn: idn.idn.0,
+                elements: SoeCommand::VALUE,
+                data: data.clone(),
+                disabled: false,
+            };
+            Some(command.to_element())
+        };
+        let list = self.config.selection.startup_idns.iter();
+        list.filter_map(command).collect()
+    }
+
+    /// Returns the request that sets the IP parameters.
+    fn ip_parameters(&self) -> Vec<Element> {
+        let parameters = self.config.eoe.as_ref().and_then(|eoe| eoe.parameters);
+        let command = |parameters| {
+            let mut request = Vec::new();
+            Message::from(Service::SetIp(parameters)).emit(0, MAX_REQUEST, &mut request);
+            let length = request.first_chunk().map_or(0, |n| u16::from_le_bytes(*n));
+            request.truncate(HEADER + usize::from(length));
+            mailbox_command(
+                &["PS".to_owned()],
+                "IP parameters",
+                self.mailbox_timeout_ms(),
+                request.get(HEADER..).unwrap_or_default(),
+            )
+        };
+        parameters.map(command).into_iter().collect()
+    }
+
+    /// Returns the start-up SDOs.
+    fn start_up(&self) -> Vec<CoeCommand> {
         let list = self.config.selection.startup.iter();
         let command = |sdo: &ecaxis_esi::StartupSdo| CoeCommand {
             transitions: vec![sdo.transition.to_owned()],
@@ -159,7 +218,7 @@ impl PlacedDevice<'_> {
                 true => sdo.origin.clone(),
                 false => format!("{}: {}", sdo.name, sdo.origin),
             },
-            timeout_ms: u32::try_from(timeout.as_millis()).unwrap_or(u32::MAX >> 1),
+            timeout_ms: self.mailbox_timeout_ms(),
             index: sdo.index,
             sub: sdo.sub,
             complete_access: sdo.complete_access,

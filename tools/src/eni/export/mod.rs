@@ -9,6 +9,7 @@ mod cyclic;
 mod device;
 
 use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_esi::IdnValue;
 use ecaxis_master::acyclic::enumerate::FIRST_STATION;
 use ecaxis_master::config::{DeviceConfig, Locator, Machine, MailboxSource, SegmentHead};
 use ecaxis_master::esi_library::RevisionMatch;
@@ -181,6 +182,14 @@ impl<'m> Network<'m> {
             }
             if config.selection.startup.iter().any(|sdo| sdo.optional) {
                 add("it may refuse 0x60C2; another MainDevice may stop there");
+            }
+            for idn in &config.selection.startup_idns {
+                if let IdnValue::Text(text) = &idn.value {
+                    add(&format!(
+                        "{} = {text} is not part of the ENI: its bytes follow from the attribute that the drive reports; write them as a list",
+                        idn.idn
+                    ));
+                }
             }
             let numbers = self.image.regions.get(device.index).into_iter().flatten();
             if numbers.count() > 0 && device.high_sync_managers() {

@@ -1,16 +1,20 @@
 //! One device of an ENI as a `[[device]]` section.
 
+use std::net::Ipv4Addr;
 use std::path::Path;
 
 use ecaxis_ecat::data_type::{DataType, Kind};
+use ecaxis_ecat::mailbox::eoe::{IpParameters, Message, Service};
+use ecaxis_ecat::mailbox::soe::Idn;
 use ecaxis_ecat::registers;
 use ecaxis_ecat::sii::control;
 use ecaxis_esi as esi;
 use ecaxis_esi::model::{ObjectItem, Writable};
 use ecaxis_esi::{Mode, Position, SelectOptions, Selection, UserSdo, address};
+use ecaxis_master::config::keys_of_idn;
 use ecaxis_master::text::quoted;
 
-use super::super::command::{CoeCommand, EcatCommand, Payload, Validate, code};
+use super::super::command::{CoeCommand, EcatCommand, Payload, SoeCommand, Validate, code};
 use super::super::network::NetworkDevice;
 use super::layout::{DeviceKeys, WantedLayout, find, is_layout_object};
 use super::{Described, Unsent, unsent};
@@ -31,8 +35,11 @@ pub(super) struct ImportedDevice<'n> {
     /// The process data is that of the ENI.
     same_layout: bool,
     selection: Option<Selection>,
-    /// The entries of `sdo`.
+    /// The entries of `sdo` and of `idn`.
     sdos: Vec<String>,
+    idns: Vec<String>,
+    /// The value of `eoe`.
+    eoe: Option<String>,
     /// What the SDOs and the clock of the ENI do and this device does not.
     pub unsent: Vec<Unsent>,
     cycle_ns: u64,
@@ -53,6 +60,8 @@ impl<'n> ImportedDevice<'n> {
             same_layout: described.is_none(),
             selection: None,
             sdos: Vec::new(),
+            idns: Vec::new(),
+            eoe: None,
             unsent: Vec::new(),
             cycle_ns,
         };
@@ -66,6 +75,7 @@ impl<'n> ImportedDevice<'n> {
             (device.keys, device.same_layout) = (keys, same);
         }
         device.start_up();
+        device.start_up_idns();
         device.hot_connect();
         device
     }
@@ -152,9 +162,13 @@ impl<'n> ImportedDevice<'n> {
                 "a device that may be absent needs `optional`, `alias` and a [[stop.group]]";
             self.add_unsent(position, "HotConnect".to_owned(), reason);
         }
-        for (position, protocol) in self.network.others.clone() {
+        for (position, protocol, data) in &self.network.others {
+            if let ("EoE", Some(parameters)) = (*protocol, ip_parameters(data)) {
+                self.eoe = Some(eoe_value(&parameters));
+                continue;
+            }
             let reason = format!("ecaxis has no start-up commands of {protocol}");
-            self.add_unsent(position, format!("{protocol} init command"), reason);
+            self.add_unsent(*position, format!("{protocol} init command"), reason);
         }
     }
 
@@ -180,6 +194,23 @@ impl<'n> ImportedDevice<'n> {
                     }
                 }
                 Err(reason) => self.add_unsent(*position, command, reason),
+            }
+        }
+    }
+
+    /// Sorts the IDNs of the ENI alike.
+    fn start_up_idns(&mut self) {
+        let network = self.network;
+        for (position, command) in network.idns.iter().filter(|(_, c)| !c.disabled) {
+            let selection = self.selection.as_ref();
+            let own = selection.map(|s| s.startup_idns.as_slice());
+            match idn_entry(command, own.unwrap_or_default()) {
+                Ok(entry) => self.idns.extend(entry),
+                Err(reason) => {
+                    let idn = Idn(command.idn);
+                    let text = format!("SoE write of {idn}, drive {}", command.drive);
+                    self.add_unsent(*position, text, reason);
+                }
             }
         }
     }
@@ -301,13 +332,15 @@ impl<'n> ImportedDevice<'n> {
                 "{MARK} a drive: `mode` ({modes}) and a [device.axis] give it power"
             ));
         }
+        if let Some(eoe) = &self.eoe {
+            lines.add("eoe", eoe, "");
+        }
         let mut text = lines.text();
-        if !self.sdos.is_empty() {
-            text += "sdo = [\n";
-            for entry in &self.sdos {
-                text += &format!("    {entry},\n");
+        for (key, entries) in [("sdo", &self.sdos), ("idn", &self.idns)] {
+            if !entries.is_empty() {
+                let lines = entries.iter().map(|entry| format!("    {entry},\n"));
+                text += &format!("{key} = [\n{}]\n", lines.collect::<String>());
             }
-            text += "]\n";
         }
         text
     }
@@ -381,6 +414,78 @@ pub(super) fn validated(command: &EcatCommand, register: u16) -> Option<&Validat
     let read = matches!(command.command, code::APRD | code::FPRD);
     let at = unsent::register(command).filter(|_| read)?;
     command.validate.as_ref().filter(|_| at == register)
+}
+
+/// Returns the IP parameters that a request of EoE sets, if it sets an address.
+fn ip_parameters(data: &[u8]) -> Option<IpParameters> {
+    const TYPE_EOE: u8 = 2;
+    let [low, high] = u16::try_from(data.len()).ok()?.to_le_bytes();
+    let mut mailbox = vec![low, high, 0, 0, 0, TYPE_EOE];
+    mailbox.extend_from_slice(data);
+    match Message::parse(&mailbox).ok()?.service {
+        Service::SetIp(parameters) if parameters.ip.is_some() => Some(parameters),
+        _ => None,
+    }
+}
+
+/// Returns IP parameters as TOML. Addresses of zeros are those that a request does not set.
+fn eoe_value(parameters: &IpParameters) -> String {
+    let address = |address: Option<Ipv4Addr>| {
+        let set = address.filter(|address| !address.is_unspecified());
+        set.map(|address| address.to_string())
+    };
+    let mac = parameters.mac.map(|mac| {
+        let bytes = mac.map(|byte| format!("{byte:02x}"));
+        bytes.join(":")
+    });
+    let name = parameters.name.map(|name| {
+        let text: Vec<u8> = name.into_iter().take_while(|byte| *byte != 0).collect();
+        String::from_utf8_lossy(&text).into_owned()
+    });
+    let keys = [
+        ("ip", address(parameters.ip)),
+        ("netmask", address(parameters.netmask)),
+        ("gateway", address(parameters.gateway)),
+        ("dns", address(parameters.dns)),
+        ("name", name.filter(|name| !name.is_empty())),
+        ("mac", mac),
+    ];
+    let keys = keys.iter().filter_map(|(key, value)| {
+        let value = value.as_ref()?;
+        Some(format!("{key} = {}", quoted(value)))
+    });
+    format!("{{ {} }}", keys.collect::<Vec<_>>().join(", "))
+}
+
+/// Returns the entry of `idn`; `Ok(None)` if the drive gets the value without one.
+fn idn_entry(command: &SoeCommand, own: &[esi::StartupIdn]) -> Result<Option<String>, String> {
+    let idn = Idn(command.idn);
+    if (command.op_code, command.elements) != (SoeCommand::WRITE, SoeCommand::VALUE) {
+        return Err("`idn` writes the value of an IDN only".to_owned());
+    }
+    let upwards = |t: &String| matches!(t.as_str(), "PS" | "SO");
+    if !command.transitions.iter().any(upwards) {
+        return Err("ecaxis writes IDNs on the way to Op only".to_owned());
+    }
+    let same = |own: &esi::StartupIdn| {
+        let value = esi::IdnValue::Bytes(command.data.clone());
+        (own.idn, own.drive, &own.value) == (idn, command.drive, &value)
+    };
+    if own.iter().any(same) {
+        return Ok(None);
+    }
+    if let Some(keys) = keys_of_idn(idn) {
+        return Err(format!("it follows from {keys}"));
+    }
+    let bytes: Vec<_> = command.data.iter().map(u8::to_string).collect();
+    let drive = match command.drive {
+        0 => String::new(),
+        drive => format!("drive = {drive}, "),
+    };
+    let value = bytes.join(", ");
+    Ok(Some(format!(
+        "{{ idn = \"{idn}\", {drive}value = [{value}] }}"
+    )))
 }
 
 fn describe(sdo: &CoeCommand) -> String {
