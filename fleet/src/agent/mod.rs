@@ -1,0 +1,64 @@
+//! The agent of a machine: from the socket of `ecaxis serve` to Zenoh. It reads; orders alone change
+//! something.
+
+pub mod publish;
+pub mod reader;
+pub mod state;
+
+use std::path::Path;
+use std::sync::Arc;
+use std::thread;
+
+use tokio::sync::mpsc;
+
+use crate::config::{self, AgentFile, Role};
+use crate::error::{Error, Result};
+use crate::reports::ReportStore;
+use crate::session;
+use publish::Publisher;
+use reader::Reader;
+
+/// The fault reports that an agent keeps. The server itself has 20.
+const MAX_REPORTS: usize = 500;
+/// The updates that wait for Zenoh. More of them are dropped: states are superseded, and the archive
+/// queries what it has missed.
+pub const UPDATES: usize = 256;
+
+/// Publishes a machine until SIGINT or SIGTERM.
+///
+/// # Errors
+/// Fails if the file is wrong or the spool cannot be read. It waits for an absent server or router.
+pub async fn run(path: &Path) -> Result<()> {
+    let file: AgentFile = config::read(path)?;
+    let zenoh = config::zenoh(&file.zenoh, path, Role::Service)?;
+    let id = file.id();
+    let spool = config::resolve(path, &file.spool);
+    let store = ReportStore::open(&spool.join("reports"), MAX_REPORTS).map_err(|error| {
+        Error::new(format!("spool {}: {error}", spool.display()))
+            .help("give the folder to the user of the agent")
+    })?;
+    let store = Arc::new(store);
+    let socket = config::resolve(path, &file.socket);
+    let (updates, received) = mpsc::channel(UPDATES);
+    let reader = Reader {
+        id: id.clone(),
+        socket: socket.clone(),
+        page: file.page,
+        store: Arc::clone(&store),
+        updates,
+    };
+    // Its connection to the server blocks. Without Zenoh, it still spools reports.
+    let named = thread::Builder::new().name("reader".to_owned());
+    named
+        .spawn(move || reader.run())
+        .map_err(|error| Error::new(format!("starting a thread: {error}")))?;
+    tracing::info!(machine = %id, socket = %socket.display(), "agent");
+    tokio::select! {
+        ended = async {
+            let session = session::open(zenoh).await?;
+            tracing::info!(machine = %id, "connected");
+            Publisher::new(session, id.clone(), store, Some(socket)).run(received).await
+        } => ended,
+        ended = session::terminated() => ended,
+    }
+}

@@ -1,0 +1,81 @@
+//! `report`: fault reports of machines, also of those that are gone if an archive has them.
+
+use std::collections::BTreeMap;
+
+use zenoh::Session;
+
+use super::{TIMEOUT, print};
+use crate::error::{Error, Result};
+use crate::keys::{ALL_REPORTS, MachineId};
+use crate::options::{Network, ReportAction};
+use crate::reports::{ReportId, Summary};
+use crate::session;
+
+/// Lists or shows fault reports.
+///
+/// # Errors
+/// Fails if no router is reached, or the report is not there.
+pub async fn run(network: &Network, action: ReportAction) -> Result<()> {
+    let session = session::open_command(network).await?;
+    match action {
+        ReportAction::List { machine, json } => {
+            let key = machine.map_or(ALL_REPORTS.to_owned(), |id| id.key("reports"));
+            let reports = list(&session, &key).await?;
+            if json {
+                print(&serde_json::json!(reports).to_string())?;
+            } else {
+                for report in reports {
+                    let time = report.unix_time.map_or("-".to_owned(), |t| t.to_string());
+                    let headline = report.headline.escape_debug();
+                    let id = &report.id.as_str()[..12];
+                    print(&format!("{id}  {time:>10}  {}  {headline}", report.machine))?;
+                }
+            }
+        }
+        ReportAction::Show { id } => show(&session, &id).await?,
+    }
+    let failed = |error: zenoh::Error| Error::new(format!("closing the session: {error}"));
+    session.close().await.map_err(failed)
+}
+
+/// Returns the reports of all that answer, each once, newest first.
+async fn list(session: &Session, selector: &str) -> Result<Vec<Summary>> {
+    let mut reports = BTreeMap::new();
+    for reply in session::query(session, selector, TIMEOUT).await? {
+        let machine = MachineId::of_key(&reply.key).map(|(id, _)| id);
+        for summary in reply.json::<Vec<Summary>>().unwrap_or_default() {
+            if Some(&summary.machine) == machine.as_ref() {
+                reports.insert(summary.id.clone(), summary);
+            }
+        }
+    }
+    let mut reports: Vec<_> = reports.into_values().collect();
+    reports.sort_by(|a, b| (b.unix_time, b.event).cmp(&(a.unix_time, a.event)));
+    Ok(reports)
+}
+
+async fn show(session: &Session, prefix: &str) -> Result<()> {
+    let reports = list(session, ALL_REPORTS).await?;
+    let mut found = reports
+        .iter()
+        .filter(|report| report.id.as_str().starts_with(prefix));
+    let help = "`ecaxis-fleet report list` has the ids";
+    let Some(report) = found.next() else {
+        return Err(Error::new(format!("report {prefix}: none begins like this")).help(help));
+    };
+    if found.next().is_some() {
+        return Err(Error::new(format!("report {prefix}: several begin like this")).help(help));
+    }
+    let key = report
+        .machine
+        .key(&format!("report/{}", report.id.as_str()));
+    let replies = session::query(session, &key, TIMEOUT).await?;
+    let whole = replies
+        .iter()
+        .find(|reply| ReportId::of(&reply.bytes) == report.id);
+    let Some(reply) = whole else {
+        let what = format!("report {prefix}: {} does not answer", report.machine);
+        return Err(Error::new(what).help("run an archive to keep the reports of machines"));
+    };
+    print(&String::from_utf8_lossy(&reply.bytes))
+}

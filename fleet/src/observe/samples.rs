@@ -1,0 +1,30 @@
+//! `samples`: every cycle's values of some signals.
+
+use std::time::Duration;
+
+use super::{TIMEOUT, print};
+use crate::error::{Error, Result};
+use crate::options::{Network, SamplesRequest};
+use crate::session;
+
+/// Prints the samples of a machine.
+///
+/// # Errors
+/// Fails if the machine does not answer, or has no such signal.
+pub async fn run(network: &Network, request: SamplesRequest) -> Result<()> {
+    let session = session::open_command(network).await?;
+    let seconds = request.seconds.clamp(0.0, 10.0);
+    let signals = request.signals.join(",");
+    let selector = request
+        .machine
+        .key(&format!("samples?signals={signals};seconds={seconds}"));
+    let timeout = TIMEOUT + Duration::from_secs_f64(seconds);
+    let replies = session::query(&session, &selector, timeout).await?;
+    let Some(reply) = replies.first() else {
+        return Err(
+            Error::new(format!("samples of {}: no answer", request.machine))
+                .help("check the names of the signals, and `ecaxis-fleet status`"),
+        );
+    };
+    print(&String::from_utf8_lossy(&reply.bytes))
+}

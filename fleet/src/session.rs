@@ -1,0 +1,115 @@
+//! Zenoh sessions, queries with bounds, and signals.
+
+use std::path::Path;
+use std::time::Duration;
+
+use serde::de::DeserializeOwned;
+use tokio::signal::unix::{SignalKind, signal};
+use zenoh::Session;
+use zenoh::query::{ConsolidationMode, QueryTarget};
+
+use crate::config::{self, Role, ZenohFile};
+use crate::error::{Error, Result};
+use crate::options::Network;
+
+/// The longest reply, and the longest fault report.
+pub const MAX_REPLY: usize = 4 << 20;
+/// The replies to a query that are taken.
+const MAX_REPLIES: usize = 100_000;
+
+/// Opens a session. With a role other than a command, this lasts until something answers.
+///
+/// # Errors
+/// Fails if the configuration is wrong, or a command finds no router.
+pub async fn open(config: zenoh::Config) -> Result<Session> {
+    zenoh::open(config).await.map_err(|error| {
+        let text = error.to_string();
+        let text: String = text.chars().take(200).collect();
+        Error::new(format!("Zenoh: {text}"))
+            .help("check `connect` and the certificates, and that the router runs")
+    })
+}
+
+/// Opens the session of a command.
+///
+/// # Errors
+/// Fails if the file is wrong or no router answers.
+pub async fn open_command(network: &Network) -> Result<Session> {
+    let path = network.config.as_deref();
+    let mut file: ZenohFile = path.map_or(Ok(ZenohFile::default()), config::read)?;
+    if !network.connect.is_empty() {
+        let endpoints = network.connect.iter().cloned().map(toml::Value::String);
+        let connect = file
+            .zenoh
+            .entry("connect")
+            .or_insert_with(|| toml::Table::new().into());
+        if let Some(connect) = connect.as_table_mut() {
+            connect.insert(
+                "endpoints".to_owned(),
+                toml::Value::Array(endpoints.collect()),
+            );
+        }
+    }
+    let path = path.unwrap_or(Path::new("the command line"));
+    open(config::zenoh(&file.zenoh, path, Role::Command)?).await
+}
+
+/// A reply: its key and its bytes.
+#[derive(Debug, Clone)]
+pub struct Reply {
+    /// The key.
+    pub key: String,
+    /// The bytes.
+    pub bytes: Vec<u8>,
+}
+
+impl Reply {
+    /// Reads JSON; `None` for anything else.
+    #[must_use]
+    pub fn json<T: DeserializeOwned>(&self) -> Option<T> {
+        serde_json::from_slice(&self.bytes).ok()
+    }
+}
+
+/// Asks all that answer to a selector, and returns what came in time. Errors are left out.
+///
+/// # Errors
+/// Fails if the session is closed or the selector is wrong.
+pub async fn query(session: &Session, selector: &str, timeout: Duration) -> Result<Vec<Reply>> {
+    let failed = |error: zenoh::Error| Error::new(format!("query {selector}: {error}"));
+    let replies = session
+        .get(selector)
+        .target(QueryTarget::All)
+        .consolidation(ConsolidationMode::None)
+        .timeout(timeout)
+        .await
+        .map_err(failed)?;
+    let mut taken = Vec::new();
+    while let Ok(reply) = replies.recv_async().await {
+        let Ok(sample) = reply.into_result() else {
+            continue;
+        };
+        if sample.payload().len() <= MAX_REPLY && taken.len() < MAX_REPLIES {
+            taken.push(Reply {
+                key: sample.key_expr().to_string(),
+                bytes: sample.payload().to_bytes().into_owned(),
+            });
+        }
+    }
+    Ok(taken)
+}
+
+/// Waits for SIGINT or SIGTERM.
+///
+/// # Errors
+/// Fails if the system refuses a handler.
+pub async fn terminated() -> Result<()> {
+    let failed = |error: std::io::Error| Error::new(format!("signals: {error}"));
+    let mut terminate = signal(SignalKind::terminate()).map_err(failed)?;
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(failed)?;
+    tokio::select! {
+        _ = terminate.recv() => {}
+        _ = interrupt.recv() => {}
+    }
+    Ok(())
+}
