@@ -6,11 +6,12 @@
 //! | [`keys`] | the key expressions, and the names in them |
 //! | [`agent`] | from the socket of `ecaxis serve` to Zenoh |
 //! | [`reports`] | fault reports on disk, each under its SHA-256 |
-//! | [`router`] | a Zenoh router |
+//! | [`archive`], [`router`] | the history of all machines; a Zenoh router |
 //! | [`observe`] | the commands that read |
 //! | [`orders`] | orders to machines |
 
 pub mod agent;
+pub mod archive;
 pub mod config;
 pub mod error;
 pub mod keys;
@@ -58,6 +59,7 @@ async fn execute(command: Command) -> error::Result<()> {
     match command {
         Command::Agent { file } => agent::run(&file).await,
         Command::Router { file } => router::run(&file).await,
+        Command::Archive { file } => archive::run(&file).await,
         Command::Status { network, json } => observe::status::run(&network, json).await,
         Command::Watch { network, json } => observe::watch::run(&network, json).await,
         Command::Report { network, action } => observe::report::run(&network, action).await,

@@ -29,6 +29,12 @@ pub enum Command {
         /// The file of the router
         file: PathBuf,
     },
+    /// Keep the last states, fault reports and events of all machines
+    #[command(after_help = "Examples:\n  ecaxis-fleet archive /etc/ecaxis/archive.toml")]
+    Archive {
+        /// The file of the archive
+        file: PathBuf,
+    },
     /// Print all machines with their state
     #[command(
         after_help = "Examples:\n  ecaxis-fleet status --connect tcp/router:7447\n  \

@@ -276,7 +276,7 @@ mod tests {
         fs::write(folder.path().join(".new-half"), "half").unwrap();
         let again = ReportStore::open(folder.path(), 10).unwrap();
         assert_eq!(again.add(&report(1)).unwrap(), None);
-        assert_eq!(again.list(), [summary.clone()]);
+        assert_eq!(again.list(), std::slice::from_ref(&summary));
         assert_eq!(again.get(&summary.id), Some(report(1)));
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
     }

@@ -6,7 +6,8 @@ use std::time::Duration;
 use serde::de::DeserializeOwned;
 use tokio::signal::unix::{SignalKind, signal};
 use zenoh::Session;
-use zenoh::query::{ConsolidationMode, QueryTarget};
+use zenoh::query::{ConsolidationMode, Query, QueryTarget};
+use zenoh::sample::Locality;
 
 use crate::config::{self, Role, ZenohFile};
 use crate::error::{Error, Result};
@@ -81,6 +82,8 @@ pub async fn query(session: &Session, selector: &str, timeout: Duration) -> Resu
         .get(selector)
         .target(QueryTarget::All)
         .consolidation(ConsolidationMode::None)
+        // An archive needs no answer from itself.
+        .allowed_destination(Locality::Remote)
         .timeout(timeout)
         .await
         .map_err(failed)?;
@@ -97,6 +100,13 @@ pub async fn query(session: &Session, selector: &str, timeout: Duration) -> Resu
         }
     }
     Ok(taken)
+}
+
+/// Replies to a query. A session that is closed meanwhile needs no reply.
+pub async fn reply(query: &Query, key: &str, bytes: Vec<u8>) {
+    if let Err(error) = query.reply(key, bytes).await {
+        tracing::debug!("reply {key}: {error}");
+    }
 }
 
 /// Waits for SIGINT or SIGTERM.

@@ -17,6 +17,7 @@ use crate::error::{Error, Result};
 use crate::keys::MachineId;
 use crate::orders;
 use crate::reports::{ReportId, ReportStore};
+use crate::session::reply;
 
 /// The longest request for samples, and the most rows and signals in its answer.
 const MAX_SAMPLES: Duration = Duration::from_secs(10);
@@ -163,13 +164,17 @@ impl Publisher {
                 (Ok(permit), Some(socket)) => {
                     let parameters = query.parameters();
                     let signals = parameters.get("signals").unwrap_or_default().to_owned();
+                    let after = parameters.get("after").and_then(|n| n.parse().ok());
                     let seconds = parameters.get("seconds").and_then(|s| s.parse().ok());
                     let work = move || {
                         let _permit = permit;
                         let machine = Machine::attach(&socket, attach_options())?;
                         match samples {
                             true => read_samples(&machine, &signals, seconds.unwrap_or(1.0)),
-                            false => machine.request("events", json!({})),
+                            false => {
+                                let after: u64 = after.unwrap_or(0);
+                                machine.request("events", json!({"after": after}))
+                            }
                         }
                     };
                     let done = tokio::task::spawn_blocking(work).await;
@@ -190,12 +195,6 @@ impl Publisher {
 
 fn refusal(code: &str, message: &str) -> Value {
     json!({"ok": false, "error": {"code": code, "message": message}})
-}
-
-async fn reply(query: &Query, key: &str, bytes: Vec<u8>) {
-    if let Err(error) = query.reply(key, bytes).await {
-        tracing::debug!("reply {key}: {error}");
-    }
 }
 
 /// Reads every cycle's values for some time.

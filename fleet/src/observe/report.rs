@@ -1,5 +1,6 @@
 //! `report`: fault reports of machines, also of those that are gone if an archive has them.
 
+use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
 use zenoh::Session;
@@ -50,7 +51,7 @@ async fn list(session: &Session, selector: &str) -> Result<Vec<Summary>> {
         }
     }
     let mut reports: Vec<_> = reports.into_values().collect();
-    reports.sort_by(|a, b| (b.unix_time, b.event).cmp(&(a.unix_time, a.event)));
+    reports.sort_by_key(|report| Reverse((report.unix_time, report.event)));
     Ok(reports)
 }
 

@@ -1,0 +1,190 @@
+//! Events of a machine in a file, a JSON object per line, each once.
+
+use std::collections::{BTreeSet, VecDeque};
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
+
+/// The length of a file; the one before it is kept, too.
+const MAX_FILE: u64 = 4 << 20;
+/// The longest event.
+const MAX_EVENT: usize = 16 << 10;
+/// The events that are recognized; a server has 1,000.
+const MAX_KNOWN: usize = 4000;
+
+/// The time of an event in ns and its number. Numbers alone begin again with the server.
+pub type EventIdentity = (u64, u64);
+
+/// Returns what distinguishes an event; `None` if it is none.
+#[must_use]
+pub fn identity(event: &Value) -> Option<EventIdentity> {
+    Some((event["time_ns"].as_u64()?, event["number"].as_u64()?))
+}
+
+/// The file of the events.
+#[derive(Debug)]
+pub struct EventLog {
+    path: PathBuf,
+    older: PathBuf,
+    file: File,
+    length: u64,
+    known: Known,
+}
+
+/// Events in the order of the file: after a restart of the computer, times begin again.
+#[derive(Debug, Default)]
+struct Known {
+    set: BTreeSet<EventIdentity>,
+    order: VecDeque<EventIdentity>,
+    /// The one that came last, also if it was known.
+    last: Option<EventIdentity>,
+}
+
+impl Known {
+    /// Returns true if the event is new.
+    fn add(&mut self, identity: EventIdentity) -> bool {
+        self.last = Some(identity);
+        if !self.set.insert(identity) {
+            return false;
+        }
+        self.order.push_back(identity);
+        if self.order.len() > MAX_KNOWN
+            && let Some(oldest) = self.order.pop_front()
+        {
+            self.set.remove(&oldest);
+        }
+        true
+    }
+}
+
+impl EventLog {
+    /// Opens the file in a folder, or makes it. An incomplete last line is removed.
+    ///
+    /// # Errors
+    /// Fails if the disk refuses.
+    pub fn open(folder: &Path) -> io::Result<Self> {
+        let path = folder.join("events.jsonl");
+        let older = folder.join("events.1.jsonl");
+        let mut known = Known::default();
+        let mut read = |path: &Path| -> io::Result<usize> {
+            let mut text = Vec::new();
+            match File::open(path) {
+                Ok(file) => drop(file.take(2 * MAX_FILE).read_to_end(&mut text)?),
+                Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(0),
+                Err(error) => return Err(error),
+            }
+            let whole = text
+                .iter()
+                .rposition(|b| *b == b'\n')
+                .map_or(0, |at| at + 1);
+            for line in text[..whole].split(|byte| *byte == b'\n') {
+                let event = serde_json::from_slice(line).ok();
+                if let Some(identity) = event.as_ref().and_then(identity) {
+                    known.add(identity);
+                }
+            }
+            Ok(whole)
+        };
+        read(&older)?;
+        let length = read(&path)? as u64;
+        let mut file = OpenOptions::new().create(true).append(true).open(&path)?;
+        file.set_len(length)?;
+        file.seek(SeekFrom::End(0))?;
+        Ok(Self {
+            path,
+            older,
+            file,
+            length,
+            known,
+        })
+    }
+
+    /// Appends the events that are not there. What is not an event is left out.
+    ///
+    /// # Errors
+    /// Fails if the disk refuses.
+    pub fn add(&mut self, events: impl IntoIterator<Item = Value>) -> io::Result<()> {
+        for event in events {
+            let Some(identity) = identity(&event) else {
+                continue;
+            };
+            let line = format!("{event}\n");
+            if line.len() > MAX_EVENT || !self.known.add(identity) {
+                continue;
+            }
+            if self.length > MAX_FILE {
+                fs::rename(&self.path, &self.older)?;
+                self.file = OpenOptions::new()
+                    .create(true)
+                    .append(true)
+                    .open(&self.path)?;
+                self.length = 0;
+            }
+            self.file.write_all(line.as_bytes())?;
+            self.length += line.len() as u64;
+        }
+        Ok(())
+    }
+
+    /// Returns the event that came last.
+    #[must_use]
+    pub fn last(&self) -> Option<EventIdentity> {
+        self.known.last
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn event(number: u64) -> Value {
+        json!({"event": "fault", "number": number, "time_ns": number * 1000})
+    }
+
+    #[test]
+    fn an_event_is_written_once_across_restarts() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut log = EventLog::open(folder.path()).unwrap();
+        log.add([event(1), event(2), json!({"event": "missed"}), json!(null)])
+            .unwrap();
+        let path = folder.path().join("events.jsonl");
+        let mut file = OpenOptions::new().append(true).open(&path).unwrap();
+        file.write_all(b"{\"event\":\"fau").unwrap();
+        let mut again = EventLog::open(folder.path()).unwrap();
+        assert_eq!(again.last(), Some((2000, 2)));
+        again.add([event(1), event(3)]).unwrap();
+        // The computer has restarted.
+        let mut first = event(1);
+        first["time_ns"] = json!(7);
+        again.add([first.clone()]).unwrap();
+        assert_eq!(again.last(), Some((7, 1)));
+        let text = fs::read_to_string(&path).unwrap();
+        let events: Vec<Value> = text
+            .lines()
+            .map(|l| serde_json::from_str(l).unwrap())
+            .collect();
+        assert_eq!(events, [event(1), event(2), event(3), first]);
+    }
+
+    #[test]
+    fn the_files_are_bounded() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut log = EventLog::open(folder.path()).unwrap();
+        for number in 0..1000 {
+            let mut event = event(number);
+            event["text"] = json!("t".repeat(MAX_EVENT - 200));
+            log.add([event]).unwrap();
+        }
+        for entry in fs::read_dir(folder.path()).unwrap() {
+            let length = entry.unwrap().metadata().unwrap().len();
+            assert!(length <= MAX_FILE + MAX_EVENT as u64, "{length}");
+        }
+        assert_eq!(
+            EventLog::open(folder.path()).unwrap().last(),
+            Some((999_000, 999))
+        );
+    }
+}

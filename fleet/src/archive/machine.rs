@@ -1,0 +1,118 @@
+//! What an archive keeps of one machine: a folder with `reports/`, `events.jsonl` and `state.json`.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+
+use super::events::{EventIdentity, EventLog};
+use crate::agent::state::State;
+use crate::keys::MachineId;
+use crate::reports::{ReportStore, summarize};
+
+/// The last state goes to the disk at most this often.
+const WRITE_INTERVAL: Duration = Duration::from_secs(10);
+
+/// The history of a machine.
+#[derive(Debug)]
+pub struct ArchivedMachine {
+    /// Its fault reports.
+    pub reports: ReportStore,
+    folder: PathBuf,
+    events: Mutex<EventLog>,
+    state: Mutex<LastState>,
+}
+
+#[derive(Debug, Default)]
+struct LastState {
+    state: Option<State>,
+    written: Option<Instant>,
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl ArchivedMachine {
+    /// Opens the folder of a machine, or makes it.
+    ///
+    /// # Errors
+    /// Fails if the disk refuses.
+    pub fn open(folder: &Path, max_reports: usize) -> io::Result<Self> {
+        let reports = ReportStore::open(&folder.join("reports"), max_reports)?;
+        let state = fs::read(folder.join("state.json")).ok();
+        let state = state.and_then(|bytes| serde_json::from_slice(&bytes).ok());
+        Ok(Self {
+            reports,
+            folder: folder.to_owned(),
+            events: Mutex::new(EventLog::open(folder)?),
+            state: Mutex::new(LastState {
+                state,
+                written: None,
+            }),
+        })
+    }
+
+    /// Returns the last state.
+    #[must_use]
+    pub fn state(&self) -> Option<State> {
+        lock(&self.state).state.clone()
+    }
+
+    /// Takes the last state.
+    pub fn set_state(&self, state: State) {
+        let mut last = lock(&self.state);
+        if last
+            .written
+            .is_none_or(|written| written.elapsed() > WRITE_INTERVAL)
+        {
+            last.written = Some(Instant::now());
+            let new = self.folder.join(".new-state");
+            let done = fs::write(&new, json!(state).to_string())
+                .and_then(|()| fs::rename(&new, self.folder.join("state.json")));
+            if let Err(error) = done {
+                tracing::error!(machine = %state.id, "state: {error}");
+            }
+        }
+        last.state = Some(state);
+    }
+
+    /// Writes a report if it is one of this machine.
+    pub fn add_report(&self, id: &MachineId, bytes: &[u8]) {
+        if summarize(bytes).is_none_or(|summary| summary.machine != *id) {
+            tracing::warn!(machine = %id, "not a report of this machine");
+            return;
+        }
+        match self.reports.add(bytes) {
+            Ok(Some(summary)) => {
+                tracing::info!(machine = %id, id = summary.id.as_str(), "fault report");
+            }
+            Ok(None) => {}
+            Err(error) => tracing::error!(machine = %id, "report: {error}"),
+        }
+    }
+
+    /// Writes the events that are not there.
+    pub fn add_events(&self, id: &MachineId, new: impl IntoIterator<Item = Value>) {
+        if let Err(error) = lock(&self.events).add(new) {
+            tracing::error!(machine = %id, "events: {error}");
+        }
+    }
+
+    /// Returns the event that came last.
+    #[must_use]
+    pub fn last_event(&self) -> Option<EventIdentity> {
+        lock(&self.events).last()
+    }
+
+    /// Returns true if the server has an event that is not here.
+    #[must_use]
+    pub fn lacks_events(&self) -> bool {
+        let state = self.state();
+        let serve = state.and_then(|state| state.serve);
+        serve.is_some_and(|serve| Some(serve.events) != self.last_event().map(|last| last.1))
+    }
+}
