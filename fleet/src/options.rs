@@ -80,7 +80,7 @@ pub enum Command {
 #[derive(Debug, Clone, Args)]
 pub struct Network {
     /// A file with the table `zenoh`
-    #[arg(long, env = "ECAXIS_FLEET", global = true)]
+    #[arg(long, env = "ECAXIS_FLEET_CONFIG", global = true)]
     pub config: Option<PathBuf>,
     /// A router, such as tcp/router:7447
     #[arg(long, value_name = "ENDPOINT", global = true)]

@@ -1,6 +1,7 @@
 //! The agent of a machine: from the socket of `ecaxis serve` to Zenoh. It reads; orders alone change
 //! something.
 
+pub mod events;
 pub mod publish;
 pub mod reader;
 pub mod state;
@@ -15,6 +16,7 @@ use crate::config::{self, AgentFile, Role};
 use crate::error::{Error, Result};
 use crate::reports::ReportStore;
 use crate::session;
+use events::Events;
 use publish::Publisher;
 use reader::Reader;
 
@@ -39,12 +41,14 @@ pub async fn run(path: &Path) -> Result<()> {
     })?;
     let store = Arc::new(store);
     let socket = config::resolve(path, &file.socket);
+    let events = Arc::new(Events::default());
     let (updates, received) = mpsc::channel(UPDATES);
     let reader = Reader {
         id: id.clone(),
         socket: socket.clone(),
         page: file.page,
         store: Arc::clone(&store),
+        events: Arc::clone(&events),
         updates,
     };
     // Its connection to the server blocks. Without Zenoh, it still spools reports.
@@ -57,7 +61,8 @@ pub async fn run(path: &Path) -> Result<()> {
         ended = async {
             let session = session::open(zenoh).await?;
             tracing::info!(machine = %id, "connected");
-            Publisher::new(session, id.clone(), store, Some(socket)).run(received).await
+            let publisher = Publisher::new(session, id.clone(), store, events, Some(socket));
+            publisher.run(received).await
         } => ended,
         ended = session::terminated() => ended,
     }

@@ -12,6 +12,7 @@ use tokio::sync::mpsc::Receiver;
 use zenoh::Session;
 use zenoh::query::Query;
 
+use super::events::{EventIdentity, Events};
 use super::reader::{Update, attach_options};
 use crate::error::{Error, Result};
 use crate::keys::MachineId;
@@ -34,6 +35,7 @@ pub struct Publisher {
     session: Session,
     id: MachineId,
     store: Arc<ReportStore>,
+    events: Arc<Events>,
     socket: Option<PathBuf>,
     requests: Arc<Semaphore>,
     /// The last state, as it was published.
@@ -47,12 +49,14 @@ impl Publisher {
         session: Session,
         id: MachineId,
         store: Arc<ReportStore>,
+        events: Arc<Events>,
         socket: Option<PathBuf>,
     ) -> Self {
         Self {
             session,
             id,
             store,
+            events,
             socket,
             requests: Arc::new(Semaphore::new(REQUESTS)),
             state: None,
@@ -138,9 +142,14 @@ impl Publisher {
                 )
                 .await;
             }
-            Some((id, suffix @ ("events" | "samples"))) if id == self.id => {
-                self.ask_server(query.clone(), suffix == "samples");
+            Some((id, "events")) if id == self.id => {
+                let number = |name| query.parameters().get(name).and_then(|n| n.parse().ok());
+                let known = number("time_ns").zip(number("number"));
+                let known = known.map(|(time_ns, number)| EventIdentity { time_ns, number });
+                let events = json!({"events": self.events.after(known)}).to_string();
+                reply(&query, &self.id.key("events"), events.into_bytes()).await;
             }
+            Some((id, "samples")) if id == self.id => self.read_samples(query.clone()),
             Some((id, suffix)) if id == self.id => {
                 let report = suffix.strip_prefix("report/");
                 let report = report.and_then(|id| ReportId::try_from(id.to_owned()).ok());
@@ -153,8 +162,8 @@ impl Publisher {
     }
 
     /// Asks the server in a thread, because its client blocks.
-    fn ask_server(&self, query: Query, samples: bool) {
-        let key = self.id.key(if samples { "samples" } else { "events" });
+    fn read_samples(&self, query: Query) {
+        let key = self.id.key("samples");
         let permit = Arc::clone(&self.requests).try_acquire_owned();
         let socket = self.socket.clone();
         tokio::spawn(async move {
@@ -164,22 +173,14 @@ impl Publisher {
                 (Ok(permit), Some(socket)) => {
                     let parameters = query.parameters();
                     let signals = parameters.get("signals").unwrap_or_default().to_owned();
-                    let after = parameters.get("after").and_then(|n| n.parse().ok());
                     let seconds = parameters.get("seconds").and_then(|s| s.parse().ok());
                     let work = move || {
                         let _permit = permit;
                         let machine = Machine::attach(&socket, attach_options())?;
-                        match samples {
-                            true => read_samples(&machine, &signals, seconds.unwrap_or(1.0)),
-                            false => {
-                                let after: u64 = after.unwrap_or(0);
-                                machine.request("events", json!({"after": after}))
-                            }
-                        }
+                        read_samples(&machine, &signals, seconds.unwrap_or(1.0))
                     };
-                    let done = tokio::task::spawn_blocking(work).await;
                     let error = |error: ecaxis_client::Error| refusal(&error.code, &error.cause);
-                    match done {
+                    match tokio::task::spawn_blocking(work).await {
                         Ok(answer) => answer.map_err(error),
                         Err(_) => Err(refusal("failed", "the request has no answer")),
                     }

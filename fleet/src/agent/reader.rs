@@ -9,6 +9,7 @@ use ecaxis_client::{Machine, Options};
 use serde_json::{Value, json};
 use tokio::sync::mpsc::Sender;
 
+use super::events::Events;
 use super::state::{Serve, Server, State, unix_time};
 use crate::keys::MachineId;
 use crate::reports::{self, ReportStore, Summary};
@@ -38,6 +39,8 @@ pub struct Reader {
     pub page: Option<String>,
     /// Where fault reports go.
     pub store: Arc<ReportStore>,
+    /// The newest events.
+    pub events: Arc<Events>,
     /// To Zenoh.
     pub updates: Sender<Update>,
 }
@@ -82,6 +85,10 @@ impl Reader {
         // From here on, no event is missed; those before it are in the lists of the server.
         let events = machine.events()?;
         self.spool(&machine)?;
+        let earlier = machine.request("events", json!({"after": 0}))?;
+        for event in earlier["events"].as_array().into_iter().flatten() {
+            self.take_event(event);
+        }
         let mut due = Instant::now();
         loop {
             let rest = due.saturating_duration_since(Instant::now());
@@ -97,8 +104,14 @@ impl Reader {
                 if event["event"] == "fault_report" || event["event"] == "missed" {
                     self.spool(&machine)?;
                 }
-                self.send(Update::Event(event));
+                self.take_event(&event);
             }
+        }
+    }
+
+    fn take_event(&self, event: &Value) {
+        if self.events.add(event) {
+            self.send(Update::Event(event.clone()));
         }
     }
 
@@ -129,6 +142,7 @@ impl Reader {
             agent: env!("CARGO_PKG_VERSION").to_owned(),
             page: self.page.clone(),
             reports: self.store.len(),
+            last_event: self.events.last(),
             server: match serve {
                 Some(_) => Server::Present,
                 None => Server::Absent,

@@ -5,6 +5,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use super::events::EventIdentity;
 use crate::keys::MachineId;
 
 /// The axes with a fault that are listed, and the length of a text in characters.
@@ -25,6 +26,8 @@ pub struct State {
     pub page: Option<String>,
     /// The fault reports that the agent keeps.
     pub reports: usize,
+    /// The newest event that the agent has.
+    pub last_event: Option<EventIdentity>,
     /// `present`, or `absent`: nothing answers at the socket.
     pub server: Server,
     /// What the server says.
@@ -51,8 +54,6 @@ pub struct Serve {
     pub name: String,
     /// The SHA-256 of the machine's files.
     pub sha256: String,
-    /// The number of the last event.
-    pub events: u64,
     /// The bus.
     pub bus: Bus,
     /// The number of axes, of those enabled, and of those in motion.
@@ -152,7 +153,6 @@ impl Serve {
             version: text(&hello["version"]).unwrap_or_default(),
             name: text(&machine["name"]).unwrap_or_default(),
             sha256: text(&machine["sha256"]).unwrap_or_default(),
-            events: number(&state["events"]),
             bus: Bus {
                 state: text(&bus["state"]).unwrap_or_default(),
                 error: text(&bus["error"]),
@@ -245,6 +245,7 @@ mod tests {
             agent: "0.1.0".to_owned(),
             page: None,
             reports: 2,
+            last_event: None,
             server: Server::Absent,
             serve: None,
         };

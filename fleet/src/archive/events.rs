@@ -7,21 +7,14 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
+use crate::agent::events::EventIdentity;
+
 /// The length of a file; the one before it is kept, too.
 const MAX_FILE: u64 = 4 << 20;
 /// The longest event.
 const MAX_EVENT: usize = 16 << 10;
 /// The events that are recognized; a server has 1,000.
 const MAX_KNOWN: usize = 4000;
-
-/// The time of an event in ns and its number. Numbers alone begin again with the server.
-pub type EventIdentity = (u64, u64);
-
-/// Returns what distinguishes an event; `None` if it is none.
-#[must_use]
-pub fn identity(event: &Value) -> Option<EventIdentity> {
-    Some((event["time_ns"].as_u64()?, event["number"].as_u64()?))
-}
 
 /// The file of the events.
 #[derive(Debug)]
@@ -38,14 +31,11 @@ pub struct EventLog {
 struct Known {
     set: BTreeSet<EventIdentity>,
     order: VecDeque<EventIdentity>,
-    /// The one that came last, also if it was known.
-    last: Option<EventIdentity>,
 }
 
 impl Known {
     /// Returns true if the event is new.
     fn add(&mut self, identity: EventIdentity) -> bool {
-        self.last = Some(identity);
         if !self.set.insert(identity) {
             return false;
         }
@@ -81,7 +71,7 @@ impl EventLog {
                 .map_or(0, |at| at + 1);
             for line in text[..whole].split(|byte| *byte == b'\n') {
                 let event = serde_json::from_slice(line).ok();
-                if let Some(identity) = event.as_ref().and_then(identity) {
+                if let Some(identity) = event.as_ref().and_then(EventIdentity::of) {
                     known.add(identity);
                 }
             }
@@ -107,7 +97,7 @@ impl EventLog {
     /// Fails if the disk refuses.
     pub fn add(&mut self, events: impl IntoIterator<Item = Value>) -> io::Result<()> {
         for event in events {
-            let Some(identity) = identity(&event) else {
+            let Some(identity) = EventIdentity::of(&event) else {
                 continue;
             };
             let line = format!("{event}\n");
@@ -126,12 +116,6 @@ impl EventLog {
             self.length += line.len() as u64;
         }
         Ok(())
-    }
-
-    /// Returns the event that came last.
-    #[must_use]
-    pub fn last(&self) -> Option<EventIdentity> {
-        self.known.last
     }
 }
 
@@ -154,13 +138,11 @@ mod tests {
         let mut file = OpenOptions::new().append(true).open(&path).unwrap();
         file.write_all(b"{\"event\":\"fau").unwrap();
         let mut again = EventLog::open(folder.path()).unwrap();
-        assert_eq!(again.last(), Some((2000, 2)));
         again.add([event(1), event(3)]).unwrap();
         // The computer has restarted.
         let mut first = event(1);
         first["time_ns"] = json!(7);
         again.add([first.clone()]).unwrap();
-        assert_eq!(again.last(), Some((7, 1)));
         let text = fs::read_to_string(&path).unwrap();
         let events: Vec<Value> = text
             .lines()
@@ -182,9 +164,11 @@ mod tests {
             let length = entry.unwrap().metadata().unwrap().len();
             assert!(length <= MAX_FILE + MAX_EVENT as u64, "{length}");
         }
-        assert_eq!(
-            EventLog::open(folder.path()).unwrap().last(),
-            Some((999_000, 999))
-        );
+        let known = EventLog::open(folder.path()).unwrap().known;
+        let last = EventIdentity {
+            time_ns: 999_000,
+            number: 999,
+        };
+        assert_eq!(known.order.back(), Some(&last));
     }
 }

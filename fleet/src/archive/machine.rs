@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
-use super::events::{EventIdentity, EventLog};
+use super::events::EventLog;
+use crate::agent::events::EventIdentity;
 use crate::agent::state::State;
 use crate::keys::MachineId;
 use crate::reports::{ReportStore, summarize};
@@ -23,6 +24,8 @@ pub struct ArchivedMachine {
     pub reports: ReportStore,
     folder: PathBuf,
     events: Mutex<EventLog>,
+    /// Single events come earlier than those before them.
+    complete_to: Mutex<Option<EventIdentity>>,
     state: Mutex<LastState>,
 }
 
@@ -49,6 +52,7 @@ impl ArchivedMachine {
             reports,
             folder: folder.to_owned(),
             events: Mutex::new(EventLog::open(folder)?),
+            complete_to: Mutex::default(),
             state: Mutex::new(LastState {
                 state,
                 written: None,
@@ -95,24 +99,36 @@ impl ArchivedMachine {
         }
     }
 
-    /// Writes the events that are not there.
-    pub fn add_events(&self, id: &MachineId, new: impl IntoIterator<Item = Value>) {
-        if let Err(error) = lock(&self.events).add(new) {
-            tracing::error!(machine = %id, "events: {error}");
+    /// Writes an event unless it is there.
+    pub fn add_event(&self, id: &MachineId, event: Value) {
+        self.write_events(id, [event]);
+    }
+
+    /// Writes the events after [`Self::complete_to`] that are not there.
+    pub fn complete_events(&self, id: &MachineId, events: Vec<Value>) {
+        let last = events.last().and_then(EventIdentity::of);
+        self.write_events(id, events);
+        if last.is_some() {
+            *lock(&self.complete_to) = last;
         }
     }
 
-    /// Returns the event that came last.
+    /// Returns the event up to which none is missing.
     #[must_use]
-    pub fn last_event(&self) -> Option<EventIdentity> {
-        lock(&self.events).last()
+    pub fn complete_to(&self) -> Option<EventIdentity> {
+        *lock(&self.complete_to)
     }
 
-    /// Returns true if the server has an event that is not here.
+    /// Returns true if the agent may have an event that is not here.
     #[must_use]
     pub fn lacks_events(&self) -> bool {
-        let state = self.state();
-        let serve = state.and_then(|state| state.serve);
-        serve.is_some_and(|serve| Some(serve.events) != self.last_event().map(|last| last.1))
+        let last = self.state().and_then(|state| state.last_event);
+        last.is_some() && last != self.complete_to()
+    }
+
+    fn write_events(&self, id: &MachineId, events: impl IntoIterator<Item = Value>) {
+        if let Err(error) = lock(&self.events).add(events) {
+            tracing::error!(machine = %id, "events: {error}");
+        }
     }
 }

@@ -218,7 +218,7 @@ impl Archive {
             && let Ok(event) = serde_json::from_slice::<Value>(&sample.payload().to_bytes())
             && let Some(machine) = self.machine(&id)
         {
-            machine.add_events(&id, [event]);
+            machine.add_event(&id, event);
         }
     }
 
@@ -284,36 +284,21 @@ impl Archive {
         }
     }
 
-    /// Fetches the events after the last known one; all that the server has if that one is not
-    /// theirs.
+    /// Fetches the events that the agent has after the last known one.
     async fn query_events(&self, id: &MachineId) {
-        let Some(machine) = self.machine(id) else {
+        let (Some(machine), Ok(_permit)) = (self.machine(id), self.queries.acquire().await) else {
             return;
         };
-        let last = machine.last_event();
-        let before = last.map_or(0, |(_, number)| number.saturating_sub(1));
-        for after in if before == 0 {
-            vec![0]
-        } else {
-            vec![before, 0]
-        } {
-            let Ok(_permit) = self.queries.acquire().await else {
-                return;
-            };
-            let selector = id.key(&format!("events?after={after}"));
-            let replies = session::query(&self.session, &selector, TIMEOUT).await;
-            let Some(mut answer) = replies.ok().and_then(|r| r.first()?.json::<Value>()) else {
-                return;
-            };
-            let Value::Array(events) = answer["events"].take() else {
-                return;
-            };
-            let known = events.iter().any(|event| events::identity(event) == last);
-            let all = after == 0 || known;
-            machine.add_events(id, events);
-            if all {
-                return;
-            }
+        let known = machine.complete_to().map_or(String::new(), |known| {
+            format!("?time_ns={};number={}", known.time_ns, known.number)
+        });
+        let selector = id.key(&format!("events{known}"));
+        let replies = session::query(&self.session, &selector, TIMEOUT).await;
+        let answer = replies
+            .ok()
+            .and_then(|replies| replies.first()?.json::<Value>());
+        if let Some(Value::Array(events)) = answer.map(|mut answer| answer["events"].take()) {
+            machine.complete_events(id, events);
         }
     }
 

@@ -1,0 +1,2 @@
+def access(report, program):
+    pass
