@@ -1,2 +1,156 @@
+"""The shipped examples with mutual TLS and access control: who may not read reads nothing, who may read commands nothing."""
+
+import contextlib
+import json
+import os
+import pathlib
+import socket
+import subprocess
+import tempfile
+import threading
+import time
+
+import rig
+
+NAMES = ["router", "press-3", "archive", "reader", "planner", "stranger"]
+ALL = "ecaxis/**"
+KEY = "ecaxis/hall-1/press-3"
+
+
+def openssl(*arguments):
+    subprocess.run(["openssl", *map(str, arguments)], check=True, capture_output=True)
+
+
+def authority(folder, names):
+    """Makes a certificate authority and a certificate for each name."""
+    folder.mkdir()
+    key = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2"]
+    ca = ["-keyout", folder / "ca.key", "-out", folder / "ca.pem", "-subj", "/CN=test authority"]
+    openssl("req", "-x509", *key, *ca)
+    for name in names:
+        files = ["-keyout", folder / f"{name}.key", "-out", folder / f"{name}.pem", "-subj", f"/CN={name}"]
+        host = ["-addext", "subjectAltName=DNS:localhost", "-addext", "basicConstraints=critical,CA:FALSE"]
+        openssl("req", "-x509", "-CA", folder / "ca.pem", "-CAkey", folder / "ca.key", *key, *files, *host)
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+class Client:
+    """A session of Python's Zenoh with a certificate. It hears what it may."""
+
+    def __init__(self, endpoint, tls, name):
+        import zenoh
+
+        certificate = {"connect_certificate": f"{tls}/{name}.pem", "connect_private_key": f"{tls}/{name}.key"} if name else {}
+        link = {"tls": {"root_ca_certificate": f"{tls}/ca.pem", "enable_mtls": bool(name), **certificate}}
+        config = {"mode": "client", "connect": {"endpoints": [endpoint], "timeout_ms": 3000}, "transport": {"link": link}}
+        config["scouting"] = {"multicast": {"enabled": False}}
+        self.session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        self.heard, self.lock = [], threading.Lock()
+        declare = [self.session.declare_subscriber, self.session.liveliness().declare_subscriber]
+        keys = [ALL, f"{KEY}/state", "ecaxis/*/*/state", "ecaxis/*/*/event/*"], [ALL, "ecaxis/*/*/alive"]
+        self.declared = [function(key, self.hear) for function, own in zip(declare, keys) for key in own]
+
+    def hear(self, sample):
+        with self.lock:
+            self.heard.append((str(sample.key_expr), sample.payload.to_string()))
+
+    def ask(self, selector, payload=None):
+        replies = self.session.get(selector, payload=payload, timeout=2.0)
+        return [reply.ok.payload.to_string() for reply in replies if reply.ok]
+
+    def alive(self):
+        replies = self.session.liveliness().get("ecaxis/*/*/alive", timeout=2.0)
+        return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok)
+
+    def close(self):
+        self.session.close()
+
+
 def access(report, program):
-    pass
+    report.section("access")
+    with tempfile.TemporaryDirectory(prefix="ecaxis-judge-") as temporary, contextlib.ExitStack() as stack:
+        folder, port = pathlib.Path(temporary), free_port()
+        authority(folder / "tls", NAMES)
+        authority(folder / "other", NAMES)
+        for example in (rig.ROOT / "configs/fleet").glob("*.toml"):
+            text = example.read_text().replace("/run/ecaxis/press-3.sock", "serve.sock").replace("/var/lib/ecaxis-fleet/", "")
+            text = text.replace("tls/router:7447", f"tls/localhost:{port}").replace("tls/[::]:7447", f"tls/127.0.0.1:{port}")
+            (folder / example.name).write_text(text)
+        text = (rig.ROOT / "configs/demo.toml").read_text().replace('"1ms"', '"10ms"').replace("lost_frames = 20", "lost_frames = 9")
+        (folder / "machine.toml").write_text(text.replace('"esi/', f'"{rig.ROOT}/configs/esi/'))
+        (folder / "forged.toml").write_text((folder / "agent.toml").read_text().replace('machine = "press-3"', 'machine = "press-4"'))
+        changes, log = folder / "changes.jsonl", open(folder / "log", "wb")
+
+        def start(*command, **environment):
+            environment = {**os.environ, **environment}
+            stack.enter_context(rig.process(list(map(str, command)), stdout=log, stderr=log, env=environment))
+
+        serve = [rig.binary(), "serve", folder / "machine.toml", "--sim", "--quiet", "--socket", folder / "serve.sock"]
+        start(*serve, ECAXIS_CHANGE_LOG=str(changes))
+        for verb in ("router", "archive", "agent"):
+            start(program, verb, folder / f"{verb}.toml")
+        start(program, "agent", folder / "forged.toml")
+        endpoint, tls = f"tls/localhost:{port}", folder / "tls"
+
+        def command(*arguments):
+            arguments = [program, *arguments, "--config", folder / "client.toml"]
+            done = subprocess.run(arguments, capture_output=True, text=True, timeout=60)
+            return json.loads(done.stdout) if done.returncode == 0 else done.stderr
+
+        end = time.monotonic() + 20
+        while time.monotonic() < end:
+            rows = command("status", "--json")
+            if isinstance(rows, list) and rows and rows[0]["alive"] and (rows[0]["state"] or {}).get("server") == "present":
+                break
+            time.sleep(0.5)
+        names = [(row["machine"], row["alive"]) for row in rows] if isinstance(rows, list) else rows
+        report.need("a reader sees the machine, and none under a name that is not its own", names == [("press-3", True)], names)
+
+        reader, planner, stranger = (Client(endpoint, tls, name) for name in ("reader", "planner", "stranger"))
+        # A session hears itself: what must come to nothing comes from sessions of its own.
+        forgers = [Client(endpoint, tls, name) for name in ("reader", "stranger")]
+        for client in (reader, planner, stranger, *forgers):
+            stack.callback(client.close)
+        forged = '{"site":"hall-1","machine":"press-3","unix_time":9e9}'
+        for client in forgers:
+            token = client.session.liveliness().declare_token("ecaxis/hall-1/ghost/alive")
+            answer = client.session.declare_queryable("ecaxis/*/*/state", lambda q: q.reply(f"{KEY}/state", forged))
+            client.declared += [token, answer]
+            for suffix in ("state", "order", "event/1", "report/1"):
+                client.session.put(f"{KEY}/{suffix}", forged)
+            client.session.delete(f"{KEY}/state")
+        time.sleep(3)
+        states = [text for key, text in reader.heard if key == f"{KEY}/state"]
+        report.check("a reader hears states", len(states) >= 2, len(states))
+        report.check("and asks for them", reader.ask(f"{KEY}/state"))
+        heard = [what for client in (reader, planner) for what in client.heard if "9e9" in what[1] or "ghost" in what[0]]
+        report.equal("no forged state, event or token arrives", heard, [])
+        state = command("status", "--json")[0]["state"]
+        report.check("no forged answer arrives", abs(state["unix_time"] - time.time()) < 60, state["unix_time"])
+        report.equal("tokens", reader.alive(), [f"{KEY}/alive"])
+        order = json.dumps({"machine": "hall-1/press-3", "action": "start"})
+        for key in (f"{KEY}/order", "ecaxis/*/*/order", ALL):
+            report.equal(f"a reader's order at {key}", reader.ask(key, order), [])
+        answers = [json.loads(text)["ok"] for text in planner.ask(f"{KEY}/order", order)]
+        report.equal("an order without a key, from a client with the right to send it, is refused", answers, [False])
+        wildcard = [text for text in planner.ask("ecaxis/*/*/order", order)]
+        report.equal("an order to all at once has no answer", wildcard, [])
+        report.equal("a stranger hears", stranger.heard, [])
+        report.equal("a stranger asks for tokens", stranger.alive(), [])
+        for suffix in ("state", "reports", "events", "order", "samples?signals=x.position"):
+            report.equal(f"a stranger asks for {suffix}", stranger.ask(f"{KEY}/{suffix}", order), [])
+        entries = [json.loads(line) for line in changes.read_text().splitlines()]
+        report.equal("no command reached the machine", [entry for entry in entries if "client" in entry], [])
+        for what, certificates, name in (("another authority", folder / "other", "reader"), ("no certificate", tls, None)):
+            try:
+                client = Client(endpoint, certificates, name)
+                heard = client.ask(f"{KEY}/state")
+                client.close()
+                report.check(f"{what}: no session", False, heard)
+            except Exception as error:
+                report.check(f"{what}: no session", "onnect" in str(error), str(error)[:80])
