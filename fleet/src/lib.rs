@@ -22,6 +22,7 @@ pub mod reports;
 pub mod router;
 pub mod session;
 
+use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use options::{Command, Options};
@@ -37,6 +38,7 @@ pub fn run(options: Options) -> ExitCode {
     let filter = EnvFilter::try_from_default_env();
     let filter = filter.unwrap_or_else(|_| EnvFilter::new("error,ecaxis_fleet=info"));
     let log = tracing_subscriber::fmt().with_env_filter(filter);
+    let log = log.with_ansi(std::io::stderr().is_terminal());
     log.with_writer(std::io::stderr).init();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(WORKERS)
