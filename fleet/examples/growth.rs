@@ -1,5 +1,5 @@
-//! Bytes and processor time per machine, and the time until a new observer has the whole picture, for
-//! 1, 10, 100 and 1,000 simulated agents in one process against a router in another.
+//! Bytes and processor time per machine, and the time until a new observer has the whole picture:
+//! 1, 10, 100 and 1,000 simulated agents in one process, against a router in another.
 //!
 //! The loopback interface must carry nothing else, so run it in a network namespace of its own:
 //!

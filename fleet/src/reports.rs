@@ -71,8 +71,7 @@ pub struct Summary {
     pub headline: String,
 }
 
-/// Returns the bytes of a report: JSON with sorted keys, so that the same report always has the same
-/// id.
+/// Returns the bytes of a report: JSON with sorted keys. The same report always has the same id.
 #[must_use]
 pub fn encode(machine: &MachineId, event: u64, report: &Value) -> Vec<u8> {
     let document = json!({

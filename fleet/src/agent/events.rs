@@ -29,8 +29,8 @@ impl EventIdentity {
     }
 }
 
-/// The newest events. Those about the clients of the socket are left out: each query of samples would
-/// cause some.
+/// The newest events. Those about the clients of the socket are left out: each query of samples
+/// would cause some.
 #[derive(Debug, Default)]
 pub struct Events {
     kept: Mutex<VecDeque<(EventIdentity, Value)>>,

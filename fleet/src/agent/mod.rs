@@ -1,4 +1,4 @@
-//! The agent of a machine: from the socket of `ecaxis serve` to Zenoh. It reads; orders alone change
+//! The agent of a machine: from the socket of `ecaxis serve` to Zenoh. It reads; only orders change
 //! something.
 
 pub mod events;
@@ -22,8 +22,8 @@ use reader::Reader;
 
 /// The fault reports that an agent keeps. The server itself has 20.
 const MAX_REPORTS: usize = 500;
-/// The updates that wait for Zenoh. More of them are dropped: states are superseded, and the archive
-/// queries what it has missed.
+/// The updates that wait for Zenoh. More of them are dropped: a newer state follows, and the
+/// archive queries what it has missed.
 pub const UPDATES: usize = 256;
 
 /// Publishes a machine until SIGINT or SIGTERM.

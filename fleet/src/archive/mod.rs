@@ -1,5 +1,5 @@
-//! The archive: last states, and the history of fault reports and events. It pulls what it lacks, by
-//! content, so that it may end at any time and lose or double nothing.
+//! The archive: last states, and the history of fault reports and events. It pulls what it lacks by
+//! content. It may end at any time, and loses or doubles nothing.
 
 pub mod events;
 pub mod machine;
@@ -26,8 +26,8 @@ use machine::ArchivedMachine;
 
 /// The machines of an archive.
 const MAX_MACHINES: usize = 10_000;
-/// An agent offers at most 500 reports, another archive 1,000: a smaller archive would fetch what it
-/// has deleted.
+/// An agent offers at most 500 reports, another archive 1,000: a smaller archive would fetch what
+/// it has deleted.
 const MIN_REPORTS: usize = 1000;
 /// The queries at the same time.
 const QUERIES: usize = 16;
