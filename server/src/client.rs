@@ -40,6 +40,8 @@ const JOG_PAUSE_NS: u64 = 1_000_000_000;
 const TORQUE_OFFSET: u16 = 0x60b2;
 /// The longest name of a client.
 const NAME_LENGTH: usize = 64;
+/// The longest text of a note, in characters.
+const NOTE_LENGTH: usize = 2000;
 
 /// The answer to a request.
 #[derive(Debug)]
@@ -296,6 +298,12 @@ impl Client {
                 let bytes = self.sdo_bytes(&device, &index, sub, data, value)?;
                 self.sdo_write(&device, &index, sub, complete, &bytes).await
             }
+            // The entry of the change log is all that this operation does.
+            Op::Note { text } if text.chars().count() > NOTE_LENGTH => {
+                let message = format!("`text` has more than {NOTE_LENGTH} characters");
+                Err(OpError::new(ErrorCode::BadRequest, message))
+            }
+            Op::Note { .. } => Ok(Map::new()),
             Op::Take {
                 name,
                 ttl_ms,

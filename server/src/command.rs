@@ -64,6 +64,11 @@ pub enum Op {
         #[serde(default)]
         complete: bool,
     },
+    /// Enters a text in the change log, at most 2000 characters. Needs no lease.
+    Note {
+        #[schemars(length(max = 2000))]
+        text: String,
+    },
     /// Gets the lease: the client owns the motion.
     Take {
         name: Option<String>,
@@ -295,6 +300,7 @@ impl Op {
             Self::Stop {}
             | Self::EmergencyStop {}
             | Self::Hold { .. }
+            | Self::Note { .. }
             | Self::Take { .. }
             | Self::Renew {}
             | Self::Release {}

@@ -260,7 +260,18 @@ fn commands_are_in_the_change_log_with_their_client() {
     }
     let mut other = server.client();
     other.refused("move", json!({"axis": "x", "to": 1.0}));
-    let expected = ["take", "enable", "override", "sdo_write", "jog", "move"];
+    other.ok("note", json!({"text": "a new spindle"}));
+    other.refused("note", json!({"text": "x".repeat(2001)}));
+    let expected = [
+        "take",
+        "enable",
+        "override",
+        "sdo_write",
+        "jog",
+        "move",
+        "note",
+        "note",
+    ];
     // The thread that writes is not waited for.
     let end = Instant::now() + Duration::from_secs(10);
     while server.changes().len() < expected.len() && Instant::now() < end {
@@ -281,6 +292,8 @@ fn commands_are_in_the_change_log_with_their_client() {
     assert_eq!(changes[3]["sha256"].as_str().map(str::len), Some(64));
     let refused = changes[5]["outcome"].as_str().unwrap();
     assert!(refused.contains("cell"), "{refused}");
+    assert_eq!(changes[6]["command"]["text"], json!("a new spindle"));
+    assert_eq!(changes[6]["outcome"], json!("ok"));
 }
 
 /// A client presses the inputs of a simulated bus, without the lease.
