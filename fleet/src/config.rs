@@ -9,6 +9,8 @@ use serde_json::{Map, Value, json};
 
 use crate::error::{Error, Result};
 use crate::keys::{MachineId, Name};
+use crate::orders::executor::OrdersTable;
+use crate::orders::signing::KeyTable;
 
 /// The longest file.
 const MAX_FILE: u64 = 1 << 20;
@@ -45,6 +47,11 @@ pub struct AgentFile {
     pub spool: PathBuf,
     /// The address of the machine's own page.
     pub page: Option<String>,
+    /// How orders are executed. Without it, the agent only reads.
+    pub orders: Option<OrdersTable>,
+    /// The keys whose orders are executed.
+    #[serde(default)]
+    pub key: Vec<KeyTable>,
     /// The configuration of Zenoh.
     #[serde(default)]
     pub zenoh: toml::Table,

@@ -65,6 +65,10 @@ async fn execute(command: Command) -> error::Result<()> {
         Command::Status { network, json } => observe::status::run(&network, json).await,
         Command::Watch { network, json } => observe::watch::run(&network, json).await,
         Command::Report { network, action } => observe::report::run(&network, action).await,
+        Command::Bundle { action } => orders::commands::bundle(action),
+        Command::Push(args) => orders::commands::push(args).await,
+        Command::Start(args) => orders::commands::start(args).await,
+        Command::Update(args) => orders::commands::update(args).await,
         Command::Samples { network, request } => observe::samples::run(&network, request).await,
     }
 }

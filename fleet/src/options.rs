@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand};
 
 use crate::keys::MachineId;
+use crate::orders::commands::{BundleAction, PushArgs, StartArgs, UpdateArgs};
 use crate::reports::ReportId;
 
 /// Machines of `ecaxis serve` as a fleet over Zenoh
@@ -74,6 +75,38 @@ pub enum Command {
         #[command(flatten)]
         request: SamplesRequest,
     },
+    /// Make, sign and verify bundles: the files of a machine
+    #[command(
+        after_help = "Examples:\n  ecaxis-fleet bundle make machine.toml press.bundle \\\n    \
+                            --machine hall-1/press-3\n  \
+                            ecaxis-fleet bundle sign press.bundle --key release.key"
+    )]
+    Bundle {
+        #[command(subcommand)]
+        action: BundleAction,
+    },
+    /// Send a bundle to a machine, which checks it and restarts with it
+    #[command(
+        after_help = "Examples:\n  ecaxis-fleet push hall-1/press-3 press.bundle \
+                            --key anna.key\n  \
+                            ecaxis-fleet push hall-1/press-3 --back --key anna.key"
+    )]
+    Push(PushArgs),
+    /// Start the programs of machines
+    #[command(
+        after_help = "Examples:\n  ecaxis-fleet start hall-1/press-3 --key anna.key\n  \
+                            ecaxis-fleet start hall-1/press-3 hall-1/press-4 \\\n    \
+                            --at 1795718434.5 --key anna.key"
+    )]
+    Start(StartArgs),
+    /// Update firmware or parameters, device by device, up to the first failure
+    #[command(
+        after_help = "Examples:\n  ecaxis-fleet update new.msdc hall-1/press-3:x,y \\\n    \
+                            hall-1/press-4:x,y --key anna.key\n  \
+                            ecaxis-fleet update x.toml hall-1/press-3:x \\\n    \
+                            --parameters --key anna.key"
+    )]
+    Update(UpdateArgs),
 }
 
 /// How a command reaches the fleet.

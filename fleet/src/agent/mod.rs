@@ -14,6 +14,8 @@ use tokio::sync::mpsc;
 
 use crate::config::{self, AgentFile, Role};
 use crate::error::{Error, Result};
+use crate::orders::executor::OrderExecutor;
+use crate::orders::sender::ZenohSource;
 use crate::reports::ReportStore;
 use crate::session;
 use events::Events;
@@ -61,8 +63,17 @@ pub async fn run(path: &Path) -> Result<()> {
         ended = async {
             let session = session::open(zenoh).await?;
             tracing::info!(machine = %id, "connected");
+            let orders = file.orders.as_ref().map(|table| {
+                let source = Box::new(ZenohSource::new(session.clone(), id.clone()));
+                let socket = socket.clone();
+                let orders =
+                    OrderExecutor::open(path, id.clone(), socket, table, &file.key, source)?;
+                orders.resume()?;
+                Ok::<_, Error>(orders)
+            });
+            let orders = orders.transpose()?;
             let publisher = Publisher::new(session, id.clone(), store, events, Some(socket));
-            publisher.run(received).await
+            publisher.with_orders(orders).run(received).await
         } => ended,
         ended = session::terminated() => ended,
     }

@@ -16,7 +16,8 @@ use super::events::{EventIdentity, Events};
 use super::reader::{Update, attach_options};
 use crate::error::{Error, Result};
 use crate::keys::MachineId;
-use crate::orders;
+use crate::orders::executor::OrderExecutor;
+use crate::orders::order::{OrderReply, Status};
 use crate::reports::{ReportId, ReportStore};
 use crate::session::reply;
 
@@ -26,8 +27,6 @@ const MAX_ROWS: usize = 20_000;
 const MAX_SIGNALS: usize = 32;
 /// The requests to the server at the same time. More of them are refused.
 const REQUESTS: usize = 4;
-/// The longest order.
-const MAX_ORDER: usize = 64 << 10;
 
 /// A machine on Zenoh.
 #[derive(Debug)]
@@ -37,6 +36,8 @@ pub struct Publisher {
     store: Arc<ReportStore>,
     events: Arc<Events>,
     socket: Option<PathBuf>,
+    /// Without it, the agent only reads.
+    orders: Option<Arc<OrderExecutor>>,
     requests: Arc<Semaphore>,
     /// The last state, as it was published.
     state: Option<Vec<u8>>,
@@ -58,9 +59,16 @@ impl Publisher {
             store,
             events,
             socket,
+            orders: None,
             requests: Arc::new(Semaphore::new(REQUESTS)),
             state: None,
         }
+    }
+
+    /// Executes orders, if there is an executor.
+    #[must_use]
+    pub fn with_orders(self, orders: Option<Arc<OrderExecutor>>) -> Self {
+        Self { orders, ..self }
     }
 
     /// Publishes until the reader ends.
@@ -130,17 +138,21 @@ impl Publisher {
         match MachineId::of_key(keys.as_str()) {
             Some((id, "order")) if id == self.id => {
                 let order = query.payload().map(|payload| payload.to_bytes());
-                let order = order.unwrap_or_default();
-                let answer = match order.len() <= MAX_ORDER {
-                    true => orders::answer(&order),
-                    false => refusal("bad_request", "the order is too long"),
-                };
-                reply(
-                    &query,
-                    &self.id.key("order"),
-                    answer.to_string().into_bytes(),
-                )
-                .await;
+                let order = order.unwrap_or_default().into_owned();
+                let (orders, key) = (self.orders.clone(), self.id.key("order"));
+                // The log of orders is written before the answer.
+                tokio::spawn(async move {
+                    let receive = move || match orders {
+                        Some(orders) => orders.receive(&order),
+                        None => OrderReply::new(
+                            Status::Refused,
+                            "this machine takes no orders: its agent has no table `orders`",
+                        ),
+                    };
+                    if let Ok(answer) = tokio::task::spawn_blocking(receive).await {
+                        reply(&query, &key, json!(answer).to_string().into_bytes()).await;
+                    }
+                });
             }
             Some((id, "events")) if id == self.id => {
                 let number = |name| query.parameters().get(name).and_then(|n| n.parse().ok());

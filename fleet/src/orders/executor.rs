@@ -1,0 +1,296 @@
+//! Receives orders and executes them, one at a time.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use serde::Deserialize;
+
+use super::digest::FileDigest;
+use super::journal::OrderJournal;
+use super::order::{Action, Order, OrderReply, SignedOrder, Status};
+use super::server;
+use super::signing::{KeyTable, Keyring};
+use super::slots::Slots;
+use super::store::{FileSource, FileStore};
+use crate::config;
+use crate::error::{Error, Result};
+use crate::keys::MachineId;
+
+/// The table `[orders]` of an agent's file.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OrdersTable {
+    /// The folder of the slots, the log and the received files.
+    pub folder: PathBuf,
+    /// The machine file that the server uses. With bundles: in `FOLDER/current`.
+    pub machine_file: PathBuf,
+    /// The program.
+    #[serde(default = "ecaxis")]
+    pub ecaxis: String,
+    /// The command that restarts the server. Without it, bundles are refused.
+    #[serde(default)]
+    pub restart: Vec<String>,
+    /// The time in which the machine is healthy after a change, in s.
+    #[serde(default = "health_timeout_s")]
+    pub health_timeout_s: u64,
+    /// False: bundles are not compared with the bus.
+    #[serde(default = "compare")]
+    pub compare: bool,
+}
+
+fn ecaxis() -> String {
+    "ecaxis".to_owned()
+}
+
+fn health_timeout_s() -> u64 {
+    60
+}
+
+fn compare() -> bool {
+    true
+}
+
+/// Executes the orders to one machine.
+pub struct OrderExecutor {
+    pub(super) machine: MachineId,
+    pub(super) socket: PathBuf,
+    pub(super) table: OrdersTable,
+    pub(super) keys: Keyring,
+    pub(super) store: FileStore,
+    pub(super) slots: Slots,
+    pub(super) source: Box<dyn FileSource>,
+    journal: Mutex<OrderJournal>,
+    running: Mutex<Option<String>>,
+}
+
+impl fmt::Debug for OrderExecutor {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut shown = f.debug_struct("OrderExecutor");
+        shown
+            .field("machine", &self.machine)
+            .finish_non_exhaustive()
+    }
+}
+
+/// Why an order did not reach its end.
+#[derive(Debug)]
+pub(super) enum Ended {
+    /// Nothing was changed.
+    Refused(Error),
+    Failed(Error),
+}
+
+/// `?` in the checks before a change.
+impl From<Error> for Ended {
+    fn from(error: Error) -> Self {
+        Self::Refused(error)
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Returns the seconds since 1970.
+#[must_use]
+pub fn unix_time() -> u64 {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH);
+    now.map_or(0, |now| now.as_secs())
+}
+
+impl OrderExecutor {
+    /// Opens the folder of the orders. Paths are relative to the agent's file.
+    ///
+    /// # Errors
+    /// Fails if a key is wrong, or the folder cannot be used.
+    pub fn open(
+        file: &Path,
+        machine: MachineId,
+        socket: PathBuf,
+        table: &OrdersTable,
+        keys: &[KeyTable],
+        source: Box<dyn FileSource>,
+    ) -> Result<Arc<Self>> {
+        let mut table = table.clone();
+        table.folder = config::resolve(file, &table.folder);
+        table.machine_file = config::resolve(file, &table.machine_file);
+        let slots = Slots::open(&table.folder)?;
+        Ok(Arc::new(Self {
+            machine,
+            socket,
+            keys: Keyring::new(keys)?,
+            store: FileStore::open(&table.folder.join("files"), Duration::from_secs(1))?,
+            journal: Mutex::new(OrderJournal::open(&table.folder.join("orders.jsonl"))?),
+            slots,
+            table,
+            source,
+            running: Mutex::new(None),
+        }))
+    }
+
+    /// Continues a switch during which the agent ended.
+    ///
+    /// # Errors
+    /// Fails if the file of the switch is damaged.
+    pub fn resume(self: &Arc<Self>) -> Result<()> {
+        let Some(switch) = self.slots.pending()? else {
+            return Ok(());
+        };
+        *lock(&self.running) = Some(format!("the switch by `{}`", switch.sender));
+        let executor = Arc::clone(self);
+        thread::spawn(move || {
+            let done = executor.finish(&switch, &mut |_| ());
+            let text = match done {
+                Ok(text) => text,
+                Err(Ended::Refused(error) | Ended::Failed(error)) => error.to_string(),
+            };
+            tracing::warn!(sender = switch.sender, "switch after a restart: {text}");
+            let text = format!("switch after a restart of the agent: {text}");
+            server::note(&executor.socket, &switch.sender, &text);
+            *lock(&executor.running) = None;
+        });
+        Ok(())
+    }
+
+    /// Returns the answer to a message. A new order begins; a known one is not executed again.
+    pub fn receive(self: &Arc<Self>, bytes: &[u8]) -> OrderReply {
+        let refused = |error: Error| OrderReply::new(Status::Refused, error.to_string());
+        let verified = SignedOrder::parse(bytes).and_then(|signed| {
+            let text = signed.order.as_bytes();
+            let key = self.keys.verify("the order", text, &signed.signature)?;
+            let order = Order::parse(&signed.order)?;
+            Ok((order, key, FileDigest::of(text)))
+        });
+        let (order, key, sha256) = match verified {
+            Ok(verified) => verified,
+            Err(error) => {
+                tracing::warn!("order refused: {error}");
+                return refused(error);
+            }
+        };
+        let now = unix_time();
+        let mut journal = lock(&self.journal);
+        match journal.reply(&order, sha256) {
+            Ok(None) => {}
+            Ok(Some(reply)) => return reply,
+            Err(error) => return refused(error),
+        }
+        let mut running = lock(&self.running);
+        let permitted = order
+            .check(&self.machine, now)
+            .and_then(|()| key.require(order.action.right()))
+            .and_then(|()| match &*running {
+                Some(other) => Err(Error::new(format!("{other} is not done yet"))),
+                None => Ok(()),
+            });
+        let reply = match permitted {
+            Ok(()) => OrderReply::new(Status::Running, "accepted"),
+            Err(error) => refused(error),
+        };
+        let begins = reply.status == Status::Running;
+        if let Err(error) = journal.begin(&order, sha256, &key.name, now, reply.clone()) {
+            return refused(error);
+        }
+        drop(journal);
+        if begins {
+            *running = Some(format!("`{}` by `{}`", order.action.summary(), key.name));
+        }
+        let (executor, sender) = (Arc::clone(self), key.name.clone());
+        let first = reply.clone();
+        thread::spawn(move || {
+            executor.log(&order, &sender, &first);
+            if begins {
+                executor.execute(&order, &sender);
+                *lock(&executor.running) = None;
+            }
+        });
+        reply
+    }
+
+    /// Enters an order with its state in the change log of the machine.
+    fn log(&self, order: &Order, sender: &str, reply: &OrderReply) {
+        let (summary, text) = (order.action.summary(), reply.text.replace('\n', " "));
+        let status = match reply.status {
+            Status::Running => "begins",
+            Status::Started => "started",
+            Status::Done => "done",
+            Status::Refused => "refused",
+            Status::Failed => "failed",
+        };
+        let text = format!("order `{summary}`: {status}: {text}");
+        tracing::info!(sender, "{text}");
+        if !server::note(&self.socket, sender, &text) {
+            tracing::warn!(sender, "no server answers: the change log has no entry");
+        }
+    }
+
+    fn execute(self: &Arc<Self>, order: &Order, sender: &str) {
+        let mut progress = |status: Status, text: String| {
+            let reply = OrderReply::new(status, text);
+            let kept = status == Status::Started;
+            let updated = lock(&self.journal).update(&order.nonce, unix_time(), reply, kept);
+            if let Err(error) = updated {
+                tracing::error!("the log of orders: {error}");
+            }
+        };
+        let done = match &order.action {
+            Action::Push {
+                manifest,
+                signature,
+            } => self.push(*manifest, signature, sender, &mut |text| {
+                progress(Status::Running, text);
+            }),
+            Action::Back {} => self.back(sender, &mut |text| progress(Status::Running, text)),
+            Action::Start { at_unix_ns } => self.start(*at_unix_ns, sender, &mut progress),
+            Action::Firmware {
+                device,
+                name,
+                file,
+                signature,
+            } => {
+                let signature = signature.as_deref();
+                self.update_firmware(device, name, *file, signature, sender, &mut |text| {
+                    progress(Status::Running, text);
+                })
+            }
+            Action::Parameters { device, name, file } => {
+                self.update_parameters(device, name, *file, sender, &mut |text| {
+                    progress(Status::Running, text);
+                })
+            }
+        };
+        let reply = match done {
+            Ok(text) => OrderReply::new(Status::Done, text),
+            Err(Ended::Refused(error)) => OrderReply::new(Status::Refused, error.to_string()),
+            Err(Ended::Failed(error)) => OrderReply::new(Status::Failed, error.to_string()),
+        };
+        self.log(order, sender, &reply);
+        let updated = lock(&self.journal).update(&order.nonce, unix_time(), reply, true);
+        if let Err(error) = updated {
+            tracing::error!("the log of orders: {error}");
+        }
+    }
+
+    /// Fetches a file of the order.
+    pub(super) fn fetch(
+        &self,
+        file: super::manifest::FileRef,
+        progress: &mut dyn FnMut(String),
+    ) -> Result<Vec<u8>> {
+        if file.size > super::manifest::MAX_FILE {
+            let most = super::manifest::MAX_FILE;
+            return Err(Error::new(format!("the file is longer than {most} bytes")));
+        }
+        let size = file.size;
+        self.store.get(file, &*self.source, &mut |have| {
+            progress(format!("file {}: {have} of {size} bytes", file.sha256));
+        })
+    }
+
+    pub(super) fn health_timeout(&self) -> Duration {
+        Duration::from_secs(self.table.health_timeout_s)
+    }
+}

@@ -1,0 +1,60 @@
+//! Starts the program of a machine.
+
+use std::time::{Duration, Instant};
+
+use serde_json::json;
+
+use super::executor::{Ended, OrderExecutor};
+use super::order::Status;
+use super::server;
+use crate::error::Error;
+
+const POLL: Duration = Duration::from_millis(100);
+/// The time in which the server refuses a start that it does not plan.
+const PLANNED: Duration = Duration::from_secs(1);
+
+impl OrderExecutor {
+    /// Starts the program and holds the lease until its end: if the agent ends, the axes stop.
+    pub(super) fn start(
+        &self,
+        at_unix_ns: Option<u64>,
+        sender: &str,
+        progress: &mut dyn FnMut(Status, String),
+    ) -> Result<String, Ended> {
+        let machine = server::connect(&self.socket, sender).map_err(server::text)?;
+        machine.take(false).map_err(server::text)?;
+        let mut keys = json!({"action": "start"});
+        if let Some(at) = at_unix_ns {
+            keys["at_unix_ns"] = json!(at);
+        }
+        let request = machine.command("program", "", keys).map_err(server::text)?;
+        let begin = Instant::now();
+        let mut started = false;
+        loop {
+            match machine.is_done(request) {
+                Ok(true) => return Ok("the program has ended".to_owned()),
+                Ok(false) => {}
+                Err(error) if started => return Err(Ended::Failed(server::text(error))),
+                Err(error) => return Err(Ended::Refused(server::text(error))),
+            }
+            if !started {
+                let state = machine.request("state", json!({})).map_err(server::text)?;
+                if state["program"]["running"] == json!(true) {
+                    started = true;
+                    progress(Status::Started, "the program runs".to_owned());
+                } else if at_unix_ns.is_some() && begin.elapsed() > PLANNED {
+                    started = true;
+                    progress(
+                        Status::Started,
+                        "the program waits for its instant".to_owned(),
+                    );
+                }
+            }
+            let kept = machine.sleep(POLL);
+            kept.map_err(|error| {
+                let what = format!("the connection during the program: {error}");
+                Ended::Failed(Error::new(what))
+            })?;
+        }
+    }
+}

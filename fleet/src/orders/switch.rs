@@ -1,0 +1,223 @@
+//! Takes bundles, and goes back to the previous one.
+
+use std::io;
+use std::path::Path;
+use std::time::Duration;
+
+use super::bundle;
+use super::executor::{Ended, OrderExecutor};
+use super::manifest::{FileRef, MAX_MANIFEST, Manifest};
+use super::program;
+use super::server;
+use super::signing::Right;
+use super::slots::{Switch, Unpacked};
+use crate::error::{Error, Result};
+
+const COMPARE: Duration = Duration::from_secs(120);
+const RESTART: Duration = Duration::from_secs(120);
+
+impl OrderExecutor {
+    pub(super) fn push(
+        &self,
+        file: FileRef,
+        signature: &str,
+        sender: &str,
+        progress: &mut dyn FnMut(String),
+    ) -> std::result::Result<String, Ended> {
+        if self.table.restart.is_empty() {
+            let what = "`restart` of `[orders]` is missing in the file of the agent";
+            return Err(Error::new(what).into());
+        }
+        if file.size > MAX_MANIFEST {
+            return Err(Error::new("the manifest of the bundle is too long").into());
+        }
+        let text = self.fetch(file, progress)?;
+        let key = self.keys.verify("the bundle", &text, signature)?;
+        key.require(Right::Bundle)?;
+        let manifest = Manifest::parse(&text)?;
+        if manifest.machine != self.machine {
+            let (for_, here) = (&manifest.machine, &self.machine);
+            return Err(Error::new(format!("the bundle is for {for_}, not for {here}")).into());
+        }
+        let current = self.table.folder.join("current");
+        let expected = current.join(manifest.machine_file.as_path());
+        if expected != self.table.machine_file {
+            return Err(Error::new(format!(
+                "the machine file of the bundle is `{}`, the server uses {}",
+                manifest.machine_file,
+                self.table.machine_file.display()
+            ))
+            .into());
+        }
+        if self.slots.current() == Some(file.sha256) {
+            return Ok("this bundle is the current one".to_owned());
+        }
+        let contents = manifest.files.iter();
+        let contents = contents.map(|file| self.fetch(file.content(), progress));
+        let contents = contents.collect::<Result<Vec<_>>>()?;
+        let unpacked = Unpacked {
+            id: file.sha256,
+            text,
+            signature: signature.to_owned(),
+            manifest,
+        };
+        self.slots.unpack(&unpacked, &contents)?;
+        self.take(&unpacked, sender, progress)
+    }
+
+    pub(super) fn back(
+        &self,
+        sender: &str,
+        progress: &mut dyn FnMut(String),
+    ) -> std::result::Result<String, Ended> {
+        let Some(previous) = self.slots.previous() else {
+            return Err(Error::new("there is no previous bundle").into());
+        };
+        let unpacked = self.slots.unpacked(previous)?;
+        self.take(&unpacked, sender, progress)
+    }
+
+    /// Checks an unpacked bundle and makes it the current one.
+    fn take(
+        &self,
+        unpacked: &Unpacked,
+        sender: &str,
+        progress: &mut dyn FnMut(String),
+    ) -> std::result::Result<String, Ended> {
+        let folder = self.slots.path(unpacked.id);
+        let machine_file = folder.join(unpacked.manifest.machine_file.as_path());
+        progress("check".to_owned());
+        let checked = bundle::check(&self.table.ecaxis, &machine_file)?;
+        if checked.sha256 != unpacked.manifest.machine_sha256 {
+            return Err(Error::new("the files are not those of the manifest").into());
+        }
+        // No server: nothing of this machine has power.
+        let machine = match server::connect(&self.socket, sender) {
+            Ok(machine) => Some(machine),
+            Err(_) if is_absent(&self.socket) => None,
+            Err(error) => return Err(server::text(error).into()),
+        };
+        if let Some(machine) = &machine {
+            server::take_disabled(machine)?;
+        }
+        let mut keep = || {
+            if let Some(machine) = &machine {
+                // A lost lease is noticed before the switch.
+                let _ = machine.keep();
+            }
+        };
+        if self.table.compare {
+            progress("compare with the bus".to_owned());
+            self.compare(&machine_file, &mut keep)?;
+        }
+        if let Some(machine) = &machine {
+            server::take_disabled(machine)?;
+        }
+        let switch = Switch {
+            to: unpacked.id,
+            current: self.slots.current(),
+            previous: self.slots.previous(),
+            sender: sender.to_owned(),
+        };
+        self.slots.switch(&switch).map_err(Ended::Failed)?;
+        progress("restart".to_owned());
+        if let Err(error) = self.restart(&mut keep) {
+            return self.undo(&switch, error);
+        }
+        self.finish(&switch, progress)
+    }
+
+    fn compare(&self, machine_file: &Path, tick: &mut dyn FnMut()) -> Result<()> {
+        let file = machine_file.display().to_string();
+        let words = [self.table.ecaxis.as_str(), "compare", &file].map(str::to_owned);
+        let output = program::run(&words, COMPARE, tick)?;
+        if output.ok {
+            return Ok(());
+        }
+        let differences = output
+            .stdout
+            .trim()
+            .lines()
+            .take(3)
+            .collect::<Vec<_>>()
+            .join("; ");
+        let reason = output.reason();
+        let reason = reason.lines().next().unwrap_or_default();
+        Err(Error::new(format!(
+            "`ecaxis compare` refuses it: {reason}; {differences}"
+        )))
+    }
+
+    fn restart(&self, tick: &mut dyn FnMut()) -> Result<()> {
+        let output = program::run(&self.table.restart, RESTART, tick)?;
+        if output.ok {
+            return Ok(());
+        }
+        Err(Error::new(format!(
+            "the restart failed: {}",
+            output.reason()
+        )))
+    }
+
+    /// Waits for the health of a switched machine; else goes back.
+    pub(super) fn finish(
+        &self,
+        switch: &Switch,
+        progress: &mut dyn FnMut(String),
+    ) -> std::result::Result<String, Ended> {
+        progress("wait until the machine is healthy".to_owned());
+        let healthy = self.slots.unpacked(switch.to).and_then(|unpacked| {
+            let sha256 = Some(unpacked.manifest.machine_sha256);
+            self.await_health(sha256, &switch.sender)
+        });
+        if let Err(error) = healthy {
+            return self.undo(switch, error);
+        }
+        let kept = self.slots.confirm().map_err(Ended::Failed)?;
+        self.store.keep(&kept).map_err(Ended::Failed)?;
+        Ok(format!("the machine runs the bundle {}", switch.to))
+    }
+
+    fn await_health(&self, sha256: Option<super::digest::FileDigest>, sender: &str) -> Result<()> {
+        let timeout = self.health_timeout();
+        server::await_health(&self.socket, sender, sha256, timeout, &mut || ())
+    }
+
+    fn undo(&self, switch: &Switch, error: Error) -> std::result::Result<String, Ended> {
+        let what = error.to_string();
+        let what = what.split("\nhelp:").next().unwrap_or_default().to_owned();
+        let failed = |then: &str| Ended::Failed(Error::new(format!("{what}; {then}")));
+        if let Err(error) = self.slots.undo(switch) {
+            return Err(failed(&format!("the return failed as well: {error}")));
+        }
+        let returned = self
+            .restart(&mut || ())
+            .and_then(|()| match switch.current {
+                Some(current) => {
+                    let sha256 = self.slots.unpacked(current)?.manifest.machine_sha256;
+                    self.await_health(Some(sha256), &switch.sender)
+                }
+                None => Ok(()),
+            });
+        if let Err(error) = self.slots.confirm() {
+            return Err(failed(&error.to_string()));
+        }
+        match returned {
+            Ok(()) => Err(failed("the machine is back at its previous bundle")),
+            Err(error) => Err(failed(&format!(
+                "the previous bundle is current again, but it does not run: {error}"
+            ))),
+        }
+    }
+}
+
+/// True if no process listens on the socket.
+fn is_absent(socket: &Path) -> bool {
+    match std::os::unix::net::UnixStream::connect(socket) {
+        Ok(_) => false,
+        Err(error) => matches!(
+            error.kind(),
+            io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused
+        ),
+    }
+}
