@@ -46,7 +46,7 @@ def require(condition, text):
 
 
 def machine_file(nic, note=""):
-    text = f'# {note}\n[bus]\nnic = "{nic}"\ncycle = "4ms"\nlost_frames = 20\n\n'
+    text = f'# {note}\n[bus]\nnic = "{nic}"\ncycle = "10ms"\nlost_frames = 90\nwatchdog = "1s"\n\n'
     for n, drive in enumerate(DRIVES):
         text += f"""[[device]]
 name = "{drive}"
@@ -243,6 +243,7 @@ def bundles(fleet):
 
     second = fleet.bundle("m1", "second")
     client = fleet.client("m1")
+    client.do("await", bus="op")
     client.do("take", name="cell", ttl_ms=60000)
     client.do("enable", axis="d1", wait=True)
     client.do("velocity", axis="d1", velocity=1.0)

@@ -59,19 +59,20 @@ pub async fn run(path: &Path) -> Result<()> {
         .spawn(move || reader.run())
         .map_err(|error| Error::new(format!("starting a thread: {error}")))?;
     tracing::info!(machine = %id, socket = %socket.display(), "agent");
+    // A switch that was interrupted is finished without Zenoh.
+    let source = Arc::new(ZenohSource::new(id.clone()));
+    let orders = file.orders.as_ref().map(|table| {
+        let (id, socket, source) = (id.clone(), socket.clone(), Arc::clone(&source));
+        let orders = OrderExecutor::open(path, id, socket, table, &file.key, source)?;
+        orders.resume()?;
+        Ok(orders)
+    });
+    let orders = orders.transpose()?;
     tokio::select! {
         ended = async {
             let session = session::open(zenoh).await?;
             tracing::info!(machine = %id, "connected");
-            let orders = file.orders.as_ref().map(|table| {
-                let source = Box::new(ZenohSource::new(session.clone(), id.clone()));
-                let socket = socket.clone();
-                let orders =
-                    OrderExecutor::open(path, id.clone(), socket, table, &file.key, source)?;
-                orders.resume()?;
-                Ok::<_, Error>(orders)
-            });
-            let orders = orders.transpose()?;
+            source.connect(session.clone());
             let publisher = Publisher::new(session, id.clone(), store, events, Some(socket));
             publisher.with_orders(orders).run(received).await
         } => ended,

@@ -61,7 +61,7 @@ pub struct OrderExecutor {
     pub(super) keys: Keyring,
     pub(super) store: FileStore,
     pub(super) slots: Slots,
-    pub(super) source: Box<dyn FileSource>,
+    pub(super) source: Arc<dyn FileSource>,
     journal: Mutex<OrderJournal>,
     running: Mutex<Option<String>>,
 }
@@ -112,7 +112,7 @@ impl OrderExecutor {
         socket: PathBuf,
         table: &OrdersTable,
         keys: &[KeyTable],
-        source: Box<dyn FileSource>,
+        source: Arc<dyn FileSource>,
     ) -> Result<Arc<Self>> {
         let mut table = table.clone();
         table.folder = config::resolve(file, &table.folder);
@@ -167,7 +167,7 @@ impl OrderExecutor {
         let (order, key, sha256) = match verified {
             Ok(verified) => verified,
             Err(error) => {
-                tracing::warn!("order refused: {error}");
+                tracing::debug!("order refused: {error}");
                 return refused(error);
             }
         };
@@ -231,6 +231,9 @@ impl OrderExecutor {
         let mut progress = |status: Status, text: String| {
             let reply = OrderReply::new(status, text);
             let kept = status == Status::Started;
+            if kept {
+                self.log(order, sender, &reply);
+            }
             let updated = lock(&self.journal).update(&order.nonce, unix_time(), reply, kept);
             if let Err(error) = updated {
                 tracing::error!("the log of orders: {error}");

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use zenoh::query::QueryTarget;
@@ -149,14 +149,21 @@ fn nonce() -> Result<String> {
 /// Fetches the files of orders over Zenoh.
 #[derive(Debug)]
 pub struct ZenohSource {
-    session: Session,
+    session: OnceLock<Session>,
     machine: MachineId,
 }
 
 impl ZenohSource {
+    /// Returns a source that waits for its session.
     #[must_use]
-    pub fn new(session: Session, machine: MachineId) -> Self {
+    pub fn new(machine: MachineId) -> Self {
+        let session = OnceLock::new();
         Self { session, machine }
+    }
+
+    /// Fetches by this session from now on.
+    pub fn connect(&self, session: Session) {
+        self.session.get_or_init(|| session);
     }
 }
 
@@ -164,8 +171,9 @@ impl FileSource for ZenohSource {
     fn chunk(&self, digest: FileDigest, offset: u64) -> Result<Vec<u8>> {
         let key = self.machine.key(&format!("file/{digest}"));
         let failed = |e: zenoh::Error| Error::new(format!("Zenoh: {e}"));
-        let replies = self
-            .session
+        let session = self.session.get();
+        let session = session.ok_or_else(|| Error::new("Zenoh is not connected"))?;
+        let replies = session
             .get(format!("{key}?offset={offset}"))
             .target(QueryTarget::All)
             .timeout(QUERY)

@@ -77,16 +77,18 @@ fn require_disabled(state: &Value) -> Result<()> {
     }
 }
 
-/// Brings the bus down and waits until the interface is free.
+/// Brings the bus down and waits until the interface is free. Returns false if it was down.
 ///
 /// # Errors
 /// Fails if the server refuses it.
-pub fn bus_down(machine: &Machine) -> Result<()> {
+pub fn bus_down(machine: &Machine) -> Result<bool> {
+    let state = machine.request("state", json!({})).map_err(text)?;
     machine
         .request("bus", json!({"action": "down"}))
         .map_err(text)?;
     let keys = json!({"bus": "down", "timeout_ms": 20_000});
-    machine.request("await", keys).map_err(text).map(drop)
+    machine.request("await", keys).map_err(text)?;
+    Ok(state["bus"]["state"] != json!("down"))
 }
 
 /// Brings the bus up.

@@ -108,10 +108,15 @@ impl OrderExecutor {
         };
         if self.table.compare {
             progress("compare with the bus".to_owned());
-            self.compare(&machine_file, &mut keep)?;
-        }
-        if let Some(machine) = &machine {
-            server::take_disabled(machine)?;
+            let down = machine.as_ref().map(server::bus_down).transpose()?;
+            let compared = self.compare(&machine_file, &mut keep).and_then(|()| {
+                let machine = machine.as_ref();
+                machine.map_or(Ok(()), server::take_disabled)
+            });
+            if let (Err(_), Some(machine), Some(true)) = (&compared, &machine, down) {
+                server::bus_up(machine)?;
+            }
+            compared?;
         }
         let switch = Switch {
             to: unpacked.id,

@@ -365,7 +365,7 @@ fn executor(folder: &Path, keys: &[KeyTable]) -> Arc<OrderExecutor> {
         compare: false,
     };
     let (file, socket) = (folder.join("agent.toml"), folder.join("absent.sock"));
-    let source = Box::new(Memory::new(&[], 0));
+    let source = Arc::new(Memory::new(&[], 0));
     OrderExecutor::open(&file, machine(), socket, &table, keys, source).unwrap()
 }
 
