@@ -13,6 +13,8 @@ use crate::error::{Error, Result};
 const LEASE: Duration = Duration::from_secs(5);
 /// The time without a fault after which a machine is healthy.
 const SETTLE: Duration = Duration::from_secs(2);
+/// The time for the bus to go down.
+const DOWN: Duration = Duration::from_secs(20);
 const POLL: Duration = Duration::from_millis(200);
 
 /// Returns an error of the server as one line.
@@ -86,9 +88,18 @@ pub fn bus_down(machine: &Machine) -> Result<bool> {
     machine
         .request("bus", json!({"action": "down"}))
         .map_err(text)?;
-    let keys = json!({"bus": "down", "timeout_ms": 20_000});
-    machine.request("await", keys).map_err(text)?;
-    Ok(state["bus"]["state"] != json!("down"))
+    let begin = Instant::now();
+    loop {
+        let now = machine.request("state", json!({})).map_err(text)?;
+        // A bus that had failed stays so: the server does not use the interface either.
+        if now["bus"]["state"] == json!("down") || now["bus"]["state"] == json!("failed") {
+            return Ok(state["bus"]["state"] != json!("down"));
+        }
+        if begin.elapsed() > DOWN {
+            return Err(Error::new("the server does not bring the bus down"));
+        }
+        std::thread::sleep(POLL);
+    }
 }
 
 /// Brings the bus up.
