@@ -21,6 +21,8 @@ pub const WORKING_COUNTER: usize = 2;
 pub struct Command(pub u8);
 
 impl Command {
+    /// No operation: no device processes the datagram.
+    pub const NOP: Self = Self(0);
     /// Auto-increment physical read.
     pub const APRD: Self = Self(1);
     /// Auto-increment physical write.
