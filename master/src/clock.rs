@@ -19,10 +19,18 @@ const NANOS_PER_SECOND: u64 = 1_000_000_000;
 /// The start of virtual time. It is not zero, so that a clock read before the start is visible.
 const VIRTUAL_EPOCH: Nanos = NANOS_PER_SECOND;
 
+/// A reading of two clocks that takes longer was interrupted.
+const LONGEST_READING: Nanos = 5_000;
+
 thread_local! {
     /// The virtual time of this thread; `None` where time is real.
     static VIRTUAL: Cell<Option<Nanos>> = const { Cell::new(None) };
+    /// Common time minus virtual time.
+    static COMMON: Cell<i64> = const { Cell::new(0) };
 }
+
+/// The name of the clock that computers have in common.
+pub const COMMON_CLOCK: &str = "CLOCK_REALTIME";
 
 /// The time base of a session.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -39,8 +47,34 @@ pub fn now() -> Nanos {
     VIRTUAL.get().unwrap_or_else(monotonic)
 }
 
+/// Returns common time (`CLOCK_REALTIME`) minus the time of the thread's clock. Linux runs both
+/// clocks at the same rate, so the difference changes only when `CLOCK_REALTIME` is set. Virtual
+/// time begins in 1970. Returns `None` if the thread was interrupted between the readings. RT:
+/// reads clocks, no other system call.
+#[must_use]
+pub fn common_offset() -> Option<i64> {
+    if VIRTUAL.get().is_some() {
+        return Some(COMMON.get());
+    }
+    let before = monotonic();
+    let common = read(ClockId::Realtime);
+    let after = monotonic();
+    let took = after.saturating_sub(before);
+    (took <= LONGEST_READING).then(|| common.wrapping_sub(before + took / 2).cast_signed())
+}
+
+/// Sets the common time of this thread's virtual clock, as a program of the host sets
+/// `CLOCK_REALTIME`.
+pub fn set_common_offset(offset: i64) {
+    COMMON.set(offset);
+}
+
 fn monotonic() -> Nanos {
-    let t = clock_gettime(ClockId::Monotonic);
+    read(ClockId::Monotonic)
+}
+
+fn read(clock: ClockId) -> Nanos {
+    let t = clock_gettime(clock);
     let seconds = u64::try_from(t.tv_sec).unwrap_or(0);
     let nanos = u64::try_from(t.tv_nsec).unwrap_or(0);
     seconds * NANOS_PER_SECOND + nanos
@@ -153,6 +187,18 @@ mod tests {
             "all of it is spun"
         );
         assert!(now() >= t);
+    }
+
+    #[test]
+    fn common_time_is_that_of_the_system() {
+        let offset = (0..1_000).find_map(|_| common_offset()).expect("a reading");
+        let common = now().wrapping_add_signed(offset);
+        let unix = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+        let unix = unix.expect("after 1970").as_nanos();
+        assert!(
+            unix.abs_diff(u128::from(common)) < 10_000_000_000,
+            "{common} {unix}"
+        );
     }
 
     #[test]

@@ -201,6 +201,7 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         Cause::NotHomed { error, .. } => not_homed(*error).to_owned(),
         Cause::VariableRange { .. } => "test the variable with `if` before this step, or correct its range under [variables]".to_owned(),
         Cause::Alarm { .. } => "remove its cause, then start again".to_owned(),
+        Cause::StartMissed { .. } => "enable the axes first, and choose a later instant".to_owned(),
         Cause::WaitTimeout { .. } => "check the sensor and its wiring, or give the step a longer `timeout`".to_owned(),
         Cause::TooLarge(_) => "map fewer objects with `pdo.rx` and `pdo.tx`".to_owned(),
         Cause::ClockNotSettled { .. } => "frames reach the clocks too irregularly, or the device has a faulty clock: run with real-time priority, or with `dc = \"off\"`".to_owned(),

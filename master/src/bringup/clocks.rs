@@ -8,13 +8,14 @@ use std::cell::Cell;
 use std::future::Future;
 use std::time::Duration;
 
+use super::common_time::{common_offset, next_multiple};
 use super::device::{read, write};
 use super::process_data::RegisterBlock;
 use super::{BusDevice, Step};
 use crate::acyclic::DeviceRef;
 use crate::clock::{self, Nanos};
 use crate::concurrent::try_join_all;
-use crate::config::Machine;
+use crate::config::{CommonTimeUse, Machine};
 use crate::datagram::DatagramClient;
 use crate::mailbox::MailboxTransport;
 use crate::report::{Cause, Error};
@@ -23,7 +24,7 @@ use crate::rt::phase::{ClockPlan, extend};
 use ecaxis_ecat::registers;
 use ecaxis_esi::select::DcSettings;
 
-const STEP: &str = "starting SYNC0";
+pub(super) const STEP: &str = "starting SYNC0";
 
 /// The pause between two distributions of the time before the cycle.
 const DISTRIBUTION_PERIOD: Duration = Duration::from_micros(100);
@@ -83,11 +84,18 @@ pub(super) async fn configure(
     let shifts = wanting.iter().map(|(dc, _)| i64::from(dc.sync0_shift_ns));
     let (earliest, latest) = (shifts.clone().min().unwrap_or(0), shifts.max().unwrap_or(0));
     let longest_shift = latest.max(0).unsigned_abs();
+    let align = machine.bus.common_time == CommonTimeUse::Align;
     for _ in 0..MAX_ATTEMPTS {
+        let common = match align {
+            true => common_offset(wire, &reference).await?,
+            false => None,
+        };
         let now = system_time(wire, &reference).await?;
         let release_at = clock::now();
         ahead = ahead.min(MAX_START_DELAY.saturating_sub(longest_shift));
         let start = now.wrapping_add(ahead);
+        let start = common.map_or(start, |offset| next_multiple(start, offset, cycle));
+        let until = start.wrapping_sub(now);
         let starts = wanting.iter().map(async |(dc, device)| {
             let own = system_time(wire, &device.at).await?;
             let first = extend(start.wrapping_add_signed(i64::from(dc.sync0_shift_ns)), own);
@@ -120,8 +128,10 @@ pub(super) async fn configure(
                 reference: reference.station,
                 cycle_ns: cycle,
                 release: start.wrapping_add(release.after) as u32,
-                release_at: release_at + ahead + release.after,
+                release_at: release_at + until + release.after,
                 window_ns: machine.bus.clock_window_ns,
+                sync0: start,
+                align,
             }));
         }
         ahead *= 2;

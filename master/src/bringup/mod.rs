@@ -37,6 +37,7 @@ use crate::text::panic_text;
 
 pub mod align;
 pub(crate) mod clocks;
+mod common_time;
 mod device;
 pub(crate) mod device_return;
 pub mod drive_units;
@@ -51,6 +52,7 @@ pub mod process_data;
 pub(crate) mod ring;
 mod soe;
 mod times;
+pub(crate) use common_time::clock_offset;
 pub(crate) use identify::{compare as compare_identity, known as known_identity, name_at};
 mod watchdog;
 

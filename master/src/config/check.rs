@@ -28,14 +28,15 @@ use super::steps::{self, Resolved, ResolvedAxis, ResolvedDevice};
 use crate::file_digest::{FileDigest, UsedFile};
 
 use super::{
-    AxisSetup, Bus, GroupStopScope, Locator, MAX_SUBDEVICES, Machine, Nic, SegmentHead,
-    ServerSetup, Signal, Spin, StopSetup, signal,
+    AxisSetup, Bus, CommonTimeUse, GroupStopScope, Locator, MAX_SUBDEVICES, Machine, Nic,
+    SegmentHead, ServerSetup, Signal, Spin, StopSetup, signal,
 };
 
 /// Returns `None` only if a problem has been reported.
 pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) -> Option<Machine> {
     let path = &*file.path;
     let cycle_span = raw.bus.cycle.place().unwrap_or_default();
+    let common_time_span = raw.bus.common_time.place().unwrap_or_default();
     let bus = bus(raw.bus, p);
     unique_names(&raw.devices, p);
     eoe::unique(&raw.devices, p);
@@ -67,6 +68,18 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
     };
     if checked.iter().all(|device| position(device).is_some()) {
         checked.sort_by_key(position);
+    }
+    let aligned = bus
+        .as_ref()
+        .is_some_and(|bus| bus.common_time == CommonTimeUse::Align);
+    let clocked = |checked: &CheckedDevice| {
+        let device = checked.device.as_ref();
+        device.is_none_or(|device| device.selection.dc.is_some())
+    };
+    if aligned && !checked.iter().any(clocked) {
+        let message = "no device has SYNC0: nothing can be aligned";
+        let hint = "take the key out, or set `dc` of a device";
+        p.add_hint(common_time_span, message, hint);
     }
     compensation::check(&mut checked, folder, p);
     let gantries = gantry::check(&raw.gantries, &mut checked, p);
@@ -280,6 +293,9 @@ fn brake_outputs(
     found
 }
 
+/// A second in ns. Clocks that count other seconds, or are set by whole ones, have cycles in common.
+const SECOND: u64 = 1_000_000_000;
+
 fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
     let defaults = Bus::default();
     let cycle_ns = raw.cycle.value();
@@ -297,6 +313,16 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
             p.add_hint(at.unwrap_or_default(), message, hint);
         } else {
             check_lost_frames(&raw, lost_frames, cycle, watchdog_ns, p);
+        }
+        if let Some(common) = &raw.common_time
+            && *common.get_ref() == CommonTimeUse::Align
+            && !SECOND.is_multiple_of(cycle)
+        {
+            let message = format!(
+                "a second is not a whole number of cycles of {}",
+                show(cycle)
+            );
+            p.add_hint(common.span(), message, "use a cycle that divides a second");
         }
         if let Some(spin) = &raw.spin
             && let Spin::For(ns) = spin.get_ref()
@@ -341,6 +367,7 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
         clock_window_ns: raw.clock_window.value().unwrap_or(defaults.clock_window_ns),
         sync_window_ns: raw.sync_window.value().unwrap_or(defaults.sync_window_ns),
         sync_timeout_ns: raw.sync_timeout.value().unwrap_or(defaults.sync_timeout_ns),
+        common_time: raw.common_time.value().unwrap_or_default(),
         exchange: raw.exchange.value().unwrap_or(defaults.exchange),
         link: raw.link.value().unwrap_or(defaults.link),
         unknown_devices: raw.unknown_devices.value().unwrap_or_default(),

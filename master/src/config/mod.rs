@@ -217,6 +217,7 @@ pub struct Bus {
     pub sync_window_ns: u64,
     /// The timeout for the clocks to settle and for frames to be in phase with SYNC0.
     pub sync_timeout_ns: u64,
+    pub common_time: CommonTimeUse,
     pub exchange: ExchangeMode,
     /// The way frames are exchanged with the network interface.
     pub link: SocketKind,
@@ -258,12 +259,22 @@ impl Default for Bus {
             clock_window_ns: 10_000,
             sync_window_ns: 1_000,
             sync_timeout_ns: 5_000_000_000,
+            common_time: CommonTimeUse::default(),
             exchange: ExchangeMode::SameCycle,
             link: SocketKind::default(),
             unknown_devices: UnknownDeviceRule::default(),
             written: Vec::new(),
         }
     }
+}
+
+/// What happens with the difference between common time and the time of the bus.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum CommonTimeUse {
+    #[default]
+    Measure,
+    /// SYNC0 is kept on whole multiples of the cycle in common time.
+    Align,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -428,6 +439,7 @@ impl Machine {
         RtConfig {
             cycle_ns: bus.cycle_ns,
             clock_window_ns: bus.clock_window_ns,
+            align: bus.common_time == CommonTimeUse::Align,
             spin: bus.spin,
             exchange: bus.exchange,
             lost_frames: bus.lost_frames,

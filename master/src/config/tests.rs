@@ -329,3 +329,24 @@ proptest::proptest! {
         }
     }
 }
+
+#[test]
+fn alignment_needs_a_cycle_that_divides_a_second_and_sync0() {
+    let cycle = "cycle = \"1ms\"";
+    let aligned = |cycle: &str| format!("cycle = \"{cycle}\"\ncommon_time = \"align\"");
+    let machine = with_esi(&GOOD.replacen(cycle, &aligned("1ms"), 1)).expect("good");
+    assert_eq!(machine.bus.common_time, CommonTimeUse::Align);
+    let found = broken(cycle, &aligned("3ms"));
+    let text = "a second is not a whole number of cycles of 3 ms";
+    assert!(found.iter().any(|p| p.message.contains(text)), "{found:#?}");
+    let off = GOOD
+        .replacen(cycle, &aligned("1ms"), 1)
+        .replace("mode = \"cs", "dc = \"off\"\nmode = \"cs");
+    let found = problems(&off);
+    assert!(
+        found
+            .iter()
+            .any(|p| p.message.contains("no device has SYNC0")),
+        "{found:#?}"
+    );
+}

@@ -357,6 +357,8 @@ pub enum Cause {
     /// A step `alarm` of the program.
     #[error("alarm: {text}")]
     Alarm { text: String },
+    #[error("the program did not start at its instant: {why}")]
+    StartMissed { why: String },
     #[error("the variable `{name}` would be {value}, outside its range, {low} to {high}")]
     VariableRange {
         name: String,

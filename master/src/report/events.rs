@@ -3,7 +3,7 @@
 use ecaxis_ecat::index::AxisIndex;
 use serde::Serialize;
 
-use crate::clock::Nanos;
+use crate::clock::{COMMON_CLOCK, Nanos};
 use crate::config::{Machine, duration};
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::Event;
@@ -91,6 +91,7 @@ fn describe_event(event: Event, machine: &Machine) -> String {
             let name = machine.devices.get(device).map_or("?", |d| d.name.as_str());
             reference_replaced(name)
         }
+        Event::CommonTimeJumped { by_ns, .. } => common_time_jumped(by_ns),
         Event::Stopping { cause, .. } => describe_cause(cause, &axis),
         Event::GroupStopping { group, cause, .. } => {
             format!(
@@ -147,6 +148,12 @@ fn describe_cause<'m>(cause: StopCause, axis: &impl Fn(AxisIndex) -> &'m str) ->
 /// Returns a text with the deviation of a clock from the reference clock.
 pub(crate) fn reference_replaced(name: &str) -> String {
     format!("the reference clock does not answer; the clock of `{name}` replaces it")
+}
+
+pub(crate) fn common_time_jumped(by_ns: i64) -> String {
+    let by = duration::show(by_ns.unsigned_abs());
+    let to = if by_ns > 0 { "forward" } else { "back" };
+    format!("common time ({COMMON_CLOCK}) has jumped {to} by {by}; the motion goes on")
 }
 
 pub(crate) fn clock_off(name: &str, difference_ns: i32) -> String {

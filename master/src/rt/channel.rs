@@ -4,7 +4,9 @@ use ecaxis_axis::{AxisStatus, Command, CommandError};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 
 use super::bus_monitor::StopCause;
+use super::common_time::CommonTimeStatus;
 use super::controller::OutputRef;
+use super::cycle::StartState;
 use super::exchange::SubDeviceDiagnostics;
 use super::heartbeat::Heartbeat;
 use super::reaction_group::GroupStatus;
@@ -81,6 +83,14 @@ pub enum RtCommand {
         axis: AxisIndex,
         code: u16,
     },
+    /// The next `count` commands, of the same batch, take effect in the cycle of this instant of
+    /// common time.
+    Defer {
+        at: u64,
+        count: usize,
+    },
+    /// Drops the commands that wait for an instant.
+    CancelStart,
     /// Ends the loop after this cycle.
     Halt,
 }
@@ -127,6 +137,11 @@ pub enum Event {
         /// Own clock minus reference.
         difference_ns: i32,
     },
+    /// Common time has jumped.
+    CommonTimeJumped {
+        cycle: u64,
+        by_ns: i64,
+    },
     /// The reference clock no longer answers; this SubDevice is the reference clock from now on.
     ReferenceReplaced {
         cycle: u64,
@@ -143,6 +158,9 @@ pub struct Snapshot {
     pub late_wake_ups: u64,
     /// `None` without distributed clocks.
     pub phase: Option<PhaseStatus>,
+    pub common_time: CommonTimeStatus,
+    /// What has become of commands for an instant of common time.
+    pub start: StartState,
     pub inputs_fresh: bool,
     pub al_status: Option<(u8, u16)>,
     pub axes: IndexVec<AxisIndex, AxisStatus>,

@@ -17,6 +17,8 @@ pub struct RtConfig {
     pub cycle_ns: Nanos,
     /// DC offsets in ns beyond this are reported.
     pub clock_window_ns: u64,
+    /// SYNC0 is kept on whole multiples of the cycle in common time.
+    pub align: bool,
     /// The time spun before the release; the rest of the cycle is slept.
     pub spin: Spin,
     pub exchange: ExchangeMode,

@@ -8,6 +8,7 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 use super::axis::RtAxis;
 use super::bus_monitor::{BusMonitor, StopCause};
 use super::channel::{Event, PhaseStatus, RtEndpoint, Snapshot};
+use super::common_time::{CommonTime, CommonTimeStatus};
 use super::config::{Condition, RtConfig};
 use super::controller::{self, Controller};
 use super::event_log::LogEntryKind;
@@ -31,8 +32,11 @@ mod commands;
 mod io;
 mod panic;
 mod rates;
+mod start;
 
 use panic::Plain;
+use start::DeferredCommands;
+pub use start::{DropCause, StartState};
 
 use crate::clock::{self, Clock, Nanos};
 use crate::link::pdu_loop::PduLoop;
@@ -69,6 +73,8 @@ pub struct Engine {
     tables: Box<[Table]>,
     finished: bool,
     phase: Option<Phase>,
+    common: CommonTime,
+    deferred: DeferredCommands,
     phase_error: i64,
     /// The reference clock as last reported.
     reference: Option<DeviceIndex>,
@@ -121,6 +127,7 @@ pub struct EngineConfig {
     pub samples: Option<SampleWriter>,
     pub tables: Box<[Table]>,
     pub phase: Option<Phase>,
+    pub common: CommonTime,
     pub end: RtEndpoint,
 }
 
@@ -184,6 +191,8 @@ impl Engine {
             tables: parts.tables,
             finished: false,
             phase: parts.phase,
+            common: parts.common,
+            deferred: DeferredCommands::new(),
             phase_error: 0,
             reference: parts.exchange.reference(),
             exchange: parts.exchange,
@@ -272,6 +281,7 @@ impl Engine {
         self.answer = self.exchange.evaluate();
         self.update_counters();
         let adjust = self.follow_clock();
+        self.follow_common_time();
         if self.guarding {
             self.watch_bus();
             let heartbeat = &self.end.heartbeat;
@@ -440,6 +450,8 @@ impl Engine {
             error_ns: self.phase_error,
             drift_ppm: phase.drift_ppm(),
         });
+        snapshot.common_time = self.common.status();
+        snapshot.start = self.deferred.state;
         snapshot.inputs_fresh = self.answer.inputs_fresh;
         snapshot.al_status = self.answer.al_status;
         for (to, slot) in snapshot.axes.iter_mut().zip(&self.axes) {
@@ -556,6 +568,8 @@ pub fn first_snapshot(
         time: clock::now(),
         counters: super::stats::Counters::default(),
         phase: None,
+        common_time: CommonTimeStatus::default(),
+        start: StartState::None,
         inputs_fresh: false,
         al_status: None,
         axes: axes.iter().map(|slot| slot.axis.status()).collect(),

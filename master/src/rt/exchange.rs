@@ -47,7 +47,7 @@ pub use poll_schedule::{AlStatusPolls, MAX_POLL_DATAGRAM};
 use poll_schedule::{PollSchedule, PollTarget};
 use reference::ReferenceClock;
 pub use result::{CycleResult, DeviceAnswer, ExchangeDevice, GroupResult, Received};
-use slots::DatagramSlots;
+use slots::{DatagramSlots, write_clock_offset};
 
 /// After a wrong working counter each device has its own datagram, until this many cycles in a row
 /// were right.
@@ -73,6 +73,8 @@ pub struct Exchange {
     /// For each device, true if a late answer has arrived since the last cycle.
     late: IndexVec<DeviceIndex, bool>,
     reference: ReferenceClock,
+    /// The value for 0x0920 of the reference clock, if SYNC0 is aligned.
+    reference_offset: Option<u64>,
     /// The largest difference to the reference clock with which a clock may replace it.
     clock_window_ns: u64,
     bus_status: Arc<BusStatus>,
@@ -143,6 +145,7 @@ impl Exchange {
             device_answers: vec![DeviceAnswer::Unknown; members.len()].into(),
             late: vec![false; members.len()].into(),
             reference: ReferenceClock::new(members, clock),
+            reference_offset: None,
             clock_window_ns: clock.map_or(0, |clock| clock.window_ns),
             bus_status: Arc::new(BusStatus::new(members.len())),
             group_results,
@@ -316,6 +319,9 @@ impl Exchange {
         if let (Some(slot), Some(station)) = (slots.clock, self.reference.station()) {
             write_station(first, slot, station);
             clear_wkc(first, slot);
+        }
+        if let Some(slot) = slots.clock_offset {
+            write_clock_offset(first, slot, self.reference.station(), self.reference_offset);
         }
         first[slots.al_status.data()].fill(0);
         clear_wkc(first, slots.al_status);
@@ -512,6 +518,7 @@ impl Exchange {
                 (sum.0.saturating_add(seen), sum.1.saturating_add(expected))
             }),
             system_time: None,
+            offset_taken: false,
             al_status: None,
             sent_late: frame_set.sent_late.unwrap_or(0),
             sent_at: frame_set.sent_at,
@@ -519,6 +526,7 @@ impl Exchange {
         let Some(first) = first else {
             return answer;
         };
+        answer.offset_taken = slots.clock_offset.is_some_and(|slot| slot.wkc(first) > 0);
         answer.al_status = first
             .get(slots.al_status.data())
             .and_then(|data| Some((*data.first()?, slots.al_status.wkc(first))));

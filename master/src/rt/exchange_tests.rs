@@ -96,6 +96,8 @@ fn exchange_with(devices: &[ProcessData], clocks: usize, mode: ExchangeMode) -> 
         release: 0,
         release_at: 0,
         window_ns: 10_000,
+        sync0: 0,
+        align: false,
     };
     Exchange::new(&plan, Some(&clock), &members, mode)
 }
@@ -508,6 +510,8 @@ fn copies_and_repeats_are_in_the_next_frames() {
         release: 0,
         release_at: 0,
         window_ns: 10_000,
+        sync0: 0,
+        align: false,
     };
     let mut exchange = Exchange::new(&plan, Some(&clock), &members, ExchangeMode::SameCycle);
     exchange.outputs_mut().fill(0xff);
@@ -532,4 +536,40 @@ fn copies_and_repeats_are_in_the_next_frames() {
     exchange.stage();
     assert_eq!(exchange.outputs_mut()[1], 0x11);
     assert_eq!(exchange.outputs_mut()[6] >> 2, 0x11 & 0x3f);
+}
+
+/// ETG.1000.4, FPWR and NOP: without an offset, no device processes the datagram.
+#[test]
+fn offset_is_written_to_the_reference_clock_only_if_it_is_known() {
+    let plan = plan(&[axis(0)]).expect("fits");
+    let members = [ExchangeDevice {
+        station: 0x1000,
+        clock: true,
+        mailbox: None,
+    }];
+    let clock = ClockPlan {
+        reference: 0x1000,
+        cycle_ns: 1_000_000,
+        release: 0,
+        release_at: 0,
+        window_ns: 10_000,
+        sync0: 0,
+        align: true,
+    };
+    let mut exchange = Exchange::new(&plan, Some(&clock), &members, ExchangeMode::SameCycle);
+    let slot = exchange.layouts[0].clock_offset.expect("aligns");
+    for (offset, command, station) in [(None, 0, 0), (Some(0x1122_3344_5566_7788), 5, 0x1000)] {
+        exchange.set_reference_offset(offset);
+        exchange.stage();
+        let mut frame = reflect(&mut exchange, 0, 0);
+        let staged = &exchange.frame_sets[exchange.staged].frames()[0].bytes;
+        let sent = &staged[slot.offset..];
+        assert_eq!(sent[0], command);
+        assert_eq!(u16::from_le_bytes([sent[2], sent[3]]), station);
+        assert_eq!(sent[4..6], [0x20, 0x09]);
+        assert_eq!(sent[10..18], offset.unwrap_or(0).to_le_bytes());
+        frame[slot.data().end] = u8::from(offset.is_some());
+        exchange.receive(&frame);
+        assert_eq!(exchange.evaluate().offset_taken, offset.is_some());
+    }
 }

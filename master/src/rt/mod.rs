@@ -4,6 +4,7 @@
 //! - [`config`]: the settings of the cycle;
 //! - [`image`]: the layout of the process image;
 //! - [`exchange`]: the frames of a cycle, built once and refilled;
+//! - [`common_time`]: the time that computers have in common, and the alignment of SYNC0 with it;
 //! - [`phase`]: keeps the release of frames in phase with SYNC0;
 //! - [`bus_monitor`]: counts bad cycles and decides when the bus is lost;
 //! - [`reaction_group`]: axes that stop together, and their release;
@@ -36,6 +37,7 @@
 pub mod axis;
 pub mod bus_monitor;
 pub mod channel;
+pub mod common_time;
 pub mod config;
 pub mod controller;
 pub mod cycle;

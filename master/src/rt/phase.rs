@@ -57,6 +57,20 @@ pub struct ClockPlan {
     pub release_at: Nanos,
     /// The largest difference to the reference clock with which a clock may replace it.
     pub window_ns: u64,
+    /// The system time of a pulse of SYNC0, before the shifts of devices; the pulses repeat every
+    /// cycle.
+    pub sync0: u64,
+    /// True if SYNC0 is kept on whole multiples of the cycle in common time.
+    pub align: bool,
+}
+
+impl ClockPlan {
+    /// Returns the time from a pulse of SYNC0 until the frames pass the reference clock, in ns.
+    #[must_use]
+    pub fn release_after(&self) -> u64 {
+        let after = u64::from(self.release.wrapping_sub(self.sync0 as u32));
+        after % self.cycle_ns.max(1)
+    }
 }
 
 /// Returns the time next to `near` with the low 32 bits of `time`. All clocks have these bits in
@@ -216,6 +230,8 @@ mod tests {
             release,
             release_at: u64::from(release),
             window_ns: 10_000,
+            sync0: 0,
+            align: false,
         }
     }
 

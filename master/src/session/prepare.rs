@@ -28,6 +28,7 @@ use crate::post_mortem::snapshot::{self, Depth};
 use crate::report::{DeviceLog, FailedStep};
 use crate::rt::axis::RtAxis;
 use crate::rt::channel::channel;
+use crate::rt::common_time::CommonTime;
 use crate::rt::cycle::{EngineConfig, Signals, first_snapshot};
 use crate::rt::exchange::{Exchange, ExchangeDevice};
 use crate::rt::gateway::{Gateway, GatewayConfig, NodePlace};
@@ -165,6 +166,7 @@ impl RunBuilder<'_> {
                     samples,
                     tables: machine.tables.clone().into(),
                     phase: bus.dc.as_ref().map(Phase::new),
+                    common: CommonTime::new(machine.bus.cycle_ns, bus.dc.as_ref()),
                     end: rt_end,
                 };
                 let ring = RingWatch::new(bus.ring);
@@ -199,6 +201,7 @@ impl RunBuilder<'_> {
                     clock_tree: None,
                     returns: None,
                     ring,
+                    start: None,
                     variables: Vec::new(),
                     control,
                     sim_inputs,

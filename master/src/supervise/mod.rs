@@ -28,7 +28,7 @@ use crate::mailbox::worker::{MailboxWorker, run_with_workers};
 use crate::mailbox::{DatagramError, Mailboxes};
 use crate::mailbox_gateway::LivePublisher;
 use crate::post_mortem::Witnessed;
-use crate::report::events::{clock_off, reference_replaced};
+use crate::report::events::{clock_off, common_time_jumped, reference_replaced};
 use crate::report::{
     Cause, DeviceLog, EmergencyLog, Error, GroupStop, ProbeCapture, Progress, Status,
 };
@@ -36,6 +36,9 @@ use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::{COMMANDS_PER_CYCLE, Event, HostEndpoint, RtCommand, Snapshot};
 use crate::rt::exchange::{BusStatus, DiagnosticRegister, SubDeviceDiagnostics};
 use clock_tree::ClockTree;
+use common_start::AlignmentWait;
+pub(crate) use common_start::CommonStart;
+pub use common_start::MAX_START_DELAY;
 use groups::StoppedGroup;
 pub(crate) use limits::{MissedTargets, ReportedLimits};
 pub(crate) use program::Buttons;
@@ -45,6 +48,7 @@ pub(crate) use ring::RingWatch;
 use sercos::ResetQueue;
 
 mod clock_tree;
+mod common_start;
 mod coordinated;
 pub(crate) mod diagnosis_history;
 mod explain;
@@ -95,6 +99,8 @@ pub struct Supervisor {
     pub control: Arc<ProgramControl>,
     /// The inputs of `[program]`.
     pub(crate) buttons: Buttons,
+    /// The instant at which the program starts, until it has.
+    pub(crate) start: Option<CommonStart>,
     /// The values of the program's variables.
     pub variables: Vec<f64>,
     /// The operator that replaces the program.
@@ -164,14 +170,15 @@ impl Supervisor {
         let latch = Arc::<Mutex<()>>::default();
         let ethernet = self.ethernet.serve();
         // The futures are large, and nothing needs them on the stack.
-        let (delays, returns, resets) = (
+        let (delays, offset, returns, resets) = (
             Box::pin(self.keep_delays(Arc::clone(&latch))),
+            Box::pin(self.keep_offset()),
             Box::pin(self.return_devices(latch)),
             Box::pin(self.open_resets().run()),
         );
         let work = async {
             let aside = async {
-                tokio::join!(delays, returns, resets, ethernet);
+                tokio::join!(delays, offset, returns, resets, ethernet);
                 std::future::pending::<Infallible>().await
             };
             tokio::select! {
@@ -249,7 +256,7 @@ impl Supervisor {
             let steady = self.steady_axes();
             self.enable_axes(None, &steady).await?;
         }
-        self.run_program(ended).await
+        self.run_program(None, ended).await
     }
 
     /// Returns the axes of the devices that are always there.
@@ -326,6 +333,8 @@ impl Supervisor {
         let bus = &self.machine.bus;
         let looks = looks.saturating_mul(bus.cycle_ns);
         let timeout = bus.sync_timeout_ns.saturating_add(looks);
+        let timeout = timeout.saturating_add(AlignmentWait::timeout(self.bus.dc.as_ref()));
+        let mut alignment = AlignmentWait::new();
         loop {
             let snapshot = self.poll_and_query().await?;
             let clocks_known = self.bus.clocks_settled || self.clocks_read(&snapshot);
@@ -333,7 +342,11 @@ impl Supervisor {
             let looked_at_all = snapshot.counters.cycles > FIRST_CYCLES && clocks_known;
             let locked = snapshot.phase.is_none_or(|phase| phase.locked);
             let unsettled = self.unsettled_clock(&snapshot);
-            if looked_at_all && inputs_fresh && locked && unsettled.is_none() {
+            let aligned = alignment.is_over(&snapshot.common_time);
+            if looked_at_all && inputs_fresh && locked && aligned && unsettled.is_none() {
+                if let Some(text) = AlignmentWait::warning(&snapshot.common_time) {
+                    self.report(Progress::Warning(text));
+                }
                 if snapshot.phase.is_some() {
                     self.report(Progress::PhaseLocked);
                 }
@@ -451,6 +464,7 @@ impl Supervisor {
         {
             return Err(self.explain_stop(cause, None, &snapshot).await);
         }
+        self.follow_start(&snapshot)?;
         self.watch_buttons(&snapshot);
         self.attend(&snapshot).await?;
         Ok(snapshot)
@@ -477,6 +491,9 @@ impl Supervisor {
                     let name = devices.get(device).map_or("?", |d| d.name.as_str());
                     self.report(Progress::Warning(reference_replaced(name)));
                 }
+                Event::CommonTimeJumped { by_ns, .. } => {
+                    self.report(Progress::Warning(common_time_jumped(by_ns)));
+                }
                 Event::Refused { axis, reason, .. } => {
                     self.refused.truncate(REFUSALS - 1);
                     self.refused.push_back((axis, reason));
@@ -492,11 +509,22 @@ impl Supervisor {
     }
 
     async fn send(&mut self, command: RtCommand) {
-        self.send_all(&[command]).await;
+        self.send_now(&[command]).await;
     }
 
-    /// Sends commands to the cycle. The cycle takes a batch in one cycle.
+    /// Sends commands to the cycle. The cycle takes a batch in one cycle. The commands of a program
+    /// wait for the instant of its start.
     async fn send_all(&mut self, commands: &[RtCommand]) {
+        let Some(start) = self.start else {
+            return self.send_now(commands).await;
+        };
+        for part in start.defer(commands) {
+            self.send_now(&part).await;
+        }
+    }
+
+    /// Sends commands that wait for no instant.
+    async fn send_now(&mut self, commands: &[RtCommand]) {
         for batch in commands.chunks(COMMANDS_PER_CYCLE) {
             while !self.outer.commands.is_abandoned() {
                 if let Ok(room) = self.outer.commands.write_chunk_uninit(batch.len()) {

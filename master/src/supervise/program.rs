@@ -22,7 +22,7 @@ use ecaxis_ecat::index::{AxisIndex, GroupIndex, IndexVec};
 use tokio::sync::Mutex;
 
 use super::groups::needed;
-use super::{ProgramOutcome, Supervisor};
+use super::{CommonStart, ProgramOutcome, Supervisor};
 use crate::clock::{self, Nanos};
 use crate::config::{Action, AxisSetup, LARGEST, Step, VariableRef};
 use crate::report::{Cause, Error, Progress, StepRef};
@@ -76,9 +76,18 @@ impl From<&Step> for StepRef {
 }
 
 impl Supervisor {
-    pub(super) async fn run_program(&mut self, ended: &mut ProgramOutcome) -> Result<(), Error> {
+    /// Runs the steps, the first one at an instant if one is given.
+    pub(super) async fn run_program(
+        &mut self,
+        at: Option<CommonStart>,
+        ended: &mut ProgramOutcome,
+    ) -> Result<(), Error> {
         let shared = Mutex::new(self);
-        Turn::take(&shared).await.run_program(ended).await
+        let mut turn = Turn::take(&shared).await;
+        if let Some(at) = at {
+            turn.await_start(at).await?;
+        }
+        turn.run_program(ended).await
     }
 
     pub(super) async fn enable_axes(

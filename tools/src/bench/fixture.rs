@@ -15,6 +15,7 @@ use ecaxis_master::link::Link;
 use ecaxis_master::link::pdu_loop::main_device;
 use ecaxis_master::rt::axis::RtAxis;
 use ecaxis_master::rt::channel::{HostEndpoint, RtCommand, channel};
+use ecaxis_master::rt::common_time::CommonTime;
 use ecaxis_master::rt::config::{ExchangeMode, GroupConfig, RtConfig};
 use ecaxis_master::rt::cycle::{EngineConfig, Signals, first_snapshot};
 use ecaxis_master::rt::exchange::{Exchange, ExchangeDevice};
@@ -174,6 +175,8 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
         release: (cycle_ns / 2) as u32,
         release_at: cycle_ns / 2,
         window_ns: config::Bus::default().clock_window_ns,
+        sync0: 0,
+        align: false,
     };
     let signals = Signals::default();
     let (end, outer) = channel(&first_snapshot(&slots, 1, &signals, members.len()));
@@ -182,6 +185,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
         config: RtConfig {
             cycle_ns,
             clock_window_ns: config::Bus::default().clock_window_ns,
+            align: false,
             spin,
             exchange,
             // Losses are counted only; a stopped machine would end the measurement.
@@ -206,6 +210,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
         samples: None,
         tables: Box::default(),
         phase: Some(Phase::new(&clock)),
+        common: CommonTime::new(cycle_ns, Some(&clock)),
         end,
     };
     Ok((parts, outer))

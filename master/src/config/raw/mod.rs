@@ -15,7 +15,9 @@ use super::schema::{self, Schema, any_of};
 use super::sim_motor::RawMotor;
 use super::subprograms::RawSub;
 use super::travel::RawTrack;
-use super::{ExchangeMode, GroupStopScope, MailboxSource, SocketKind, Spin, UnknownDeviceRule};
+use super::{
+    CommonTimeUse, ExchangeMode, GroupStopScope, MailboxSource, SocketKind, Spin, UnknownDeviceRule,
+};
 
 mod axis;
 mod condition;
@@ -128,6 +130,10 @@ const EXCHANGES: [(&str, ExchangeMode); 2] = [
     ("same-cycle", ExchangeMode::SameCycle),
     ("pipelined", ExchangeMode::Pipelined),
 ];
+const COMMON_TIMES: [(&str, CommonTimeUse); 2] = [
+    ("measure", CommonTimeUse::Measure),
+    ("align", CommonTimeUse::Align),
+];
 const LINKS: [(&str, SocketKind); 2] = [
     (SocketKind::Ring.name(), SocketKind::Ring),
     (SocketKind::Packet.name(), SocketKind::Packet),
@@ -182,6 +188,10 @@ table! { "[bus]",
         /// Until the clocks are in `sync_window` and frames are in phase with SYNC0 (time, 1 ms to
         /// 10 min; default `"5s"`)
         sync_timeout: Key<Ns> [MS..=600 * S],
+        /// `"align"` keeps SYNC0 on whole multiples of the cycle in the time that computers have in
+        /// common, see [common-time.md](common-time.md) (`"measure"`, `"align"`; default
+        /// `"measure"`)
+        common_time: Key<CommonTimeUse> [COMMON_TIMES],
         /// Cycle in which answers are processed (`"same-cycle"`, `"pipelined"`; default
         /// `"same-cycle"`)
         exchange: Key<ExchangeMode> [EXCHANGES],

@@ -3,7 +3,7 @@
 use ecaxis_axis::{Command, CommandError, StopMethod};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex};
 
-use super::Engine;
+use super::{DropCause, Engine};
 use crate::rt::axis::RtAxis;
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::{COMMANDS_PER_CYCLE, Event, RtCommand};
@@ -22,14 +22,17 @@ impl Engine {
                 if self.end.commands.is_abandoned() && !self.halted {
                     self.stop_without_supervisor();
                 }
-                return;
+                break;
             };
-            self.commands_taken += 1;
-            self.take(command);
+            if !self.take_deferred(command) {
+                self.commands_taken += 1;
+                self.take(command);
+            }
         }
+        self.begin_deferred();
     }
 
-    fn take(&mut self, command: RtCommand) {
+    pub(super) fn take(&mut self, command: RtCommand) {
         match command {
             RtCommand::Axis { axis, command } => {
                 let Some(slot) = self.axes.get(axis) else {
@@ -84,6 +87,8 @@ impl Engine {
                     slot.axis.note_error_code(code);
                 }
             }
+            RtCommand::Defer { at, count } => self.defer(at, count),
+            RtCommand::CancelStart => self.cancel_deferred(),
             RtCommand::Halt => self.halted = true,
         }
     }
@@ -177,6 +182,9 @@ impl Engine {
             } else if !goes_on {
                 self.stop_group(group, cause, Some(StopMethod::Ramp));
             }
+        }
+        if !goes_on {
+            self.drop_deferred(DropCause::Stopped);
         }
         if !machine_stops && !goes_on {
             let cycle = self.stats.counters.cycles;

@@ -1,9 +1,10 @@
 //! The cycle's I/O: sends and receives frames, and keeps their release in phase.
 
-use super::Engine;
+use super::{DropCause, Engine};
 use crate::clock::{self, Nanos};
 use crate::link::LinkError;
 use crate::rt::channel::Event;
+use crate::rt::common_time::{Jump, Observed};
 use crate::rt::event_log::LogEntryKind;
 use crate::rt::exchange::{ExchangeMode, Received};
 use crate::rt::reaction_group::ReactionGroup;
@@ -165,5 +166,29 @@ impl Engine {
             _ => {}
         }
         step.adjust
+    }
+
+    /// Measures common time, and corrects the reference clock if SYNC0 is aligned.
+    pub(super) fn follow_common_time(&mut self) {
+        if let Some((device, offset)) = self.exchange.take_offset() {
+            self.common.take_offset(device, offset);
+        }
+        let reference = self.exchange.reference();
+        let jump = self.common.update(&Observed {
+            reference,
+            system_time: self.answer.system_time,
+            offset_taken: self.answer.offset_taken,
+            sent_at: self.answer.sent_at,
+            in_op: self.guarding,
+        });
+        if let Some(Jump { by_ns }) = jump {
+            let cycle = self.stats.counters.cycles;
+            self.drop_deferred(DropCause::Jumped);
+            self.report(Event::CommonTimeJumped { cycle, by_ns });
+        }
+        self.exchange
+            .want_offset(self.common.wanted_offset(reference));
+        self.exchange
+            .set_reference_offset(self.common.offset(reference));
     }
 }

@@ -37,6 +37,11 @@ pub struct BusStatus {
     reference: AtomicUsize,
     /// The number of devices that answered the last broadcast.
     answering: AtomicU16,
+    /// The member whose clock offset (0x0920) the cycle needs; `usize::MAX`: none.
+    offset_wanted: AtomicUsize,
+    /// The member whose offset was read, and the offset.
+    offset_of: AtomicUsize,
+    offset: AtomicU64,
 }
 
 /// A member that has restarted, and another device in its place.
@@ -62,6 +67,9 @@ impl BusStatus {
             restarts: (0..members).map(|_| AtomicU8::new(0)).collect(),
             reference: AtomicUsize::new(usize::MAX),
             answering: AtomicU16::new(0),
+            offset_wanted: AtomicUsize::new(usize::MAX),
+            offset_of: AtomicUsize::new(usize::MAX),
+            offset: AtomicU64::new(0),
         }
     }
 
@@ -114,6 +122,32 @@ impl BusStatus {
         self.reference.store(index, Ordering::Relaxed);
     }
 
+    /// Requests the clock offset (0x0920) of a member. RT: O(1).
+    pub(super) fn want_offset(&self, member: Option<DeviceIndex>) {
+        let index = member.map_or(usize::MAX, |member| member.0);
+        self.offset_wanted.store(index, Ordering::Relaxed);
+    }
+
+    /// Returns the member whose clock offset the cycle needs.
+    #[must_use]
+    pub fn wanted_offset(&self) -> Option<DeviceIndex> {
+        let index = self.offset_wanted.load(Ordering::Relaxed);
+        (index != usize::MAX).then_some(DeviceIndex(index))
+    }
+
+    /// Passes the clock offset of a member to the cycle.
+    pub fn set_offset(&self, member: DeviceIndex, offset: u64) {
+        self.offset.store(offset, Ordering::Relaxed);
+        self.offset_of.store(member.0, Ordering::Release);
+    }
+
+    /// Takes a clock offset and its member. RT: O(1).
+    fn take_offset(&self) -> Option<(DeviceIndex, u64)> {
+        let member = self.offset_of.swap(usize::MAX, Ordering::Acquire);
+        let offset = self.offset.load(Ordering::Relaxed);
+        (member != usize::MAX).then_some((DeviceIndex(member), offset))
+    }
+
     /// Returns the number of devices that answered the last broadcast, in the machine file or not.
     #[must_use]
     pub fn answering(&self) -> u16 {
@@ -157,6 +191,23 @@ impl Exchange {
     /// Sets how often the diagnostic slot reads AL status.
     pub fn poll_al_status(&mut self, polls: AlStatusPolls) {
         self.schedule.al_status_polls = polls;
+    }
+
+    /// Requests the clock offset of a member from other threads, or none. RT: O(1).
+    pub fn want_offset(&self, member: Option<DeviceIndex>) {
+        self.bus_status.want_offset(member);
+    }
+
+    /// Takes a clock offset that other threads have read, and its member. RT: O(1).
+    #[must_use]
+    pub fn take_offset(&self) -> Option<(DeviceIndex, u64)> {
+        self.bus_status.take_offset()
+    }
+
+    /// Sets the offset that the frames write to the reference clock (0x0920) from the next staged
+    /// one on; with `None` they write nothing. RT: O(1).
+    pub fn set_reference_offset(&mut self, offset: Option<u64>) {
+        self.reference_offset = offset;
     }
 
     /// Returns once after a member has restarted whether it is the same device as before. RT: O(1).

@@ -127,6 +127,8 @@ mod tests {
             release: 0,
             release_at: 0,
             window_ns: 10_000,
+            sync0: 0,
+            align: false,
         };
         ReferenceClock::new(&members, Some(&plan))
     }

@@ -72,6 +72,8 @@ pub struct CycleResult {
     /// System time of the reference clock as the frame passed it; the low 32 bits, if the clock has
     /// no more.
     pub system_time: Option<u64>,
+    /// The reference clock has taken its offset.
+    pub offset_taken: bool,
     /// AL status of all SubDevices, or-ed, and the number of answers.
     pub al_status: Option<(u8, u16)>,
     /// The delay from the planned release of these frames until they were sent.

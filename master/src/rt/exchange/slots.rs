@@ -2,7 +2,7 @@
 
 use super::super::image::{Access, DatagramPlan, ImagePlan};
 use super::super::phase::ClockPlan;
-use super::frame::{DatagramSlot, Frame, push};
+use super::frame::{DatagramSlot, Frame, clear_wkc, push, write_header};
 use super::poll_schedule::MAX_POLL_DATAGRAM;
 use crate::link::MAX_FRAME;
 use ecaxis_ecat::datagram::Command;
@@ -28,6 +28,8 @@ pub(super) struct ProcessDatagram {
 #[derive(Debug)]
 pub(super) struct DatagramSlots {
     pub(super) clock: Option<DatagramSlot>,
+    /// The offset of the reference clock (0x0920), if SYNC0 is aligned.
+    pub(super) clock_offset: Option<DatagramSlot>,
     pub(super) process_data: Vec<ProcessDatagram>,
     pub(super) al_status: DatagramSlot,
     pub(super) diagnostic_at: usize,
@@ -43,10 +45,13 @@ impl DatagramSlots {
         order: &[DeviceIndex],
         clock: Option<&ClockPlan>,
     ) -> Self {
+        let aligns = clock.is_some_and(|clock| clock.align);
         let clock = clock.map(|clock| {
             let address = u32::from(registers::DC_SYSTEM_TIME) << 16 | u32::from(clock.reference);
             push(&mut frames[0], 0, Command::FRMW, address, 8)
         });
+        // Behind the time, which is thus distributed before it is corrected.
+        let clock_offset = aligns.then(|| push(&mut frames[0], 0, Command::NOP, 0, 8));
         let offset = |device: &DeviceIndex| plan.regions[*device].map_or(0, |region| region.offset);
         let process_data = datagrams.iter().map(|datagram| {
             let first = order.partition_point(|device| offset(device) < datagram.offset);
@@ -81,9 +86,30 @@ impl DatagramSlots {
         debug_assert!(diagnostic_at + MAX_POLL_DATAGRAM <= MAX_FRAME);
         Self {
             clock,
+            clock_offset,
             process_data,
             al_status,
             diagnostic_at,
         }
     }
+}
+
+/// Writes the datagram that sets the offset of the reference clock (0x0920). Without an offset, no
+/// device processes it.
+pub(super) fn write_clock_offset(
+    frame: &mut [u8],
+    slot: DatagramSlot,
+    station: Option<u16>,
+    offset: Option<u64>,
+) {
+    let (command, station, offset) = match station.zip(offset) {
+        Some((station, offset)) => (Command::FPWR, station, offset),
+        None => (Command::NOP, 0, 0),
+    };
+    let address = u32::from(registers::DC_SYSTEM_TIME_OFFSET) << 16 | u32::from(station);
+    write_header(frame, slot.offset, command, address, slot.len);
+    if let Some(data) = frame.get_mut(slot.data()) {
+        data.copy_from_slice(&offset.to_le_bytes());
+    }
+    clear_wkc(frame, slot);
 }

@@ -15,6 +15,8 @@ const FIRST_FRAME: usize = 1444;
 const NEXT_FRAME: usize = 1498;
 /// Bytes of a datagram's header and working counter.
 const DATAGRAM: usize = 12;
+/// Bytes of the datagram that corrects the reference clock.
+const CORRECTION: usize = DATAGRAM + 8;
 
 /// The process data of one SubDevice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -124,6 +126,8 @@ pub struct ImagePlan {
     /// Outputs that are copied to other outputs, after everything that writes outputs.
     pub repeats: Vec<BitCopy>,
     pub len: usize,
+    /// The first frame corrects the reference clock.
+    pub align: bool,
 }
 
 /// The process data of a device does not fit into one frame.
@@ -155,7 +159,7 @@ impl ImagePlan {
     /// Returns the longest time of a cycle's frames on the wire in ns.
     #[must_use]
     pub fn wire_ns(&self) -> u64 {
-        wire_ns(&self.datagrams).max(wire_ns(&self.separate))
+        wire_ns(&self.datagrams, self.align).max(wire_ns(&self.separate, self.align))
     }
 
     /// Returns the place of a copy in the image; `None` if a device has no process data there.
@@ -183,22 +187,23 @@ pub fn frames(datagrams: &[DatagramPlan]) -> usize {
 
 /// Returns the time of a cycle's frames on the wire in ns, from the first bit to the last one:
 /// 100 Mbit/s.
-fn wire_ns(datagrams: &[DatagramPlan]) -> u64 {
+fn wire_ns(datagrams: &[DatagramPlan], align: bool) -> u64 {
     // The other content of the first frame. `FRAME` is headers, FCS, preamble and gap.
     const FIRST: usize = 54;
     const FRAME: usize = 16 + 4 + 20;
     let data: usize = datagrams.iter().map(|d| d.len + DATAGRAM).sum();
-    let bytes = FIRST + frames(datagrams) * FRAME + data;
+    let correction = usize::from(align) * CORRECTION;
+    let bytes = FIRST + correction + frames(datagrams) * FRAME + data;
     80 * bytes as u64
 }
 
 /// Returns the image of a machine according to its settings.
 #[allow(clippy::disallowed_methods, reason = "runs before the loop")]
 pub fn of(config: &RtConfig) -> Result<ImagePlan, TooLarge> {
-    let mut image = plan(&config.devices)?;
+    let mut image = lay_out_both(&config.devices, config.align)?;
     // A frame takes about 1 µs through a device.
     let through = 1000 * config.devices.len() as u64;
-    if wire_ns(&image.separate) + through > config.cycle_ns / 2 {
+    if wire_ns(&image.separate, config.align) + through > config.cycle_ns / 2 {
         image.separate.clear();
     }
     let copies = config.copies.iter();
@@ -209,16 +214,22 @@ pub fn of(config: &RtConfig) -> Result<ImagePlan, TooLarge> {
     Ok(image)
 }
 
+/// Returns the image of these devices without copies and corrections of the reference clock.
+pub fn plan(devices: &[ProcessData]) -> Result<ImagePlan, TooLarge> {
+    lay_out_both(devices, false)
+}
+
 /// Lays devices out group by group, so that each group has its own working counters. No device is
-/// split over two frames. The position of a device does not depend on its access commands.
+/// split over two frames. The position of a device does not depend on its access commands. With
+/// `align`, the first frame has room for the correction of the reference clock.
 #[allow(
     clippy::disallowed_methods,
     clippy::disallowed_macros,
     reason = "runs before the loop"
 )]
-pub fn plan(devices: &[ProcessData]) -> Result<ImagePlan, TooLarge> {
-    let separate = lay_out(devices, false)?.datagrams;
-    let image = lay_out(devices, true)?;
+fn lay_out_both(devices: &[ProcessData], align: bool) -> Result<ImagePlan, TooLarge> {
+    let separate = lay_out(devices, false, align)?.datagrams;
+    let image = lay_out(devices, true, align)?;
     Ok(ImagePlan { separate, ..image })
 }
 
@@ -228,8 +239,9 @@ pub fn plan(devices: &[ProcessData]) -> Result<ImagePlan, TooLarge> {
     clippy::disallowed_macros,
     reason = "runs before the loop"
 )]
-fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge> {
+fn lay_out(devices: &[ProcessData], shared: bool, align: bool) -> Result<ImagePlan, TooLarge> {
     let mut image = ImagePlan {
+        align,
         regions: vec![None; devices.len()].into(),
         groups: devices.iter().map(|device| device.group).collect(),
         ..ImagePlan::default()
@@ -238,7 +250,7 @@ fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge>
     order.sort_by_key(|(_, device)| device.group);
     let mut frames = FramePacker {
         last: 0,
-        room: FIRST_FRAME,
+        room: FIRST_FRAME - usize::from(align) * CORRECTION,
     };
     for (index, device) in order {
         let (out, inp) = (device.out_len, device.in_len);

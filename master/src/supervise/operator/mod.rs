@@ -264,6 +264,11 @@ impl Request {
 pub enum ProgramRequest {
     /// Starts the program. It enables the axes first, unless its steps do so.
     Start,
+    /// Starts the program at an instant of common time, in ns since 1970. It enables the axes at once,
+    /// unless its steps do so.
+    StartAt {
+        at_unix_ns: u64,
+    },
     /// Waits before the next step.
     Pause,
     Resume,

@@ -15,7 +15,7 @@ use crate::report::{Cause, Error};
 use crate::rt::channel::{RtCommand, Snapshot};
 use crate::rt::reaction_group::GroupStatus;
 use crate::supervise::explain::MODES_OF_OPERATION_DISPLAY;
-use crate::supervise::{ProgramOutcome, Supervisor};
+use crate::supervise::{CommonStart, ProgramOutcome, Supervisor};
 
 /// The maximum number of requests per call, not counting stops.
 const MOST_REQUESTS: usize = 64;
@@ -28,6 +28,8 @@ pub(crate) struct Attendance {
     program: ProgramStatus,
     /// The number of the request that started the program.
     program_request: u64,
+    /// The instant at which the program is to start.
+    start_at: Option<CommonStart>,
     /// The program is to start, end, or run one step.
     start: bool,
     end: bool,
@@ -55,6 +57,7 @@ impl Supervisor {
             controller: RequestController::new(all.len(), timeout, shares),
             program: ProgramStatus::default(),
             program_request: 0,
+            start_at: None,
             start: false,
             end: false,
             step: false,
@@ -112,13 +115,18 @@ impl Supervisor {
         all: &[AxisIndex],
         ended: &mut ProgramOutcome,
     ) -> Result<(), Error> {
+        let attendance = self.attendance.as_mut();
+        let at = attendance.and_then(|attendance| attendance.start_at.take());
         let result = async {
             if !enables(&self.machine.steps) {
                 self.enable_axes(None, all).await?;
             }
-            self.run_program(ended).await
+            self.run_program(at, ended).await
         }
         .await;
+        if at.is_some() {
+            self.cancel_start().await;
+        }
         let stopping = self.outer.snapshots.read().stopping.is_some();
         if stopping || self.outer.commands.is_abandoned() {
             return result;
@@ -149,8 +157,12 @@ impl Supervisor {
         self.take_requests(&mut attendance, snapshot, &mut commands);
         let ends = attendance.program.running && (attendance.end || attendance.gone);
         self.attendance = Some(attendance);
+        if ends && self.start.is_some() {
+            // A stop must not be followed by the start of the program.
+            self.cancel_start().await;
+        }
         if !commands.is_empty() {
-            self.send_all(&commands).await;
+            self.send_now(&commands).await;
         }
         if ends {
             return Err(Cause::Interrupted.into());
@@ -316,27 +328,38 @@ impl Attendance {
 
     fn take_program(&mut self, request: ProgramRequest, scene: &RequestContext<'_>) {
         let running = self.program.running;
-        let refused = match request {
-            ProgramRequest::Start if running => Some("the program runs already"),
-            ProgramRequest::Start if scene.machine.steps.is_empty() => {
-                Some("the machine file has no [[step]]")
+        let starts = matches!(
+            request,
+            ProgramRequest::Start | ProgramRequest::StartAt { .. }
+        );
+        let cycle = scene.machine.bus.cycle_ns;
+        let common = &scene.snapshot.common_time;
+        let mut start_at = None;
+        let result = match request {
+            _ if starts && running => Err("the program runs already".to_owned()),
+            _ if starts && scene.machine.steps.is_empty() => {
+                Err("the machine file has no [[step]]".to_owned())
             }
-            ProgramRequest::Start if self.controller.moves() => {
-                Some("an axis moves: stop it first")
+            _ if starts && self.controller.moves() => {
+                Err("an axis moves: stop it first".to_owned())
+            }
+            ProgramRequest::StartAt { at_unix_ns } => {
+                let start = CommonStart::new(at_unix_ns, cycle, common);
+                start.map(|start| start_at = Some(start))
             }
             ProgramRequest::Step if running && !self.program.paused => {
-                Some("the program is not paused")
+                Err("the program is not paused".to_owned())
             }
-            ProgramRequest::Start | ProgramRequest::Step => None,
-            _ if !running => Some("no program runs"),
-            _ => None,
+            ProgramRequest::Start | ProgramRequest::Step => Ok(()),
+            _ if !running => Err("no program runs".to_owned()),
+            _ => Ok(()),
         };
-        let result = refused.map_or(Ok(()), |why| Err(why.to_owned()));
         let request_number = self.requests;
-        if refused.is_none() {
+        if result.is_ok() {
             match request {
                 // The end of the program is the result of its start.
-                ProgramRequest::Start => {
+                ProgramRequest::Start | ProgramRequest::StartAt { .. } => {
+                    self.start_at = start_at;
                     (self.start, self.program.running) = (true, true);
                     self.program_request = request_number;
                     return;
