@@ -145,7 +145,11 @@ pub enum Op {
     /// Lets held motions continue.
     Resume { group: Option<String> },
     /// Starts or ends the program of the machine file.
-    Program { action: ProgramAction },
+    Program {
+        action: ProgramAction,
+        /// With `start`: the instant of common time, in ns since 1970, at most 1 h ahead.
+        at_unix_ns: Option<u64>,
+    },
     /// Writes an object of a device over CoE.
     SdoWrite {
         device: String,

@@ -262,6 +262,46 @@ fn cycle(text: &mut Text, latest: &Latest) {
     ] {
         text.counter(name, help, value);
     }
+    let common = &snapshot.common_time;
+    let (locked, alignment) = (f64::from(common.locked), common.alignment);
+    for (name, help, value) in [
+        (
+            "ecaxis_common_time_locked",
+            "1 if offset and drift of the bus against common time are known.",
+            Some(locked),
+        ),
+        (
+            "ecaxis_common_time_offset_seconds",
+            "Common time minus system time of the bus.",
+            common.locked.then_some(common.offset_ns as f64 * 1e-9),
+        ),
+        (
+            "ecaxis_common_time_drift_ppm",
+            "Rate of common time against the system time of the bus.",
+            common.locked.then_some(common.drift_ppm),
+        ),
+        (
+            "ecaxis_common_time_jitter_seconds",
+            "Mean deviation of one measurement of common time.",
+            Some(common.jitter_ns * 1e-9),
+        ),
+        (
+            "ecaxis_sync0_offset_seconds",
+            "Time from a multiple of the cycle in common time to SYNC0, if aligned.",
+            alignment
+                .filter(|_| common.locked)
+                .map(|a| a.sync0_ns * 1e-9),
+        ),
+    ] {
+        if let Some(value) = value {
+            text.gauge(name, help, value);
+        }
+    }
+    text.counter(
+        "ecaxis_common_time_jumps_total",
+        "Jumps of common time.",
+        common.jumps,
+    );
     if let Some(phase) = snapshot.phase {
         for (name, help, value) in [
             (

@@ -315,9 +315,9 @@ impl ServerOperator {
             | Request::Override { .. }
             | Request::Hold { .. }
             | Request::Program(ProgramRequest::Pause | ProgramRequest::Resume) => return None,
-            Request::Program(ProgramRequest::Start | ProgramRequest::Step) => {
-                (None, Some(Request::StopAll))
-            }
+            Request::Program(
+                ProgramRequest::Start | ProgramRequest::StartAt { .. } | ProgramRequest::Step,
+            ) => (None, Some(Request::StopAll)),
             Request::Jog { axis, .. } => {
                 let hand = view.hands.get(axis);
                 let jogs = hand.is_some_and(|h| matches!(h.doing, Activity::Jogging { .. }));

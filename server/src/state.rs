@@ -9,9 +9,11 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 use ecaxis_esi::address;
 use ecaxis_master::acyclic::AlState;
 use ecaxis_master::acyclic::topology::ports;
+use ecaxis_master::clock::COMMON_CLOCK;
 use ecaxis_master::config::{AxisSetup, Machine, Nic, Signal, si_factor};
 use ecaxis_master::link::redundant::{RingState, RingStatus};
 use ecaxis_master::report::events::describe_stop;
+use ecaxis_master::rt::common_time::CommonTimeStatus;
 use ecaxis_master::rt::exchange::{DiagnosticRegister, SubDeviceDiagnostics};
 use ecaxis_master::rt::overrides::Override;
 use ecaxis_master::rt::samples::CYCLE_COLUMNS;
@@ -244,12 +246,28 @@ fn bus_state(hub: &Hub, latest: Option<&Latest>) -> Value {
             ("inputs_fresh", json!(snapshot.inputs_fresh)),
             ("stopping", json!(stopping)),
             ("phase", json!(phase)),
+            ("common_time", common_time(&snapshot.common_time)),
             ("ring", hub.ring().map_or(Value::Null, ring_state)),
         ] {
             bus.insert(key.to_owned(), value);
         }
     }
     Value::Object(bus)
+}
+
+fn common_time(common: &CommonTimeStatus) -> Value {
+    let (alignment, locked) = (common.alignment, common.locked);
+    json!({
+        "clock": COMMON_CLOCK,
+        "locked": locked,
+        "offset_ns": locked.then_some(common.offset_ns),
+        "drift_ppm": locked.then_some(common.drift_ppm),
+        "jitter_ns": common.jitter_ns,
+        "jumps": common.jumps,
+        "aligned": alignment.map(|alignment| alignment.aligned),
+        "sync0_ns": alignment.filter(|_| locked).map(|alignment| alignment.sync0_ns),
+        "correction_ppm": alignment.map(|alignment| alignment.correction_ppm),
+    })
 }
 
 fn ring_state(ring: &RingStatus) -> Value {

@@ -86,13 +86,20 @@ impl Client {
             }
             Op::Hold { group } => self.hold(group.as_deref(), true),
             Op::Resume { group } => self.hold(group.as_deref(), false),
-            Op::Program { action } => {
-                let request = match action {
-                    ProgramAction::Start => ProgramRequest::Start,
-                    ProgramAction::Pause => ProgramRequest::Pause,
-                    ProgramAction::Resume => ProgramRequest::Resume,
-                    ProgramAction::Step => ProgramRequest::Step,
-                    ProgramAction::Stop => ProgramRequest::Stop,
+            Op::Program { action, at_unix_ns } => {
+                let request = match (action, at_unix_ns) {
+                    (ProgramAction::Start, None) => ProgramRequest::Start,
+                    (ProgramAction::Start, Some(at_unix_ns)) => {
+                        ProgramRequest::StartAt { at_unix_ns }
+                    }
+                    (_, Some(_)) => {
+                        let message = "`at_unix_ns` belongs to the action `start`";
+                        return Err(OpError::new(ErrorCode::BadRequest, message));
+                    }
+                    (ProgramAction::Pause, None) => ProgramRequest::Pause,
+                    (ProgramAction::Resume, None) => ProgramRequest::Resume,
+                    (ProgramAction::Step, None) => ProgramRequest::Step,
+                    (ProgramAction::Stop, None) => ProgramRequest::Stop,
                 };
                 Ok(vec![Work::Request(MachineRequest::Program(request))])
             }

@@ -212,6 +212,65 @@ fn the_program_of_the_file_runs_pauses_and_ends() {
     );
 }
 
+/// Virtual time begins in 1970. The demonstration has two drives with SYNC0.
+#[test]
+fn the_program_starts_at_an_instant_of_common_time() {
+    let server = Server::in_virtual_time(demo());
+    let mut client = server.owner("test");
+    client.advance(2.0);
+    let state = client.ok("state", json!({}));
+    let common = &state["bus"]["common_time"];
+    assert_eq!(common["clock"], json!("CLOCK_REALTIME"));
+    assert_eq!(
+        (&common["locked"], &common["aligned"]),
+        (&json!(true), &json!(null))
+    );
+    let now = state["time_ns"].as_u64().expect("a time");
+    for (action, at, code, part) in [
+        ("start", now - 1_000_000, "failed", "in the past"),
+        ("start", now + 4_000_000_000_000, "failed", "1 h"),
+        ("pause", now + 1_000_000_000, "bad_request", "start"),
+    ] {
+        let keys = json!({"action": action, "at_unix_ns": at, "wait": true});
+        let refused = client.refused("program", keys);
+        assert_eq!(refused["code"], json!(code), "{refused}");
+        assert!(
+            refused["message"].as_str().unwrap().contains(part),
+            "{refused}"
+        );
+    }
+    let at = now + 3_000_000_000;
+    let start = json!({"action": "start", "at_unix_ns": at});
+    client.ok("program", start.clone());
+    client.advance(2.5);
+    let state = client.ok("state", json!({}));
+    assert_eq!(state["program"]["running"], json!(true));
+    let x = &state["axes"][0];
+    assert_eq!(
+        (&x["enabled"], &x["moving"]),
+        (&json!(true), &json!(false)),
+        "{x}"
+    );
+    client.advance(0.6);
+    assert_eq!(client.axis("x")["moving"], json!(true));
+    client.done("program", json!({"action": "stop"}));
+    client.advance(1.0);
+    // Another client may stop it before it starts.
+    let now = client.ok("state", json!({}))["time_ns"]
+        .as_u64()
+        .expect("a time");
+    let at = now + 1_000_000_000;
+    client.ok("program", json!({"action": "start", "at_unix_ns": at}));
+    client.advance(0.9);
+    let mut other = server.client();
+    other.ok("stop", json!({}));
+    let before = client.position("x");
+    client.advance(1.0);
+    assert_eq!(client.position("x"), before);
+    let state = client.ok("state", json!({}));
+    assert_eq!(state["program"]["running"], json!(false));
+}
+
 #[test]
 fn an_override_scales_a_running_move() {
     let server = Server::in_virtual_time(demo());
