@@ -194,7 +194,7 @@ fn watch(
 }
 
 /// A device without a clock, the reference clock alone at one port, two drives at the other.
-fn branches() -> Machine {
+pub(crate) fn branches() -> Machine {
     let bench = Bench::new();
     bench.write("hub.xml", &bench.read("esi/IO8.xml"));
     bench.change("hub.xml", |esi| esi.replace("\"YY\"", "\"YYY\""));

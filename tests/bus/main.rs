@@ -9,6 +9,7 @@ mod cabling;
 mod cams;
 mod clock_wrap;
 mod clocks;
+mod common_time;
 mod compensation;
 mod controller;
 mod copy;
