@@ -270,9 +270,14 @@ impl CommonTime {
         was_locked.then_some(Jump { by_ns })
     }
 
-    fn locked(&self) -> bool {
-        self.line.count >= LOCK_TIME as f64 / self.cycle
-            && self.line.jitter <= self.cycle / OUTLIER_DIVISOR / 2.0
+    /// Returns true if common time is known well enough for a start.
+    #[must_use]
+    pub fn locked(&self) -> bool {
+        self.line.count >= LOCK_TIME as f64 / self.cycle && self.is_steady()
+    }
+
+    fn is_steady(&self) -> bool {
+        self.line.jitter <= self.cycle / OUTLIER_DIVISOR / 2.0
     }
 
     /// Returns the time from a multiple of the cycle in common time to SYNC0, in ns.
@@ -294,7 +299,7 @@ impl CommonTime {
             correction.of = None;
             return;
         }
-        if !self.line.rate_is_known(self.cycle) {
+        if !self.line.rate_is_known(self.cycle) || observed.in_op && !self.is_steady() {
             return;
         }
         let limits = self.limits;
@@ -313,6 +318,10 @@ impl CommonTime {
     /// rate, so the line begins again.
     pub fn take_offset(&mut self, of: DeviceIndex, offset: u64) {
         let correction = &mut self.correction;
+        // A second reading is older than the corrections since the first one.
+        if correction.of.is_some_and(|(known, _)| known == of) {
+            return;
+        }
         if correction.rate_of != Some(of) {
             (correction.rate, correction.rate_of) = (0.0, Some(of));
             self.line = Line::default();

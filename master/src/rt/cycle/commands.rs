@@ -153,6 +153,8 @@ impl Engine {
             .and_then(|own| self.groups.get(own))
             .is_some_and(ReactionGroup::continues_without);
         let machine_stops = self.stopping().is_some();
+        // All commands of a common start take effect, or none.
+        self.drop_deferred(DropCause::Stopped);
         if cause != StopCause::Requested {
             self.exchange.stop_windows(own.filter(|_| goes_on));
         }
@@ -182,9 +184,6 @@ impl Engine {
             } else if !goes_on {
                 self.stop_group(group, cause, Some(StopMethod::Ramp));
             }
-        }
-        if !goes_on {
-            self.drop_deferred(DropCause::Stopped);
         }
         if !machine_stops && !goes_on {
             let cycle = self.stats.counters.cycles;

@@ -170,10 +170,12 @@ impl Engine {
 
     /// Measures common time, and corrects the reference clock if SYNC0 is aligned.
     pub(super) fn follow_common_time(&mut self) {
-        if let Some((device, offset)) = self.exchange.take_offset() {
+        let reference = self.exchange.reference();
+        if let Some((device, offset)) = self.exchange.take_offset()
+            && Some(device) == reference
+        {
             self.common.take_offset(device, offset);
         }
-        let reference = self.exchange.reference();
         let jump = self.common.update(&Observed {
             reference,
             system_time: self.answer.system_time,
@@ -185,6 +187,9 @@ impl Engine {
             let cycle = self.stats.counters.cycles;
             self.drop_deferred(DropCause::Jumped);
             self.report(Event::CommonTimeJumped { cycle, by_ns });
+        }
+        if !self.common.locked() {
+            self.drop_deferred(DropCause::Unlocked);
         }
         self.exchange
             .want_offset(self.common.wanted_offset(reference));

@@ -28,7 +28,9 @@ pub enum DropCause {
     Passed { by_ns: Nanos },
     #[error("common time has jumped")]
     Jumped,
-    #[error("the machine stops")]
+    #[error("common time is not locked")]
+    Unlocked,
+    #[error("the machine or a group stops")]
     Stopped,
     #[error("more than {COMMANDS_PER_CYCLE} commands wait for the instant")]
     TooMany,
@@ -70,11 +72,9 @@ impl Engine {
             }
         }
         self.deferred.expected = count;
-        if let Some(late) = self
-            .after_instant()
-            .filter(|late| *late >= self.config.cycle_ns)
-        {
-            self.drop_deferred(DropCause::Passed { by_ns: late });
+        let late = self.after_instant();
+        if let Some(by_ns) = late.filter(|late| *late >= self.start_window()) {
+            self.drop_deferred(DropCause::Passed { by_ns });
         }
     }
 
@@ -104,8 +104,9 @@ impl Engine {
         }
         match self.after_instant() {
             None => {}
-            Some(late) if late >= self.config.cycle_ns => {
-                self.drop_deferred(DropCause::Passed { by_ns: late });
+            // Commands that are still in the queue would take effect later than these.
+            Some(by_ns) if by_ns >= self.start_window() || self.deferred.expected > 0 => {
+                self.drop_deferred(DropCause::Passed { by_ns });
             }
             Some(_) => {
                 let cycle = self.stats.counters.cycles;
@@ -113,15 +114,22 @@ impl Engine {
                     at: self.deferred.at,
                     cycle,
                 };
+                // Counted first: after a panic, no command may seem to be on its way.
+                self.commands_taken += self.deferred.commands.len() as u64;
                 for index in 0..self.deferred.commands.len() {
                     if let Some(&command) = self.deferred.commands.get(index) {
-                        self.commands_taken += 1;
                         self.take(command);
                     }
                 }
                 self.deferred.commands.clear();
             }
         }
+    }
+
+    /// The time in which the commands may begin. It is longer than a cycle, because the distance
+    /// of two pulses in common time changes with the corrections of both clocks.
+    const fn start_window(&self) -> Nanos {
+        self.config.cycle_ns + self.config.cycle_ns / 4
     }
 
     /// Returns the time since the begin of the instant's cycle; `None` before it.

@@ -39,6 +39,10 @@ impl Turn<'_, '_> {
                 }
                 .with_device(self.device_of(axis)));
             }
+            // The commands may wait for an instant of common time.
+            if snapshot.commands_taken < self.commands_sent {
+                continue;
+            }
             let status = |axis: AxisIndex| snapshot.axes.get(axis).copied();
             let late = axes
                 .iter()
