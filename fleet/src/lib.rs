@@ -7,7 +7,7 @@
 //! | [`agent`] | from the socket of `ecaxis serve` to Zenoh |
 //! | [`reports`] | fault reports on disk, each under its SHA-256 |
 //! | [`archive`], [`router`] | the history of all machines; a Zenoh router |
-//! | [`observe`] | the commands that read |
+//! | [`observe`], [`page`] | the commands that read; the page with a tile per machine |
 //! | [`orders`] | orders to machines |
 
 pub mod agent;
@@ -18,6 +18,7 @@ pub mod keys;
 pub mod observe;
 pub mod options;
 pub mod orders;
+pub mod page;
 pub mod reports;
 pub mod router;
 pub mod session;
@@ -69,6 +70,7 @@ async fn execute(command: Command) -> error::Result<()> {
         Command::Push(args) => orders::commands::push(args).await,
         Command::Start(args) => orders::commands::start(args).await,
         Command::Update(args) => orders::commands::update(args).await,
+        Command::Page { network, options } => page::run(&network, options).await,
         Command::Samples { network, request } => observe::samples::run(&network, request).await,
     }
 }

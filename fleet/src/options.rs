@@ -1,5 +1,6 @@
 //! The command line.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
@@ -65,6 +66,17 @@ pub enum Command {
         network: Network,
         #[command(subcommand)]
         action: ReportAction,
+    },
+    /// Serve a page with a tile for each machine
+    #[command(
+        after_help = "Examples:\n  ecaxis-fleet page --connect tcp/router:7447\n  \
+                            ecaxis-fleet page --http 0.0.0.0:8090 --allow-host hall.example"
+    )]
+    Page {
+        #[command(flatten)]
+        network: Network,
+        #[command(flatten)]
+        options: PageOptions,
     },
     /// Print the samples of a machine's signals, as JSON
     #[command(after_help = "Examples:\n  ecaxis-fleet samples hall-1/press-3 \
@@ -139,6 +151,16 @@ pub enum ReportAction {
         #[arg(value_parser = id_prefix)]
         id: String,
     },
+}
+
+#[derive(Debug, Clone, Args)]
+pub struct PageOptions {
+    /// The address of the page; port 0: a free port
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8090")]
+    pub http: SocketAddr,
+    /// A further name that the `Host` header may contain
+    #[arg(long, value_name = "NAME")]
+    pub allow_host: Vec<String>,
 }
 
 #[derive(Debug, Clone, Args)]

@@ -25,6 +25,8 @@ const MAX_REPLIES: usize = 100_000;
 pub async fn open(config: zenoh::Config) -> Result<Session> {
     zenoh::open(config).await.map_err(|error| {
         let text = error.to_string();
+        // Zenoh appends the place in its source.
+        let text = text.split(" at /").next().unwrap_or_default();
         let text: String = text.chars().take(200).collect();
         Error::new(format!("Zenoh: {text}"))
             .help("check `connect` and the certificates, and that the router runs")

@@ -346,8 +346,8 @@ class Fleet:
         begin, lost = time.monotonic(), ["?"]
         while lost and time.monotonic() < begin + 60:
             time.sleep(0.5)
-            lost = [(key, r) for key, own in expected.items() for r in own if r not in self.archived(key)]
-            lost += [(key, e) for key, own in events.items() for e in own if e not in self.archived_events(key)]
+            lost = [(key, r) for key, own in expected.items() for r in set(own) - set(self.archived(key))]
+            lost += [(key, e) for key, own in events.items() for e in set(own) - set(self.archived_events(key))]
         count = f"{total} reports, {sum(map(len, events.values()))} events, complete after {time.monotonic() - begin:.1f} s"
         self.report.check("no report and no event is lost", not lost, lost or count)
         for machine in self.machines:

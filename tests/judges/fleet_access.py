@@ -4,11 +4,14 @@ import contextlib
 import json
 import os
 import pathlib
+import shutil
 import socket
 import subprocess
 import tempfile
 import threading
 import time
+import urllib.error
+import urllib.request
 
 import rig
 
@@ -69,6 +72,25 @@ class Client:
 
     def close(self):
         self.session.close()
+
+
+def page(report, program, folder):
+    """The fleet page in a browser: a tile with the state, and a link to the machine's own page."""
+    command = [program, "page", "--http", "127.0.0.1:0", "--config", folder / "client.toml"]
+    with rig.process(list(map(str, command)), stdout=subprocess.PIPE) as process:
+        url = process.stdout.readline().strip()
+        machines = json.load(urllib.request.urlopen(f"{url}api/fleet", timeout=20))
+        report.equal("the page's data", [(m["machine"], m["alive"]) for m in machines], [("press-3", True)])
+        try:
+            urllib.request.urlopen(urllib.request.Request(f"{url}api/fleet", headers={"Host": "attacker.example"}), timeout=20)
+            report.check("another name of this computer is refused", False)
+        except urllib.error.HTTPError as error:
+            report.equal("another name of this computer is refused", error.code, 403)
+        if browser := shutil.which("chromium"):
+            command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=3000", "--dump-dom", url]
+            document = subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
+            report.check("a tile links to the machine's page", 'href="http://press-3:8080/"' in document, document[-2000:] if "tile" not in document else "")
+            report.check("it shows the state of the bus", 'data-state="good">op</span>' in document)
 
 
 def access(report, program):
@@ -146,6 +168,7 @@ def access(report, program):
             report.equal(f"a stranger asks for {suffix}", stranger.ask(f"{KEY}/{suffix}", order), [])
         entries = [json.loads(line) for line in changes.read_text().splitlines()]
         report.equal("no command reached the machine", [entry for entry in entries if "client" in entry], [])
+        page(report, program, folder)
         for what, certificates, name in (("another authority", folder / "other", "reader"), ("no certificate", tls, None)):
             try:
                 client = Client(endpoint, certificates, name)

@@ -23,6 +23,8 @@ use crate::session::reply;
 
 /// The longest request for samples, and the most rows and signals in its answer.
 const MAX_SAMPLES: Duration = Duration::from_secs(10);
+/// The shortest time between two batches of samples.
+const MIN_INTERVAL: Duration = Duration::from_millis(10);
 const MAX_ROWS: usize = 20_000;
 const MAX_SIGNALS: usize = 32;
 /// The requests to the server at the same time. More of them are refused.
@@ -219,7 +221,8 @@ fn read_samples(
     let signals: Vec<&str> = signals.split(',').take(MAX_SIGNALS).collect();
     let time = Duration::try_from_secs_f64(seconds).unwrap_or(MAX_SAMPLES);
     let end = Instant::now() + time.min(MAX_SAMPLES);
-    let subscription = machine.samples(&signals, Duration::from_millis(100))?;
+    let interval = (time / 4).clamp(MIN_INTERVAL, 10 * MIN_INTERVAL);
+    let subscription = machine.samples(&signals, interval)?;
     let (mut times, mut rows, mut missed) = (Vec::new(), Vec::new(), 0);
     while rows.len() < MAX_ROWS {
         let rest = end.saturating_duration_since(Instant::now());

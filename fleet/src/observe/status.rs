@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use serde::Serialize;
-use serde_json::json;
+use serde_json::{Value, json};
 use zenoh::Session;
 
 use super::{TIMEOUT, print};
@@ -63,6 +63,16 @@ pub fn state_of(reply: &Reply) -> Option<State> {
     (suffix == "state" && state.id == id).then_some(state)
 }
 
+/// Returns all machines as JSON.
+#[must_use]
+pub fn to_json(machines: &BTreeMap<MachineId, Seen>) -> Value {
+    let machines = machines.iter().map(|(id, seen)| {
+        json!({"site": id.site, "machine": id.machine, "alive": seen.alive,
+               "age_s": seen.age_s, "state": seen.state})
+    });
+    machines.collect()
+}
+
 /// Prints all machines.
 ///
 /// # Errors
@@ -71,11 +81,7 @@ pub async fn run(network: &Network, as_json: bool) -> Result<()> {
     let session = session::open_command(network).await?;
     let machines = look(&session).await?;
     if as_json {
-        let list = machines.iter().map(|(id, seen)| {
-            json!({"site": id.site, "machine": id.machine, "alive": seen.alive,
-                   "age_s": seen.age_s, "state": seen.state})
-        });
-        print(&serde_json::Value::from_iter(list).to_string())?;
+        print(&to_json(&machines).to_string())?;
     } else {
         let rows: Vec<_> = machines.iter().map(|(id, seen)| row(id, seen)).collect();
         print(&table(&rows))?;
