@@ -155,11 +155,11 @@ def access(report, program):
         state = command("status", "--json")[0]["state"]
         report.check("no forged answer arrives", abs(state["unix_time"] - time.time()) < 60, state["unix_time"])
         report.equal("tokens", reader.alive(), [f"{KEY}/alive"])
-        order = json.dumps({"machine": "hall-1/press-3", "action": "start"})
+        order = json.dumps({"order": json.dumps({"machine": "hall-1/press-3", "action": "start"}), "signature": ""})
         for key in (f"{KEY}/order", "ecaxis/*/*/order", ALL):
             report.equal(f"a reader's order at {key}", reader.ask(key, order), [])
-        answers = [json.loads(text)["ok"] for text in planner.ask(f"{KEY}/order", order)]
-        report.equal("an order without a key, from a client with the right to send it, is refused", answers, [False])
+        answers = [json.loads(text)["status"] for text in planner.ask(f"{KEY}/order", order)]
+        report.equal("an order without a key, from a client with the right to send it, is refused", answers, ["refused"])
         wildcard = [text for text in planner.ask("ecaxis/*/*/order", order)]
         report.equal("an order to all at once has no answer", wildcard, [])
         report.equal("a stranger hears", stranger.heard, [])
