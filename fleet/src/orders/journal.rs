@@ -21,6 +21,9 @@ const MAX_NONCES: usize = 20_000;
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct Entry {
     unix_time: u64,
+    /// The latest time that the log has seen.
+    #[serde(default)]
+    latest: u64,
     nonce: String,
     not_after: u64,
     sha256: FileDigest,
@@ -35,6 +38,10 @@ struct Entry {
 pub struct OrderJournal {
     path: PathBuf,
     file: File,
+    /// The length of the whole entries.
+    length: u64,
+    /// The clock may be set back. It would make old orders valid again.
+    latest: u64,
     known: BTreeMap<String, Entry>,
 }
 
@@ -44,13 +51,14 @@ impl OrderJournal {
     /// # Errors
     /// Fails if the log cannot be read or written.
     pub fn open(path: &Path) -> Result<Self> {
-        let mut known = BTreeMap::new();
+        let (mut known, mut latest) = (BTreeMap::new(), 0);
         if path.exists() {
             let file = File::open(path).map_err(at(path))?;
             for line in BufReader::new(file).split(b'\n') {
                 let line = line.map_err(at(path))?;
                 // The last line may be incomplete; it was not acknowledged.
                 if let Ok(entry) = serde_json::from_slice::<Entry>(&line) {
+                    latest = latest.max(entry.latest).max(entry.unix_time);
                     known.insert(entry.nonce.clone(), entry);
                 }
             }
@@ -64,6 +72,8 @@ impl OrderJournal {
         let mut journal = Self {
             path: path.to_owned(),
             file,
+            length: 0,
+            latest,
             known,
         };
         journal.rewrite()?;
@@ -90,7 +100,7 @@ impl OrderJournal {
     /// Enters an order. After this, it is never executed again.
     ///
     /// # Errors
-    /// Fails if the disk is full, or too many orders are remembered.
+    /// Fails if the disk is full, too many orders are remembered, or the clock went back by a day.
     pub fn begin(
         &mut self,
         order: &Order,
@@ -99,14 +109,24 @@ impl OrderJournal {
         now: u64,
         reply: OrderReply,
     ) -> Result<()> {
-        // The clock may be set back by a day.
+        if now.saturating_add(MAX_WINDOW) < self.latest {
+            let what = format!(
+                "the clock is {} s behind the log of orders",
+                self.latest - now
+            );
+            return Err(Error::new(what).help("set the clock of the machine's computer"));
+        }
+        self.latest = self.latest.max(now);
+        // Each order that may be valid after this check is remembered.
+        let latest = self.latest;
         self.known
-            .retain(|_, entry| entry.not_after.saturating_add(MAX_WINDOW) >= now);
+            .retain(|_, entry| entry.not_after.saturating_add(MAX_WINDOW) >= latest);
         if self.known.len() >= MAX_NONCES {
             return Err(Error::new("the agent had too many orders today"));
         }
         let entry = Entry {
             unix_time: now,
+            latest: self.latest,
             nonce: order.nonce.clone(),
             not_after: order.not_after,
             sha256,
@@ -129,6 +149,8 @@ impl OrderJournal {
         };
         entry.reply = reply;
         entry.unix_time = now;
+        self.latest = self.latest.max(now);
+        entry.latest = self.latest;
         let entry = entry.clone();
         match kept {
             true => self.append(&entry),
@@ -137,14 +159,17 @@ impl OrderJournal {
     }
 
     fn append(&mut self, entry: &Entry) -> Result<()> {
-        let size = self.file.metadata().map_err(at(&self.path))?.len();
-        if size > MAX_LOG {
+        if self.length > MAX_LOG {
             self.rewrite()?;
         }
         let line = format!("{}\n", serde_json::to_string(entry).unwrap_or_default());
-        let written = self.file.write_all(line.as_bytes());
+        // A failed append may have left a part of a line, which would spoil this one.
+        let cut = self.file.set_len(self.length);
+        let written = cut.and_then(|()| self.file.write_all(line.as_bytes()));
         let stored = written.and_then(|()| self.file.sync_data());
-        stored.map_err(at(&self.path))
+        stored.map_err(at(&self.path))?;
+        self.length += line.len() as u64;
+        Ok(())
     }
 
     /// Begins the log again with the remembered orders. The old one remains as `orders.jsonl.1`.
@@ -154,12 +179,16 @@ impl OrderJournal {
             let old = self.path.with_extension("jsonl.1");
             fs::copy(&self.path, &old).map_err(at(&old))?;
         }
-        let lines = self.known.values().map(|entry| {
+        let latest = self.latest;
+        let lines = self.known.values_mut().map(|entry| {
+            entry.latest = latest;
             let line = serde_json::to_string(entry).unwrap_or_default();
             line + "\n"
         });
-        files::write(&self.path, lines.collect::<String>().as_bytes())?;
+        let lines: String = lines.collect();
+        files::write(&self.path, lines.as_bytes())?;
         self.file = open(&self.path)?;
+        self.length = lines.len() as u64;
         Ok(())
     }
 }
@@ -167,4 +196,56 @@ impl OrderJournal {
 fn open(path: &Path) -> Result<File> {
     let file = OpenOptions::new().create(true).append(true).open(path);
     file.map_err(at(path))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::order::Action;
+    use super::*;
+
+    const DAY: u64 = MAX_WINDOW;
+
+    fn begin(journal: &mut OrderJournal, nonce: &str, now: u64) -> Result<()> {
+        let machine = "hall/m1".parse().unwrap();
+        let action = Action::Back {};
+        let order = Order::new(machine, action, now, now + 60, nonce.to_owned());
+        let reply = OrderReply::new(Status::Done, "done");
+        journal.begin(&order, FileDigest::of(nonce.as_bytes()), "anna", now, reply)
+    }
+
+    #[test]
+    fn a_part_of_an_entry_does_not_spoil_the_next_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("orders.jsonl");
+        let mut journal = OrderJournal::open(&path).unwrap();
+        begin(&mut journal, "a", 1000).unwrap();
+        // What an append on a full disk leaves.
+        open(&path)
+            .unwrap()
+            .write_all(b"{\"unix_time\":10")
+            .unwrap();
+        begin(&mut journal, "b", 1001).unwrap();
+        drop(journal);
+        let again = OrderJournal::open(&path).unwrap();
+        assert_eq!(again.known.keys().collect::<Vec<_>>(), ["a", "b"]);
+    }
+
+    #[test]
+    fn an_order_stays_known_when_the_clock_is_set_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("orders.jsonl");
+        let mut journal = OrderJournal::open(&path).unwrap();
+        begin(&mut journal, "old", 10 * DAY).unwrap();
+        begin(&mut journal, "new", 20 * DAY).unwrap();
+        assert!(!journal.known.contains_key("old"));
+        drop(journal);
+        let mut again = OrderJournal::open(&path).unwrap();
+        let error = begin(&mut again, "old", 10 * DAY).unwrap_err().to_string();
+        assert!(error.contains("behind the log of orders"), "{error}");
+        begin(&mut again, "next", 19 * DAY).unwrap();
+        assert!(again.known.contains_key("new"));
+        drop(again);
+        // The entry with the lower time does not lower the latest.
+        assert_eq!(OrderJournal::open(&path).unwrap().latest, 20 * DAY);
+    }
 }
