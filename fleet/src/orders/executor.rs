@@ -178,34 +178,36 @@ impl OrderExecutor {
             Ok(Some(reply)) => return reply,
             Err(error) => return refused(error),
         }
+        let permitted = order.check(&self.machine, now);
+        let permitted = permitted.and_then(|()| key.require(order.action.right()));
+        if let Err(error) = permitted {
+            // Without an entry: the sender decides how many of them come, and how long they count.
+            let summary = order.action.summary();
+            tracing::info!(sender = key.name, "order `{summary}`: refused: {error}");
+            return refused(error);
+        }
         let mut running = lock(&self.running);
-        let permitted = order
-            .check(&self.machine, now)
-            .and_then(|()| key.require(order.action.right()))
-            .and_then(|()| match &*running {
-                Some(other) => Err(Error::new(format!("{other} is not done yet"))),
-                None => Ok(()),
-            });
-        let reply = match permitted {
-            Ok(()) => OrderReply::new(Status::Running, "accepted"),
-            Err(error) => refused(error),
+        let reply = match &*running {
+            Some(other) => refused(Error::new(format!("{other} is not done yet"))),
+            None => OrderReply::new(Status::Running, "accepted"),
         };
         let begins = reply.status == Status::Running;
         if let Err(error) = journal.begin(&order, sha256, &key.name, now, reply.clone()) {
             return refused(error);
         }
         drop(journal);
-        if begins {
-            *running = Some(format!("`{}` by `{}`", order.action.summary(), key.name));
+        if !begins {
+            drop(running);
+            self.log(&order, &key.name, &reply);
+            return reply;
         }
+        *running = Some(format!("`{}` by `{}`", order.action.summary(), key.name));
         let (executor, sender) = (Arc::clone(self), key.name.clone());
         let first = reply.clone();
         thread::spawn(move || {
             executor.log(&order, &sender, &first);
-            if begins {
-                executor.execute(&order, &sender);
-                *lock(&executor.running) = None;
-            }
+            executor.execute(&order, &sender);
+            *lock(&executor.running) = None;
         });
         reply
     }

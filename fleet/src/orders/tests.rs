@@ -427,6 +427,9 @@ fn orders_without_right_time_or_place_are_refused() {
         refused(text.replace(from, to).as_bytes(), "wrong signature");
     }
     refused(b"{}", "not an order");
+    // None of them is remembered.
+    let log = fs::read_to_string(folder.path().join("orders/orders.jsonl")).unwrap();
+    assert_eq!(log, "");
     refused(&vec![b' '; 70_000], "longer than");
 }
 
