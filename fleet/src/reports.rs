@@ -6,7 +6,7 @@ use std::fs::{self, File};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -173,16 +173,21 @@ impl ReportStore {
         if kept.contains_key(&summary.id) {
             return Ok(None);
         }
+        // The newest one, also after the clock was set back.
+        let newest = kept.values().map(|report| report.stored).max();
+        let after = newest.and_then(|newest| newest.checked_add(Duration::from_nanos(1)));
+        let stored = after.map_or_else(SystemTime::now, |after| after.max(SystemTime::now()));
         let temporary = self.folder.join(format!(".new-{}", summary.id.as_str()));
         let mut file = File::create(&temporary)?;
         file.write_all(bytes)?;
+        file.set_modified(stored)?;
         file.sync_all()?;
         fs::rename(&temporary, self.path(&summary.id))?;
         File::open(&self.folder)?.sync_all()?;
         kept.insert(
             summary.id.clone(),
             Kept {
-                stored: SystemTime::now(),
+                stored,
                 summary: Some(summary.clone()),
             },
         );
@@ -290,6 +295,26 @@ mod tests {
         let events: Vec<_> = store.list().iter().map(|summary| summary.event).collect();
         assert_eq!(events, [4, 3, 2]);
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 3);
+    }
+
+    #[test]
+    fn a_new_report_stays_after_the_clock_was_set_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = ReportStore::open(folder.path(), 2).unwrap();
+        let future = SystemTime::now() + Duration::from_secs(86_400);
+        for number in 0..2 {
+            let id = store.add(&report(number)).unwrap().unwrap().id;
+            let file = File::options().write(true).open(store.path(&id)).unwrap();
+            file.set_modified(future + Duration::from_secs(number))
+                .unwrap();
+        }
+        for number in 2..4 {
+            let store = ReportStore::open(folder.path(), 2).unwrap();
+            let id = store.add(&report(number)).unwrap().unwrap().id;
+            assert!(store.get(&id).is_some());
+            assert_eq!(store.list()[0].event, number);
+            assert_eq!(store.list()[1].event, number - 1);
+        }
     }
 
     #[test]
