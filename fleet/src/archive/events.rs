@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeSet, VecDeque};
 use std::fs::{self, File, OpenOptions};
-use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
@@ -12,16 +12,16 @@ use crate::agent::events::EventIdentity;
 /// The length of a file; the one before it is kept, too.
 const MAX_FILE: u64 = 4 << 20;
 /// The longest event.
-const MAX_EVENT: usize = 16 << 10;
+pub(super) const MAX_EVENT: usize = 16 << 10;
 /// The events that are recognized; a server has 1,000.
 const MAX_KNOWN: usize = 4000;
 
-/// The file of the events.
+/// The file of the events. It is open only during an append: an archive has many machines.
 #[derive(Debug)]
 pub struct EventLog {
     path: PathBuf,
     older: PathBuf,
-    file: File,
+    /// The length of the whole lines.
     length: u64,
     known: Known,
 }
@@ -34,10 +34,9 @@ struct Known {
 }
 
 impl Known {
-    /// Returns true if the event is new.
-    fn add(&mut self, identity: EventIdentity) -> bool {
+    fn add(&mut self, identity: EventIdentity) {
         if !self.set.insert(identity) {
-            return false;
+            return;
         }
         self.order.push_back(identity);
         if self.order.len() > MAX_KNOWN
@@ -45,12 +44,11 @@ impl Known {
         {
             self.set.remove(&oldest);
         }
-        true
     }
 }
 
 impl EventLog {
-    /// Opens the file in a folder, or makes it. An incomplete last line is removed.
+    /// Reads the file in a folder. The next append removes an incomplete last line.
     ///
     /// # Errors
     /// Fails if the disk refuses.
@@ -79,13 +77,9 @@ impl EventLog {
         };
         read(&older)?;
         let length = read(&path)? as u64;
-        let mut file = OpenOptions::new().create(true).append(true).open(&path)?;
-        file.set_len(length)?;
-        file.seek(SeekFrom::End(0))?;
         Ok(Self {
             path,
             older,
-            file,
             length,
             known,
         })
@@ -96,26 +90,41 @@ impl EventLog {
     /// # Errors
     /// Fails if the disk refuses.
     pub fn add(&mut self, events: impl IntoIterator<Item = Value>) -> io::Result<()> {
+        let mut opened = None;
         for event in events {
             let Some(identity) = EventIdentity::of(&event) else {
                 continue;
             };
             let line = format!("{event}\n");
-            if line.len() > MAX_EVENT || !self.known.add(identity) {
+            if line.len() > MAX_EVENT || self.known.set.contains(&identity) {
                 continue;
             }
             if self.length > MAX_FILE {
                 fs::rename(&self.path, &self.older)?;
-                self.file = OpenOptions::new()
-                    .create(true)
-                    .append(true)
-                    .open(&self.path)?;
                 self.length = 0;
+                opened = None;
             }
-            self.file.write_all(line.as_bytes())?;
+            let file = match &mut opened {
+                Some(file) => file,
+                None => opened.insert(self.open_end()?),
+            };
+            file.write_all(line.as_bytes())?;
             self.length += line.len() as u64;
+            self.known.add(identity);
         }
         Ok(())
+    }
+
+    /// Opens the file after its last whole line. A failed append may have left a part of one.
+    fn open_end(&self) -> io::Result<File> {
+        let file = OpenOptions::new()
+            .create(true)
+            .append(true)
+            .open(&self.path)?;
+        if file.metadata()?.len() > self.length {
+            file.set_len(self.length)?;
+        }
+        Ok(file)
     }
 }
 
@@ -149,6 +158,23 @@ mod tests {
             .map(|l| serde_json::from_str(l).unwrap())
             .collect();
         assert_eq!(events, [event(1), event(2), event(3), first]);
+    }
+
+    #[test]
+    fn an_event_comes_again_after_a_failed_append() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("events.jsonl");
+        let mut log = EventLog::open(folder.path()).unwrap();
+        fs::create_dir(&path).unwrap();
+        log.add([event(1)]).unwrap_err();
+        fs::remove_dir(&path).unwrap();
+        log.add([event(1)]).unwrap();
+        // What an append on a full disk leaves.
+        let mut file = OpenOptions::new().append(true).open(&path).unwrap();
+        file.write_all(b"{\"event\":\"fau").unwrap();
+        log.add([event(1), event(2)]).unwrap();
+        let text = fs::read_to_string(&path).unwrap();
+        assert_eq!(text, format!("{}\n{}\n", event(1), event(2)));
     }
 
     #[test]

@@ -107,8 +107,7 @@ impl ArchivedMachine {
     /// Writes the events after [`Self::complete_to`] that are not there.
     pub fn complete_events(&self, id: &MachineId, events: Vec<Value>) {
         let last = events.last().and_then(EventIdentity::of);
-        self.write_events(id, events);
-        if last.is_some() {
+        if self.write_events(id, events) && last.is_some() {
             *lock(&self.complete_to) = last;
         }
     }
@@ -126,9 +125,32 @@ impl ArchivedMachine {
         last.is_some() && last != self.complete_to()
     }
 
-    fn write_events(&self, id: &MachineId, events: impl IntoIterator<Item = Value>) {
-        if let Err(error) = lock(&self.events).add(events) {
+    fn write_events(&self, id: &MachineId, events: impl IntoIterator<Item = Value>) -> bool {
+        let written = lock(&self.events).add(events);
+        if let Err(error) = &written {
             tracing::error!(machine = %id, "events: {error}");
         }
+        written.is_ok()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn events_are_complete_only_if_they_are_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let machine = ArchivedMachine::open(folder.path(), 10).unwrap();
+        let id = "hall/m1".parse().unwrap();
+        let event = |n: u64| json!({"event": "fault", "number": n, "time_ns": n});
+        let path = folder.path().join("events.jsonl");
+        fs::create_dir(&path).unwrap();
+        machine.complete_events(&id, vec![event(1), event(2)]);
+        assert_eq!(machine.complete_to(), None);
+        fs::remove_dir(&path).unwrap();
+        machine.complete_events(&id, vec![event(1), event(2)]);
+        assert_eq!(machine.complete_to(), EventIdentity::of(&event(2)));
+        assert_eq!(fs::read_to_string(&path).unwrap().lines().count(), 2);
     }
 }
