@@ -1,11 +1,14 @@
 //! Zenoh sessions, queries with bounds, and signals.
 
 use std::path::Path;
+use std::sync::mpsc;
+use std::thread;
 use std::time::Duration;
 
 use serde::de::DeserializeOwned;
 use tokio::signal::unix::{SignalKind, signal};
 use zenoh::Session;
+use zenoh::Wait;
 use zenoh::query::{ConsolidationMode, Query, QueryTarget};
 use zenoh::sample::Locality;
 
@@ -17,6 +20,10 @@ use crate::options::Network;
 pub const MAX_REPLY: usize = 4 << 20;
 /// The replies to a query that are taken.
 const MAX_REPLIES: usize = 100_000;
+/// The sum of their bytes. The states of 10,000 machines are 6 MB.
+const MAX_BYTES: usize = 256 << 20;
+/// The queries that wait for an answer.
+const MAX_QUERIES: usize = 256;
 
 /// Opens a session. With a role other than a command, this lasts until something answers.
 ///
@@ -89,12 +96,14 @@ pub async fn query(session: &Session, selector: &str, timeout: Duration) -> Resu
         .timeout(timeout)
         .await
         .map_err(failed)?;
-    let mut taken = Vec::new();
+    let (mut taken, mut bytes) = (Vec::new(), 0);
     while let Ok(reply) = replies.recv_async().await {
         let Ok(sample) = reply.into_result() else {
             continue;
         };
-        if sample.payload().len() <= MAX_REPLY && taken.len() < MAX_REPLIES {
+        let length = sample.payload().len();
+        if length <= MAX_REPLY && taken.len() < MAX_REPLIES && bytes + length <= MAX_BYTES {
+            bytes += length;
             taken.push(Reply {
                 key: sample.key_expr().to_string(),
                 bytes: sample.payload().to_bytes().into_owned(),
@@ -104,9 +113,29 @@ pub async fn query(session: &Session, selector: &str, timeout: Duration) -> Resu
     Ok(taken)
 }
 
+/// Starts a thread that answers queries, because replies and the disk block. It ends with the
+/// returned callback of a queryable, which drops a query when too many wait.
+///
+/// # Errors
+/// Fails if the system refuses a thread.
+pub fn answer_queries(
+    answer: impl Fn(Query) + Send + 'static,
+) -> Result<impl Fn(Query) + Clone + Send + Sync + 'static> {
+    let (queries, waiting) = mpsc::sync_channel(MAX_QUERIES);
+    let named = thread::Builder::new().name("queries".to_owned());
+    named
+        .spawn(move || waiting.into_iter().for_each(answer))
+        .map_err(|error| Error::new(format!("starting a thread: {error}")))?;
+    Ok(move |query| {
+        if queries.try_send(query).is_err() {
+            tracing::debug!("a query is dropped: {MAX_QUERIES} wait");
+        }
+    })
+}
+
 /// Replies to a query. A session that is closed meanwhile needs no reply.
-pub async fn reply(query: &Query, key: &str, bytes: Vec<u8>) {
-    if let Err(error) = query.reply(key, bytes).await {
+pub fn reply(query: &Query, key: &str, bytes: Vec<u8>) {
+    if let Err(error) = query.reply(key, bytes).wait() {
         tracing::debug!("reply {key}: {error}");
     }
 }

@@ -2,14 +2,17 @@
 //! machine.
 
 use std::path::PathBuf;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use ecaxis_client::Machine;
+use serde::Serialize;
 use serde_json::{Value, json};
+use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio::sync::mpsc::Receiver;
 use zenoh::Session;
+use zenoh::Wait;
 use zenoh::query::Query;
 
 use super::events::{EventIdentity, Events};
@@ -17,18 +20,20 @@ use super::reader::{Update, attach_options};
 use crate::error::{Error, Result};
 use crate::keys::MachineId;
 use crate::orders::executor::OrderExecutor;
-use crate::orders::order::{OrderReply, Status};
+use crate::orders::order::{MAX_ORDER, OrderReply, Status};
 use crate::reports::{ReportId, ReportStore};
-use crate::session::reply;
+use crate::session::{MAX_REPLY, answer_queries, reply};
 
-/// The longest request for samples, and the most rows and signals in its answer.
+/// The longest request for samples, and the most bytes of rows and signals in its answer.
 const MAX_SAMPLES: Duration = Duration::from_secs(10);
+const MAX_ROW_BYTES: usize = MAX_REPLY - (64 << 10);
 /// The shortest time between two batches of samples.
 const MIN_INTERVAL: Duration = Duration::from_millis(10);
-const MAX_ROWS: usize = 20_000;
 const MAX_SIGNALS: usize = 32;
 /// The requests to the server at the same time. More of them are refused.
 const REQUESTS: usize = 4;
+/// The orders that are checked at the same time. A sender repeats one without an answer.
+const ORDERS: usize = 4;
 
 /// A machine on Zenoh.
 #[derive(Debug)]
@@ -41,8 +46,9 @@ pub struct Publisher {
     /// Without it, the agent only reads.
     orders: Option<Arc<OrderExecutor>>,
     requests: Arc<Semaphore>,
+    checks: Arc<Semaphore>,
     /// The last state, as it was published.
-    state: Option<Vec<u8>>,
+    state: Mutex<Option<Vec<u8>>>,
 }
 
 impl Publisher {
@@ -63,7 +69,8 @@ impl Publisher {
             socket,
             orders: None,
             requests: Arc::new(Semaphore::new(REQUESTS)),
-            state: None,
+            checks: Arc::new(Semaphore::new(ORDERS)),
+            state: Mutex::default(),
         }
     }
 
@@ -77,34 +84,44 @@ impl Publisher {
     ///
     /// # Errors
     /// Fails if the session is closed.
-    pub async fn run(mut self, mut updates: Receiver<Update>) -> Result<()> {
+    pub async fn run(self, mut updates: Receiver<Update>) -> Result<()> {
         let failed = |error: zenoh::Error| Error::new(format!("Zenoh: {error}"));
+        let publisher = Arc::new(self);
+        let (answering, runtime) = (Arc::clone(&publisher), Handle::current());
+        let answer = answer_queries(move |query| answering.answer(query, &runtime))?;
+        publisher.serve(&mut updates, answer).await.map_err(failed)
+    }
+
+    async fn serve(
+        &self,
+        updates: &mut Receiver<Update>,
+        answer: impl Fn(Query) + Send + Sync + 'static,
+    ) -> zenoh::Result<()> {
         let queries = self.session.declare_queryable(self.id.key("**"));
-        let queries = queries.await.map_err(failed)?;
+        let _queries = queries.callback(answer).await?;
         let token = self
             .session
             .liveliness()
             .declare_token(self.id.key("alive"));
-        let _token = token.await.map_err(failed)?;
-        loop {
-            tokio::select! {
-                update = updates.recv() => match update {
-                    Some(update) => self.publish(update).await,
-                    None => return Ok(()),
-                },
-                query = queries.recv_async() => match query {
-                    Ok(query) => self.answer(query).await,
-                    Err(_) => return Err(Error::new("Zenoh: the session is closed")),
-                },
+        let _token = token.await?;
+        while let Some(update) = updates.recv().await {
+            self.publish(update).await;
+            if self.session.is_closed() {
+                return Err("the session is closed".into());
             }
         }
+        Ok(())
     }
 
-    async fn publish(&mut self, update: Update) {
+    fn state(&self) -> std::sync::MutexGuard<'_, Option<Vec<u8>>> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    async fn publish(&self, update: Update) {
         let (suffix, value) = match update {
             Update::State(state) => {
                 let bytes = json!(*state).to_string().into_bytes();
-                self.state = Some(bytes.clone());
+                *self.state() = Some(bytes.clone());
                 ("state".to_owned(), bytes)
             }
             Update::Event(event) => {
@@ -121,39 +138,44 @@ impl Publisher {
         }
     }
 
-    async fn answer(&self, query: Query) {
+    fn answer(&self, query: Query, runtime: &Handle) {
         let keys = query.key_expr();
         let asks = |suffix: &str| {
             let key = zenoh::key_expr::KeyExpr::try_from(self.id.key(suffix));
             key.is_ok_and(|key| keys.intersects(&key))
         };
         if asks("state")
-            && let Some(state) = &self.state
+            && let Some(state) = self.state().clone()
         {
-            reply(&query, &self.id.key("state"), state.clone()).await;
+            reply(&query, &self.id.key("state"), state);
         }
         if asks("reports") {
             let list = json!(self.store.list()).to_string();
-            reply(&query, &self.id.key("reports"), list.into_bytes()).await;
+            reply(&query, &self.id.key("reports"), list.into_bytes());
         }
         // Only whole keys: a wildcard shall cause neither work of the server nor an order.
         match MachineId::of_key(keys.as_str()) {
             Some((id, "order")) if id == self.id => {
-                let order = query.payload().map(|payload| payload.to_bytes());
-                let order = order.unwrap_or_default().into_owned();
+                let Ok(permit) = Arc::clone(&self.checks).try_acquire_owned() else {
+                    return;
+                };
                 let (orders, key) = (self.orders.clone(), self.id.key("order"));
                 // The log of orders is written before the answer.
-                tokio::spawn(async move {
-                    let receive = move || match orders {
-                        Some(orders) => orders.receive(&order),
-                        None => OrderReply::new(
-                            Status::Refused,
-                            "this machine takes no orders: its agent has no table `orders`",
+                runtime.spawn_blocking(move || {
+                    let _permit = permit;
+                    let refused = |text: String| OrderReply::new(Status::Refused, text);
+                    let order = query.payload().filter(|order| order.len() <= MAX_ORDER);
+                    let answer = match (orders, order) {
+                        (Some(orders), Some(order)) => orders.receive(&order.to_bytes()),
+                        (Some(_), None) => {
+                            refused(format!("no order of at most {MAX_ORDER} bytes"))
+                        }
+                        (None, _) => refused(
+                            "this machine takes no orders: its agent has no table `orders`"
+                                .to_owned(),
                         ),
                     };
-                    if let Ok(answer) = tokio::task::spawn_blocking(receive).await {
-                        reply(&query, &key, json!(answer).to_string().into_bytes()).await;
-                    }
+                    reply(&query, &key, json!(answer).to_string().into_bytes());
                 });
             }
             Some((id, "events")) if id == self.id => {
@@ -161,14 +183,14 @@ impl Publisher {
                 let known = number("time_ns").zip(number("number"));
                 let known = known.map(|(time_ns, number)| EventIdentity { time_ns, number });
                 let events = json!({"events": self.events.after(known)}).to_string();
-                reply(&query, &self.id.key("events"), events.into_bytes()).await;
+                reply(&query, &self.id.key("events"), events.into_bytes());
             }
-            Some((id, "samples")) if id == self.id => self.read_samples(query.clone()),
+            Some((id, "samples")) if id == self.id => self.read_samples(query, runtime),
             Some((id, suffix)) if id == self.id => {
                 let report = suffix.strip_prefix("report/");
                 let report = report.and_then(|id| ReportId::try_from(id.to_owned()).ok());
                 if let Some(bytes) = report.and_then(|report| self.store.get(&report)) {
-                    reply(&query, &self.id.key(suffix), bytes).await;
+                    reply(&query, &self.id.key(suffix), bytes);
                 }
             }
             _ => {}
@@ -176,35 +198,35 @@ impl Publisher {
     }
 
     /// Asks the server in a thread, because its client blocks.
-    fn read_samples(&self, query: Query) {
+    fn read_samples(&self, query: Query, runtime: &Handle) {
         let key = self.id.key("samples");
         let permit = Arc::clone(&self.requests).try_acquire_owned();
+        let busy = permit.is_err();
         let socket = self.socket.clone();
-        tokio::spawn(async move {
+        let work = move || {
             let answer = match (permit, socket) {
                 (Err(_), _) => Err(refusal("busy", "too many requests wait")),
                 (_, None) => Err(refusal("absent", "the server is absent")),
-                (Ok(permit), Some(socket)) => {
+                (Ok(_permit), Some(socket)) => {
                     let parameters = query.parameters();
-                    let signals = parameters.get("signals").unwrap_or_default().to_owned();
+                    let signals = parameters.get("signals").unwrap_or_default();
                     let seconds = parameters.get("seconds").and_then(|s| s.parse().ok());
-                    let work = move || {
-                        let _permit = permit;
-                        let machine = Machine::attach(&socket, attach_options())?;
-                        read_samples(&machine, &signals, seconds.unwrap_or(1.0))
-                    };
-                    let error = |error: ecaxis_client::Error| refusal(&error.code, &error.cause);
-                    match tokio::task::spawn_blocking(work).await {
-                        Ok(answer) => answer.map_err(error),
-                        Err(_) => Err(refusal("failed", "the request has no answer")),
-                    }
+                    let answer = Machine::attach(&socket, attach_options()).and_then(|machine| {
+                        read_samples(&machine, signals, seconds.unwrap_or(1.0))
+                    });
+                    answer.map_err(|error| refusal(&error.code, &error.cause))
                 }
             };
             match answer {
-                Ok(answer) => reply(&query, &key, answer.to_string().into_bytes()).await,
-                Err(error) => drop(query.reply_err(error.to_string()).await),
+                Ok(answer) => reply(&query, &key, answer.to_string().into_bytes()),
+                Err(error) => drop(query.reply_err(error.to_string()).wait()),
             }
-        });
+        };
+        // A busy machine is refused here: these threads are bounded.
+        match busy {
+            true => work(),
+            false => drop(runtime.spawn_blocking(work)),
+        }
     }
 }
 
@@ -223,24 +245,86 @@ fn read_samples(
     let end = Instant::now() + time.min(MAX_SAMPLES);
     let interval = (time / 4).clamp(MIN_INTERVAL, 10 * MIN_INTERVAL);
     let subscription = machine.samples(&signals, interval)?;
-    let (mut times, mut rows, mut missed) = (Vec::new(), Vec::new(), 0);
-    while rows.len() < MAX_ROWS {
+    let mut answer = SampleRows::default();
+    while answer.complete {
         let rest = end.saturating_duration_since(Instant::now());
         if rest.is_zero() {
             break;
         }
-        let Some(mut batch) = subscription.next_within(rest)? else {
+        let Some(batch) = subscription.next_within(rest)? else {
             break;
         };
-        if let (Value::Array(new_times), Value::Array(new_rows)) =
-            (batch["time_ns"].take(), batch["rows"].take())
-        {
-            times.extend(new_times);
-            rows.extend(new_rows);
-            missed += batch["missed"].as_u64().unwrap_or_default();
+        answer.add(batch, MAX_ROW_BYTES);
+    }
+    let mut answer = json!(answer);
+    answer["signals"] = json!(signals);
+    Ok(answer)
+}
+
+/// The samples of an answer.
+#[derive(Debug, Serialize)]
+struct SampleRows {
+    time_ns: Vec<Value>,
+    rows: Vec<Value>,
+    missed: u64,
+    /// False if the time was too long for one answer.
+    complete: bool,
+    #[serde(skip)]
+    bytes: usize,
+}
+
+impl Default for SampleRows {
+    fn default() -> Self {
+        Self {
+            time_ns: Vec::new(),
+            rows: Vec::new(),
+            missed: 0,
+            complete: true,
+            bytes: 0,
         }
     }
-    times.truncate(MAX_ROWS);
-    rows.truncate(MAX_ROWS);
-    Ok(json!({"signals": signals, "time_ns": times, "rows": rows, "missed": missed}))
+}
+
+impl SampleRows {
+    /// Takes the rows of a batch that fit into the bytes of an answer.
+    fn add(&mut self, mut batch: Value, max_bytes: usize) {
+        self.missed += batch["missed"].as_u64().unwrap_or_default();
+        if let (Value::Array(times), Value::Array(rows)) =
+            (batch["time_ns"].take(), batch["rows"].take())
+        {
+            for (time, row) in times.into_iter().zip(rows) {
+                // With a comma each.
+                let bytes = time.to_string().len() + row.to_string().len() + 2;
+                if self.bytes + bytes > max_bytes {
+                    self.complete = false;
+                    return;
+                }
+                self.bytes += bytes;
+                self.time_ns.push(time);
+                self.rows.push(row);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_fit_into_a_reply() {
+        let mut answer = SampleRows::default();
+        let row = vec![-0.123_456_789_012_345; MAX_SIGNALS];
+        let mut batches = 0;
+        while answer.complete {
+            let times = vec![1_795_600_000_000_000_000_u64; 100];
+            let batch = json!({"time_ns": times, "rows": vec![row.clone(); 100], "missed": 1});
+            answer.add(batch, MAX_ROW_BYTES);
+            batches += 1;
+        }
+        assert_eq!(answer.missed, batches);
+        assert_eq!(answer.rows.len(), answer.time_ns.len());
+        let length = json!(answer).to_string().len();
+        assert!((MAX_REPLY / 2..MAX_REPLY).contains(&length), "{length}");
+    }
 }

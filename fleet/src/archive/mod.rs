@@ -4,16 +4,18 @@
 pub mod events;
 pub mod machine;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use tokio::sync::Semaphore;
+use tokio::sync::mpsc::{self, Receiver, Sender};
+use tokio::task::JoinSet;
 use tokio::time::MissedTickBehavior;
 use zenoh::Session;
+use zenoh::key_expr::KeyExpr;
 use zenoh::query::Query;
 use zenoh::sample::{Sample, SampleKind};
 
@@ -22,6 +24,7 @@ use crate::error::{Error, Result};
 use crate::keys::{ALL_ALIVE, ALL_REPORTS, ALL_STATES, EACH_EVENT, EACH_REPORT, MachineId, Name};
 use crate::reports::{ReportId, Summary};
 use crate::session::{self, Reply};
+use events::MAX_EVENT;
 use machine::ArchivedMachine;
 
 /// The machines of an archive.
@@ -29,8 +32,12 @@ const MAX_MACHINES: usize = 10_000;
 /// An agent offers at most 500 reports, another archive 1,000: a smaller archive would fetch what
 /// it has deleted.
 const MIN_REPORTS: usize = 1000;
+/// The longest state.
+const MAX_STATE: usize = 64 << 10;
 /// The queries at the same time.
-const QUERIES: usize = 16;
+const WORKERS: usize = 16;
+/// The work that waits for them. More of it is dropped: the next query of all machines finds it.
+const MAX_WORK: usize = 1024;
 /// The time for an answer.
 const TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -62,7 +69,6 @@ pub async fn run(path: &Path) -> Result<()> {
                 folder,
                 max_reports: file.max_reports,
                 machines: Mutex::new(machines),
-                queries: Semaphore::new(QUERIES),
             });
             archive.keep(interval).await
         } => ended,
@@ -78,7 +84,29 @@ struct Archive {
     folder: PathBuf,
     max_reports: usize,
     machines: Mutex<Machines>,
-    queries: Semaphore,
+}
+
+/// What an archive may lack.
+#[derive(Debug)]
+enum Work {
+    /// What a machine has that appears.
+    Machine(MachineId),
+    Report(MachineId, ReportId),
+    Events(MachineId),
+}
+
+/// Runs what blocks by the disk.
+async fn on_disk<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Option<T> {
+    let done = tokio::task::spawn_blocking(work).await;
+    done.inspect_err(|error| tracing::error!("archive: {error}"))
+        .ok()
+}
+
+/// Returns the machine and the id of `…/report/ID`.
+fn report_of(key: &KeyExpr<'_>) -> Option<(MachineId, ReportId)> {
+    let (id, suffix) = MachineId::of_key(key.as_str())?;
+    let report = suffix.strip_prefix("report/")?.to_owned();
+    Some((id, ReportId::try_from(report).ok()?))
 }
 
 /// Opens what an earlier process has kept.
@@ -114,12 +142,11 @@ impl Archive {
         let failed = |error: zenoh::Error| Error::new(format!("Zenoh: {error}"));
         let session = &self.session;
         // Replies to the keys below, with the same content as from the machines themselves.
+        let archive = Arc::clone(&self);
+        let answer = session::answer_queries(move |query| archive.answer(&query))?;
         let mut queryables = Vec::new();
         for key in [ALL_STATES, ALL_REPORTS, EACH_REPORT] {
-            let archive = Arc::clone(&self);
-            let queryable = session.declare_queryable(key).callback(move |query| {
-                tokio::spawn(Arc::clone(&archive).answer(query));
-            });
+            let queryable = session.declare_queryable(key).callback(answer.clone());
             queryables.push(queryable.await.map_err(failed)?);
         }
         let states = session
@@ -140,30 +167,68 @@ impl Archive {
             .history(true);
         let tokens = tokens.await.map_err(failed)?;
         tracing::info!(folder = %self.folder.display(), "archive");
-        let mut ticks = tokio::time::interval(interval);
-        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let (work, waiting) = mpsc::channel(MAX_WORK);
+        let waiting = Arc::new(tokio::sync::Mutex::new(waiting));
+        let mut tasks = JoinSet::new();
+        for _ in 0..WORKERS {
+            tasks.spawn(Arc::clone(&self).work(Arc::clone(&waiting)));
+        }
+        tasks.spawn(Arc::clone(&self).query_all(interval, work.clone()));
+        let offer = |item| {
+            if work.try_send(item).is_err() {
+                tracing::debug!("{MAX_WORK} queries wait: one more is left to the next interval");
+            }
+        };
         loop {
             let closed = |_| Error::new("Zenoh: the session is closed");
             tokio::select! {
-                sample = states.recv_async() => self.take_state(&sample.map_err(closed)?),
-                sample = reports.recv_async() => self.take_report(&sample.map_err(closed)?),
-                sample = events.recv_async() => self.take_event(&sample.map_err(closed)?),
+                sample = states.recv_async() => self.take_state(sample.map_err(closed)?).await,
+                sample = reports.recv_async() => {
+                    if let Some((id, report)) = report_of(sample.map_err(closed)?.key_expr())
+                        && !self.has(&id, &report)
+                    {
+                        offer(Work::Report(id, report));
+                    }
+                },
+                sample = events.recv_async() => self.take_event(sample.map_err(closed)?).await,
                 sample = tokens.recv_async() => {
                     let sample = sample.map_err(closed)?;
                     let id = MachineId::of_key(sample.key_expr().as_str()).map(|(id, _)| id);
                     if let (SampleKind::Put, Some(id)) = (sample.kind(), id) {
-                        let archive = Arc::clone(&self);
-                        tokio::spawn(async move {
-                            archive.query_reports(&id.key("reports")).await;
-                            archive.query_events(&id).await;
-                        });
+                        offer(Work::Machine(id));
                     }
                 },
-                _ = ticks.tick() => {
-                    tokio::spawn(Arc::clone(&self).query_all());
-                }
             }
         }
+    }
+
+    /// Does what waits, until the archive ends.
+    async fn work(self: Arc<Self>, waiting: Arc<tokio::sync::Mutex<Receiver<Work>>>) {
+        loop {
+            let next = waiting.lock().await.recv().await;
+            match next {
+                Some(Work::Machine(id)) => {
+                    for (id, report) in self.query_reports(&id.key("reports")).await {
+                        self.fetch(&id, &report).await;
+                    }
+                    self.query_events(&id).await;
+                }
+                Some(Work::Report(id, report)) => self.fetch(&id, &report).await,
+                Some(Work::Events(id)) => self.query_events(&id).await,
+                None => return,
+            }
+        }
+    }
+
+    /// Returns true if the archive has the report.
+    fn has(&self, id: &MachineId, report: &ReportId) -> bool {
+        let machine = self.known(id);
+        machine.is_some_and(|machine| machine.reports.contains(report))
+    }
+
+    fn known(&self, id: &MachineId) -> Option<Arc<ArchivedMachine>> {
+        let machines = self.machines.lock().unwrap_or_else(PoisonError::into_inner);
+        machines.get(id).map(Arc::clone)
     }
 
     /// Returns the machine, also a new one; `None` if there are too many, or the disk refuses.
@@ -201,95 +266,101 @@ impl Archive {
             .collect()
     }
 
-    fn take_state(&self, sample: &Sample) {
-        let reply = Reply {
-            key: sample.key_expr().to_string(),
-            bytes: sample.payload().to_bytes().into_owned(),
-        };
-        if let Some(state) = crate::observe::status::state_of(&reply)
-            && let Some(machine) = self.machine(&state.id)
-        {
-            machine.set_state(state);
+    async fn take_state(self: &Arc<Self>, sample: Sample) {
+        if sample.payload().len() > MAX_STATE {
+            return;
         }
+        let archive = Arc::clone(self);
+        on_disk(move || {
+            let reply = Reply {
+                key: sample.key_expr().to_string(),
+                bytes: sample.payload().to_bytes().into_owned(),
+            };
+            if let Some(state) = crate::observe::status::state_of(&reply)
+                && let Some(machine) = archive.machine(&state.id)
+            {
+                machine.set_state(state);
+            }
+        })
+        .await;
     }
 
-    fn take_event(&self, sample: &Sample) {
-        if let Some((id, _)) = MachineId::of_key(sample.key_expr().as_str())
-            && let Ok(event) = serde_json::from_slice::<Value>(&sample.payload().to_bytes())
-            && let Some(machine) = self.machine(&id)
-        {
-            machine.add_event(&id, event);
+    async fn take_event(self: &Arc<Self>, sample: Sample) {
+        if sample.payload().len() > MAX_EVENT {
+            return;
         }
-    }
-
-    fn take_report(self: &Arc<Self>, sample: &Sample) {
-        if let Some((id, suffix)) = MachineId::of_key(sample.key_expr().as_str())
-            && let Some(report) = suffix.strip_prefix("report/")
-            && let Ok(report) = ReportId::try_from(report.to_owned())
-        {
-            let archive = Arc::clone(self);
-            tokio::spawn(async move { archive.fetch(&id, &report).await });
-        }
+        let archive = Arc::clone(self);
+        on_disk(move || {
+            if let Some((id, _)) = MachineId::of_key(sample.key_expr().as_str())
+                && let Ok(event) = serde_json::from_slice::<Value>(&sample.payload().to_bytes())
+                && let Some(machine) = archive.machine(&id)
+            {
+                machine.add_event(&id, event);
+            }
+        })
+        .await;
     }
 
     /// Finds what was neither announced nor there when a machine appeared.
-    async fn query_all(self: Arc<Self>) {
-        self.query_reports(ALL_REPORTS).await;
-        for (id, machine) in self.all() {
-            if machine.lacks_events() {
-                self.query_events(&id).await;
+    async fn query_all(self: Arc<Self>, interval: Duration, work: Sender<Work>) {
+        let mut ticks = tokio::time::interval(interval);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            ticks.tick().await;
+            let reports = self.query_reports(ALL_REPORTS).await;
+            let reports = reports.into_iter().map(|(id, r)| Work::Report(id, r));
+            let events = self.all().into_iter().filter(|(_, m)| m.lacks_events());
+            for item in reports.chain(events.map(|(id, _)| Work::Events(id))) {
+                if work.send(item).await.is_err() {
+                    return;
+                }
             }
         }
     }
 
-    async fn query_reports(&self, selector: &str) {
-        let replies = {
-            let Ok(_permit) = self.queries.acquire().await else {
-                return;
-            };
-            session::query(&self.session, selector, TIMEOUT).await
-        };
+    /// Returns the reports that others have and this archive lacks.
+    async fn query_reports(&self, selector: &str) -> BTreeSet<(MachineId, ReportId)> {
+        let replies = session::query(&self.session, selector, TIMEOUT).await;
+        let mut lacking = BTreeSet::new();
         for reply in replies.unwrap_or_default() {
             let Some((id, "reports")) = MachineId::of_key(&reply.key) else {
                 continue;
             };
+            let machine = self.known(&id);
             for summary in reply.json::<Vec<Summary>>().unwrap_or_default() {
-                self.fetch(&id, &summary.id).await;
+                let known = machine.as_ref();
+                if !known.is_some_and(|machine| machine.reports.contains(&summary.id)) {
+                    lacking.insert((id.clone(), summary.id));
+                }
             }
         }
+        lacking
     }
 
     /// Fetches a report unless it is there. Its content proves its id.
-    async fn fetch(&self, id: &MachineId, report: &ReportId) {
-        let Some(machine) = self.machine(id) else {
-            return;
-        };
-        if machine.reports.contains(report) {
+    async fn fetch(self: &Arc<Self>, id: &MachineId, report: &ReportId) {
+        if self.has(id, report) {
             return;
         }
-        let Ok(_permit) = self.queries.acquire().await else {
-            return;
-        };
         let key = id.key(&format!("report/{}", report.as_str()));
         let replies = session::query(&self.session, &key, TIMEOUT).await;
         let mut replies = replies.unwrap_or_default().into_iter();
         let Some(whole) = replies.find(|reply| ReportId::of(&reply.bytes) == *report) else {
             return;
         };
-        // The disk blocks.
-        let id = id.clone();
-        let added = tokio::task::spawn_blocking(move || machine.add_report(&id, &whole.bytes));
-        if let Err(error) = added.await {
-            tracing::error!("report: {error}");
-        }
+        let (archive, id) = (Arc::clone(self), id.clone());
+        on_disk(move || {
+            if let Some(machine) = archive.machine(&id) {
+                machine.add_report(&id, &whole.bytes);
+            }
+        })
+        .await;
     }
 
     /// Fetches the events that the agent has after the last known one.
-    async fn query_events(&self, id: &MachineId) {
-        let (Some(machine), Ok(_permit)) = (self.machine(id), self.queries.acquire().await) else {
-            return;
-        };
-        let known = machine.complete_to().map_or(String::new(), |known| {
+    async fn query_events(self: &Arc<Self>, id: &MachineId) {
+        let known = self.known(id).and_then(|machine| machine.complete_to());
+        let known = known.map_or(String::new(), |known| {
             format!("?time_ns={};number={}", known.time_ns, known.number)
         });
         let selector = id.key(&format!("events{known}"));
@@ -298,30 +369,28 @@ impl Archive {
             .ok()
             .and_then(|replies| replies.first()?.json::<Value>());
         if let Some(Value::Array(events)) = answer.map(|mut answer| answer["events"].take()) {
-            machine.complete_events(id, events);
+            let (archive, id) = (Arc::clone(self), id.clone());
+            on_disk(move || {
+                if let Some(machine) = archive.machine(&id) {
+                    machine.complete_events(&id, events);
+                }
+            })
+            .await;
         }
     }
 
-    async fn answer(self: Arc<Self>, query: Query) {
-        let keys = query.key_expr().clone();
-        let reports = MachineId::of_key(keys.as_str()).and_then(|(id, suffix)| {
-            let report = ReportId::try_from(suffix.strip_prefix("report/")?.to_owned()).ok()?;
-            Some((id, report))
-        });
-        if let Some((id, report)) = reports {
-            let kept = self.all().into_iter().find(|(other, _)| *other == id);
-            if let Some(bytes) = kept.and_then(|(_, machine)| machine.reports.get(&report)) {
-                session::reply(
-                    &query,
-                    &id.key(&format!("report/{}", report.as_str())),
-                    bytes,
-                )
-                .await;
+    fn answer(&self, query: &Query) {
+        let keys = query.key_expr();
+        if let Some((id, report)) = report_of(keys) {
+            let kept = self.known(&id);
+            if let Some(bytes) = kept.and_then(|machine| machine.reports.get(&report)) {
+                let key = id.key(&format!("report/{}", report.as_str()));
+                session::reply(query, &key, bytes);
             }
             return;
         }
         let asks = |key: &str| {
-            let key = zenoh::key_expr::KeyExpr::try_from(key);
+            let key = KeyExpr::try_from(key);
             key.is_ok_and(|key| keys.intersects(&key))
         };
         for (id, machine) in self.all() {
@@ -329,12 +398,12 @@ impl Archive {
             if asks(&key)
                 && let Some(state) = machine.state()
             {
-                session::reply(&query, &key, json!(state).to_string().into_bytes()).await;
+                session::reply(query, &key, json!(state).to_string().into_bytes());
             }
             let key = id.key("reports");
             if asks(&key) && !machine.reports.is_empty() {
                 let list = json!(machine.reports.list()).to_string();
-                session::reply(&query, &key, list.into_bytes()).await;
+                session::reply(query, &key, list.into_bytes());
             }
         }
     }

@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use serde_json::Value;
+
 use super::{TIMEOUT, print};
 use crate::error::{Error, Result};
 use crate::options::{Network, SamplesRequest};
@@ -26,5 +28,11 @@ pub async fn run(network: &Network, request: SamplesRequest) -> Result<()> {
                 .help("check the names of the signals, and `ecaxis-fleet status`"),
         );
     };
+    if reply
+        .json::<Value>()
+        .is_some_and(|answer| answer["complete"] == false)
+    {
+        tracing::warn!("the answer is cut to one reply: ask for fewer signals or seconds");
+    }
     print(&String::from_utf8_lossy(&reply.bytes))
 }
