@@ -39,7 +39,7 @@ struct CheckedFile {
 pub fn check(ecaxis: &str, machine_file: &Path) -> Result<Checked> {
     let file = machine_file.display().to_string();
     let words = [ecaxis, "check", "--json", &file].map(str::to_owned);
-    let output = program::run(&words, CHECK, &mut || ())?;
+    let output = program::run(&words, CHECK, &mut || Ok(()))?;
     if !output.ok {
         return Err(Error::new(format!(
             "`ecaxis check` refuses it: {}",
@@ -66,7 +66,7 @@ pub fn make(
     let version = program::run(
         &[ecaxis.to_owned(), "--version".to_owned()],
         CHECK,
-        &mut || (),
+        &mut || Ok(()),
     )?;
     let machine_file = fs::canonicalize(machine_file).map_err(at(machine_file))?;
     let mut sources = Vec::new();

@@ -44,8 +44,13 @@ impl Output {
 /// Runs a command line until its end. `tick` is called again and again.
 ///
 /// # Errors
-/// Fails if the program cannot start, or is not done in time. It then gets SIGINT.
-pub fn run(words: &[String], timeout: Duration, tick: &mut dyn FnMut()) -> Result<Output> {
+/// Fails if the program cannot start, or with the first error of `tick`, once the program has ended.
+/// Fails if the program is not done in time. It then gets SIGINT.
+pub fn run(
+    words: &[String],
+    timeout: Duration,
+    tick: &mut dyn FnMut() -> Result<()>,
+) -> Result<Output> {
     let [program, arguments @ ..] = words else {
         return Err(Error::new("the command is empty"));
     };
@@ -61,6 +66,7 @@ pub fn run(words: &[String], timeout: Duration, tick: &mut dyn FnMut()) -> Resul
     let stderr = child.stderr.take().map(reader);
     let begin = Instant::now();
     let mut interrupted = false;
+    let mut ticked = Ok(());
     let status = loop {
         if let Some(status) = child.try_wait().map_err(failed)? {
             break status;
@@ -72,7 +78,10 @@ pub fn run(words: &[String], timeout: Duration, tick: &mut dyn FnMut()) -> Resul
             let pid = i32::try_from(child.id()).ok().and_then(Pid::from_raw);
             pid.map(|pid| kill_process(pid, Signal::INT));
         }
-        tick();
+        // Half a firmware is worse than a firmware that another client sees.
+        if ticked.is_ok() {
+            ticked = tick();
+        }
         thread::sleep(POLL);
     };
     if interrupted {
@@ -80,6 +89,7 @@ pub fn run(words: &[String], timeout: Duration, tick: &mut dyn FnMut()) -> Resul
             "{program} was not done after {timeout:?}"
         )));
     }
+    ticked?;
     let text = |reader: Option<thread::JoinHandle<String>>| {
         reader
             .and_then(|reader| reader.join().ok())

@@ -82,7 +82,13 @@ impl OrderSender {
         progress: &mut (dyn FnMut(&str) + Send),
     ) -> Result<OrderReply> {
         let now = unix_time();
-        let order = Order::new(machine.clone(), action, now - EARLY, now + LATE, nonce()?);
+        let order = Order::new(
+            machine.clone(),
+            action,
+            now.saturating_sub(EARLY),
+            now + LATE,
+            nonce()?,
+        );
         let order = serde_json::to_string(&order).map_err(|e| Error::new(e.to_string()))?;
         let signature = self.signer.sign(order.as_bytes(), "order.json", now)?;
         let message = SignedOrder { order, signature }.emit();

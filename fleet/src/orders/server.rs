@@ -16,6 +16,8 @@ const SETTLE: Duration = Duration::from_secs(2);
 /// The time for the bus to go down.
 const DOWN: Duration = Duration::from_secs(20);
 const POLL: Duration = Duration::from_millis(200);
+/// The time between two states that must both be without power.
+const REPEAT: Duration = Duration::from_millis(100);
 
 /// Returns an error of the server as one line.
 pub fn text(error: ecaxis_client::Error) -> Error {
@@ -58,6 +60,10 @@ pub fn note(socket: &Path, sender: &str, text: &str) -> bool {
 /// Fails if another client owns the motion, an axis has power or moves, or the program runs.
 pub fn take_disabled(machine: &Machine) -> Result<()> {
     machine.take(false).map_err(text)?;
+    let state = machine.request("state", json!({})).map_err(text)?;
+    require_disabled(&state)?;
+    // An `enable` of the owner before may still be under way.
+    machine.sleep(REPEAT).map_err(text)?;
     let state = machine.request("state", json!({})).map_err(text)?;
     require_disabled(&state)
 }
@@ -120,32 +126,29 @@ pub fn await_health(
     sender: &str,
     sha256: Option<FileDigest>,
     timeout: Duration,
-    tick: &mut dyn FnMut(),
 ) -> Result<()> {
     let begin = Instant::now();
     let mut healthy: Option<Instant> = None;
-    let mut machine = None;
+    let mut machine: Option<Machine> = None;
     loop {
-        tick();
         let observed = match &machine {
-            Some(machine) => health(machine, sha256),
-            None => match connect(socket, sender) {
-                Ok(connected) => {
-                    // While the machine is not confirmed, no other client enables an axis.
-                    let _ = connected.take(false);
-                    let observed = health(&connected, sha256);
-                    machine = Some(connected);
-                    observed
-                }
-                Err(error) => Err(text(error)),
-            },
+            Some(machine) => machine
+                .keep()
+                .map_err(text)
+                .and_then(|()| health(machine, sha256)),
+            None => leased(socket, sender).and_then(|connected| {
+                let observed = health(&connected, sha256);
+                machine = Some(connected);
+                observed
+            }),
         };
         match observed {
             Ok(()) if healthy.get_or_insert_with(Instant::now).elapsed() >= SETTLE => return Ok(()),
             Ok(()) => {}
             Err(error) => {
                 healthy = None;
-                machine = None;
+                // The lease stays while the server answers: no other client enables an axis.
+                machine = machine.filter(|machine| machine.keep().is_ok());
                 if begin.elapsed() > timeout {
                     let what = error.to_string();
                     let what = what.split("\nhelp:").next().unwrap_or_default();
@@ -156,6 +159,13 @@ pub fn await_health(
         }
         std::thread::sleep(POLL);
     }
+}
+
+/// Connects and takes the lease.
+fn leased(socket: &Path, sender: &str) -> Result<Machine> {
+    let machine = connect(socket, sender).map_err(text)?;
+    machine.take(false).map_err(text)?;
+    Ok(machine)
 }
 
 fn health(machine: &Machine, sha256: Option<FileDigest>) -> Result<()> {

@@ -88,7 +88,7 @@ impl Keyring {
     /// Reads the keys of an agent's file.
     ///
     /// # Errors
-    /// Fails if a key is not one of minisign.
+    /// Fails if a key is not one of minisign, or two are the same.
     pub fn new(tables: &[KeyTable]) -> Result<Self> {
         let read = |table: &KeyTable| {
             let public = PublicKey::from_base64(table.public.trim());
@@ -102,6 +102,15 @@ impl Keyring {
                 rights: table.rights.clone(),
             })
         };
+        for (n, table) in tables.iter().enumerate() {
+            let same = |other: &&KeyTable| other.public.trim() == table.public.trim();
+            if let Some(other) = tables[..n].iter().find(same) {
+                let (a, b) = (&other.name, &table.name);
+                return Err(Error::new(format!(
+                    "`{a}` and `{b}` have the same public key"
+                )));
+            }
+        }
         tables.iter().map(read).collect::<Result<_>>().map(Self)
     }
 

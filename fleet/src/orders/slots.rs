@@ -175,6 +175,8 @@ impl Slots {
         let journal = self.folder.join(JOURNAL);
         if journal.exists() {
             fs::remove_file(&journal).map_err(at(&journal))?;
+            // A loss of power must not revive the switch.
+            files::sync_folder(&journal).map_err(at(&journal))?;
         }
         let used = [self.current(), self.previous()];
         let entries = fs::read_dir(&self.folder).map_err(at(&self.folder))?;

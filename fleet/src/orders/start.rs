@@ -38,7 +38,9 @@ impl OrderExecutor {
                 Err(error) => return Err(Ended::Refused(server::text(error))),
             }
             if !started {
-                let state = machine.request("state", json!({})).map_err(server::text)?;
+                let state = machine.request("state", json!({}));
+                // The server may have started the program.
+                let state = state.map_err(|error| Ended::Failed(server::text(error)))?;
                 if state["program"]["running"] == json!(true) {
                     started = true;
                     progress(Status::Started, "the program runs".to_owned());

@@ -2,7 +2,10 @@
 
 use std::io;
 use std::path::Path;
+use std::thread;
 use std::time::Duration;
+
+use ecaxis_client::Machine;
 
 use super::bundle;
 use super::executor::{Ended, OrderExecutor};
@@ -15,6 +18,8 @@ use crate::error::{Error, Result};
 
 const COMPARE: Duration = Duration::from_secs(120);
 const RESTART: Duration = Duration::from_secs(120);
+/// The time between two tries to go back.
+const RETRY: Duration = Duration::from_secs(2);
 
 impl OrderExecutor {
     pub(super) fn push(
@@ -92,19 +97,10 @@ impl OrderExecutor {
             return Err(Error::new("the files are not those of the manifest").into());
         }
         // No server: nothing of this machine has power.
-        let machine = match server::connect(&self.socket, sender) {
-            Ok(machine) => Some(machine),
-            Err(_) if is_absent(&self.socket) => None,
-            Err(error) => return Err(server::text(error).into()),
-        };
-        if let Some(machine) = &machine {
-            server::take_disabled(machine)?;
-        }
+        let machine = self.without_power(sender)?;
         let mut keep = || {
-            if let Some(machine) = &machine {
-                // A lost lease is noticed before the switch.
-                let _ = machine.keep();
-            }
+            let held = machine.as_ref().map_or(Ok(()), |machine| machine.keep());
+            held.map_err(server::text)
         };
         if self.table.compare {
             progress("compare with the bus".to_owned());
@@ -124,15 +120,21 @@ impl OrderExecutor {
             previous: self.slots.previous(),
             sender: sender.to_owned(),
         };
-        self.slots.switch(&switch).map_err(Ended::Failed)?;
+        let switched = self.slots.switch(&switch).and_then(|()| {
+            // The disk may have taken longer than the lease.
+            machine.as_ref().map_or(Ok(()), server::take_disabled)
+        });
         progress("restart".to_owned());
-        if let Err(error) = self.restart(&mut keep) {
-            return self.undo(&switch, error);
+        // The restart ends the connection, and with it the lease.
+        if let Err(error) = switched.and_then(|()| self.restart()) {
+            drop(machine);
+            return self.undo(&switch, error, progress);
         }
+        drop(machine);
         self.finish(&switch, progress)
     }
 
-    fn compare(&self, machine_file: &Path, tick: &mut dyn FnMut()) -> Result<()> {
+    fn compare(&self, machine_file: &Path, tick: &mut dyn FnMut() -> Result<()>) -> Result<()> {
         let file = machine_file.display().to_string();
         let words = [self.table.ecaxis.as_str(), "compare", &file].map(str::to_owned);
         let output = program::run(&words, COMPARE, tick)?;
@@ -153,8 +155,8 @@ impl OrderExecutor {
         )))
     }
 
-    fn restart(&self, tick: &mut dyn FnMut()) -> Result<()> {
-        let output = program::run(&self.table.restart, RESTART, tick)?;
+    fn restart(&self) -> Result<()> {
+        let output = program::run(&self.table.restart, RESTART, &mut || Ok(()))?;
         if output.ok {
             return Ok(());
         }
@@ -176,7 +178,7 @@ impl OrderExecutor {
             self.await_health(sha256, &switch.sender)
         });
         if let Err(error) = healthy {
-            return self.undo(switch, error);
+            return self.undo(switch, error, progress);
         }
         let kept = self.slots.confirm().map_err(Ended::Failed)?;
         self.store.keep(&kept).map_err(Ended::Failed)?;
@@ -185,33 +187,64 @@ impl OrderExecutor {
 
     fn await_health(&self, sha256: Option<super::digest::FileDigest>, sender: &str) -> Result<()> {
         let timeout = self.health_timeout();
-        server::await_health(&self.socket, sender, sha256, timeout, &mut || ())
+        server::await_health(&self.socket, sender, sha256, timeout)
     }
 
-    fn undo(&self, switch: &Switch, error: Error) -> std::result::Result<String, Ended> {
+    /// Waits until no axis has power, and goes back. The switch is pending until then.
+    fn undo(
+        &self,
+        switch: &Switch,
+        error: Error,
+        progress: &mut dyn FnMut(String),
+    ) -> std::result::Result<String, Ended> {
         let what = error.to_string();
         let what = what.split("\nhelp:").next().unwrap_or_default().to_owned();
         let failed = |then: &str| Ended::Failed(Error::new(format!("{what}; {then}")));
+        let machine = loop {
+            match self.without_power(&switch.sender) {
+                Ok(machine) => break machine,
+                Err(error) => {
+                    let error = error.to_string();
+                    let why = error.lines().next().unwrap_or_default();
+                    tracing::warn!("the return waits: {why}");
+                    progress(format!("the return waits: {why}"));
+                }
+            }
+            thread::sleep(RETRY);
+        };
         if let Err(error) = self.slots.undo(switch) {
             return Err(failed(&format!("the return failed as well: {error}")));
         }
-        let returned = self
-            .restart(&mut || ())
-            .and_then(|()| match switch.current {
-                Some(current) => {
-                    let sha256 = self.slots.unpacked(current)?.manifest.machine_sha256;
-                    self.await_health(Some(sha256), &switch.sender)
-                }
-                None => Ok(()),
-            });
+        let returned = self.restart().and_then(|()| match switch.current {
+            Some(current) => {
+                let sha256 = self.slots.unpacked(current)?.manifest.machine_sha256;
+                self.await_health(Some(sha256), &switch.sender)
+            }
+            None => Ok(()),
+        });
+        drop(machine);
         if let Err(error) = self.slots.confirm() {
             return Err(failed(&error.to_string()));
+        }
+        if switch.current.is_none() {
+            return Err(failed("no bundle is current, as before"));
         }
         match returned {
             Ok(()) => Err(failed("the machine is back at its previous bundle")),
             Err(error) => Err(failed(&format!(
                 "the previous bundle is current again, but it does not run: {error}"
             ))),
+        }
+    }
+}
+
+impl OrderExecutor {
+    /// Takes the lease and requires disabled axes; `None` if there is no server.
+    fn without_power(&self, sender: &str) -> Result<Option<Machine>> {
+        match server::connect(&self.socket, sender) {
+            Ok(machine) => server::take_disabled(&machine).map(|()| Some(machine)),
+            Err(_) if is_absent(&self.socket) => Ok(None),
+            Err(error) => Err(server::text(error)),
         }
     }
 }

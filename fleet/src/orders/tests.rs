@@ -243,6 +243,26 @@ fn a_signature_with_any_changed_byte_is_refused() {
 }
 
 #[test]
+fn a_public_key_has_one_name() {
+    let (_, pair) = keys();
+    let twice = [key(&pair, &[Right::Push]), key(&pair, &[Right::Bundle])];
+    let error = Keyring::new(&twice).unwrap_err().to_string();
+    assert!(error.contains("same public key"), "{error}");
+}
+
+#[test]
+fn a_program_runs_to_its_end_after_a_lost_lease() {
+    let words = ["sh", "-c", "sleep 0.3; touch \"$0\""].map(str::to_owned);
+    let folder = tempfile::tempdir().unwrap();
+    let done = folder.path().join("done");
+    let words = [&words[..], &[done.display().to_string()]].concat();
+    let lost = &mut || Err(Error::new("lost"));
+    let error = super::program::run(&words, Duration::from_secs(20), lost).unwrap_err();
+    assert!(error.to_string().contains("lost"));
+    assert!(done.exists());
+}
+
+#[test]
 fn keys_of_minisign_sign_with_and_without_a_password() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("secret");

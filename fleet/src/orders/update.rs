@@ -60,17 +60,20 @@ impl OrderExecutor {
             sha256: file.sha256,
             identity: identity(info),
         };
+        let machine = server::connect(&self.socket, sender).map_err(server::text)?;
+        server::take_disabled(&machine)?;
+        self.free_bus(&machine)?;
         progress("read the version".to_owned());
-        let known = self.records()?.remove(device);
+        let known = self.records().map_err(Ended::Failed)?.remove(device);
         if known.is_some_and(|known| {
             let info = self.firmware_info(device);
             info.is_ok_and(|info| record(&info) == known)
         }) {
+            self.restore_bus(&machine, device, sender)?;
             return Ok(format!("`{device}` has this firmware already"));
         }
-        let machine = server::connect(&self.socket, sender).map_err(server::text)?;
-        server::take_disabled(&machine)?;
-        server::bus_down(&machine)?;
+        let held = machine.keep().map_err(server::text);
+        held.map_err(|e| failed(device, &e.to_string()))?;
         progress("write".to_owned());
         let words = self.words(
             &["firmware", "update"],
@@ -78,15 +81,15 @@ impl OrderExecutor {
             &["--yes", "--json"],
             Some(&path),
         );
-        let output = program::run(&words, UPDATE, &mut || drop(machine.keep()));
+        let output = program::run(&words, UPDATE, &mut || machine.keep().map_err(server::text));
         let output = output.map_err(|e| failed(device, &e.to_string()))?;
         if !output.ok {
             return Err(failed(device, &output.reason()));
         }
-        self.restore_bus(&machine, device, sender)?;
         let info = self
             .firmware_info(device)
             .map_err(|e| failed(device, &e.to_string()))?;
+        self.restore_bus(&machine, device, sender)?;
         let mut records = self.records().map_err(Ended::Failed)?;
         records.insert(device.to_owned(), record(&info));
         let text = serde_json::to_vec(&records).unwrap_or_default();
@@ -114,7 +117,7 @@ impl OrderExecutor {
         let path = self.place(name, file, None, progress)?;
         let machine = server::connect(&self.socket, sender).map_err(server::text)?;
         server::take_disabled(&machine)?;
-        server::bus_down(&machine)?;
+        self.free_bus(&machine)?;
         let steps = [
             (
                 self.words(&["sdo", "restore"], device, &[], Some(&path)),
@@ -124,7 +127,9 @@ impl OrderExecutor {
         ];
         for (words, step) in steps {
             progress(step.to_owned());
-            let output = program::run(&words, UPDATE, &mut || drop(machine.keep()));
+            let held = machine.keep().map_err(server::text);
+            held.map_err(|e| failed(device, &e.to_string()))?;
+            let output = program::run(&words, UPDATE, &mut || machine.keep().map_err(server::text));
             let output = output.map_err(|e| failed(device, &e.to_string()))?;
             if !output.ok {
                 return Err(failed(device, &format!("{step}: {}", output.reason())));
@@ -132,6 +137,14 @@ impl OrderExecutor {
         }
         self.restore_bus(&machine, device, sender)?;
         Ok(format!("`{device}` has the parameters, stored"))
+    }
+
+    /// Brings the bus down. If it does not go down, it is to come up again.
+    fn free_bus(&self, machine: &Machine) -> std::result::Result<(), Ended> {
+        server::bus_down(machine).map(drop).map_err(|error| {
+            let _ = server::bus_up(machine);
+            Ended::Failed(error)
+        })
     }
 
     /// Brings the bus up and waits until the machine is healthy.
@@ -144,8 +157,7 @@ impl OrderExecutor {
         let taken = machine.take(false).map_err(server::text);
         let up = taken.and_then(|()| server::bus_up(machine));
         let timeout = self.health_timeout();
-        let healthy =
-            up.and_then(|()| server::await_health(&self.socket, sender, None, timeout, &mut || ()));
+        let healthy = up.and_then(|()| server::await_health(&self.socket, sender, None, timeout));
         healthy.map_err(|e| Ended::Failed(Error::new(format!("after `{device}`: {e}"))))
     }
 
@@ -185,7 +197,7 @@ impl OrderExecutor {
 
     fn firmware_info(&self, device: &str) -> Result<Value> {
         let words = self.words(&["firmware", "info"], device, &["--json"], None);
-        let output = program::run(&words, INFO, &mut || ())?;
+        let output = program::run(&words, INFO, &mut || Ok(()))?;
         if !output.ok {
             return Err(Error::new(output.reason()));
         }
