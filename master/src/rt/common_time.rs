@@ -10,7 +10,7 @@
 //!
 //! With alignment, the offset of the reference clock (0x0920) receives a small addition every
 //! cycle, the same in each, so that the pulses stay equally spaced. The addition compensates the
-//! drift, and approaches the phase at no more than [`Limits::slew`]. The other clocks follow the
+//! drift, and approaches the phase at no more than `Limits::slew`. The other clocks follow the
 //! reference clock as always.
 
 use ecaxis_ecat::index::DeviceIndex;
