@@ -139,8 +139,10 @@ impl Server {
     pub fn changes(&self) -> Vec<Value> {
         let log = self.folder.path().join("changes.jsonl");
         let text = std::fs::read_to_string(log).unwrap_or_default();
-        let lines = text.lines();
-        lines
+        // The end of the last line may not be written yet.
+        let complete = text.rfind('\n').map_or("", |end| &text[..end]);
+        complete
+            .lines()
             .map(|line| serde_json::from_str(line).expect("JSON"))
             .collect()
     }
