@@ -293,9 +293,11 @@ fn cycle(text: &mut Text, latest: &Latest) {
                 .map(|a| a.sync0_ns * 1e-9),
         ),
     ] {
-        if let Some(value) = value {
-            text.gauge(name, help, value);
-        }
+        text.family(name, "gauge", help, |out| {
+            if let Some(value) = value {
+                out.put(&[], value);
+            }
+        });
     }
     text.counter(
         "ecaxis_common_time_jumps_total",
