@@ -37,6 +37,7 @@ use ecaxis_server::external::{
 use ecaxis_sim::SecondPort;
 use ecaxis_test_support::{axes, faults, load, machine, virtual_time};
 
+mod common_time;
 mod corrections;
 
 /// The machine time whose samples are kept.
@@ -177,7 +178,12 @@ fn metered(
     controller: Option<Box<dyn Controller>>,
     cycles: u64,
 ) -> (u64, EngineReport, Ended) {
-    let (counted, remains, ended, _) = metered_among_users(machine, options, controller, cycles, 0);
+    let attachments = Attachments {
+        controller,
+        ..Attachments::default()
+    };
+    let (counted, remains, ended, _) =
+        metered_among_users(machine, options, attachments, cycles, 0);
     (counted, remains, ended)
 }
 
@@ -199,7 +205,7 @@ fn unmetered_bus(machine: &Machine, options: &Options) -> Box<dyn Link> {
 fn metered_among_users(
     machine: Machine,
     options: &Options,
-    controller: Option<Box<dyn Controller>>,
+    attachments: Attachments,
     cycles: u64,
     asked: usize,
 ) -> (u64, EngineReport, Ended, u64) {
@@ -215,9 +221,8 @@ fn metered_among_users(
         stop,
         progress,
         attachments: Attachments {
-            controller,
             samples: samples.writer(),
-            ..Attachments::default()
+            ..attachments
         },
     };
     let Prepared { parts, supervisor } = job.prepare_on(link).expect("comes up");
@@ -298,7 +303,8 @@ fn mailbox_transfers_cause_no_allocation_in_the_cycle() {
         ..virtual_time()
     };
     let bus = machine(&axes(4));
-    let (counted, remains, _, done) = metered_among_users(bus, &options, None, 20_000, 3);
+    let (counted, remains, _, done) =
+        metered_among_users(bus, &options, Attachments::default(), 20_000, 3);
     assert!(done > 1_000, "{done} transfers");
     assert_eq!(remains.stats.counters.wkc_errors, 0);
     assert_eq!(counted, 0, "allocations during {done} transfers");

@@ -28,7 +28,7 @@ impl Turn<'_, '_> {
             commands.push(RtCommand::Axis { axis, command });
         }
         self.send_all(&commands).await;
-        let start = clock::now();
+        let mut start = clock::now();
         let timeout = self.machine.bus.enable_timeout_ns + self.longest_release(axes);
         loop {
             let snapshot = self.poll_and_query().await?;
@@ -39,8 +39,9 @@ impl Turn<'_, '_> {
                 }
                 .with_device(self.device_of(axis)));
             }
-            // The commands may wait for an instant of common time.
-            if snapshot.commands_taken < self.commands_sent {
+            if self.start.is_some() {
+                // The commands wait for an instant of common time.
+                start = clock::now();
                 continue;
             }
             let status = |axis: AxisIndex| snapshot.axes.get(axis).copied();
