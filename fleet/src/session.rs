@@ -9,11 +9,14 @@ use serde::de::DeserializeOwned;
 use tokio::signal::unix::{SignalKind, signal};
 use zenoh::Session;
 use zenoh::Wait;
+use zenoh::handlers::FifoChannelHandler;
+use zenoh::pubsub::Subscriber;
 use zenoh::query::{ConsolidationMode, Query, QueryTarget};
-use zenoh::sample::Locality;
+use zenoh::sample::{Locality, Sample};
 
 use crate::config::{self, Role, ZenohFile};
 use crate::error::{Error, Result};
+use crate::keys::ALL_ALIVE;
 use crate::options::Network;
 
 /// The longest reply, and the longest fault report.
@@ -24,6 +27,9 @@ const MAX_REPLIES: usize = 100_000;
 const MAX_BYTES: usize = 256 << 20;
 /// The queries that wait for an answer.
 const MAX_QUERIES: usize = 256;
+
+/// What a subscription receives.
+pub type Samples = Subscriber<FifoChannelHandler<Sample>>;
 
 /// Opens a session. With a role other than a command, this lasts until something answers.
 ///
@@ -38,6 +44,25 @@ pub async fn open(config: zenoh::Config) -> Result<Session> {
         Error::new(format!("Zenoh: {text}"))
             .help("check `connect` and the certificates, and that the router runs")
     })
+}
+
+/// Subscribes to a key.
+///
+/// # Errors
+/// Fails if the session is closed.
+pub async fn subscribe(session: &Session, key: &str) -> Result<Samples> {
+    let subscriber = session.declare_subscriber(key).await;
+    subscriber.map_err(|error| Error::new(format!("Zenoh: subscribe: {error}")))
+}
+
+/// Subscribes to the tokens of all machines, also of those that are there already.
+///
+/// # Errors
+/// Fails if the session is closed.
+pub async fn subscribe_tokens(session: &Session) -> Result<Samples> {
+    let tokens = session.liveliness().declare_subscriber(ALL_ALIVE);
+    let subscriber = tokens.history(true).await;
+    subscriber.map_err(|error| Error::new(format!("Zenoh: subscribe: {error}")))
 }
 
 /// Opens the session of a command.

@@ -21,7 +21,7 @@ use zenoh::sample::{Sample, SampleKind};
 
 use crate::config::{self, ArchiveFile, Role};
 use crate::error::{Error, Result};
-use crate::keys::{ALL_ALIVE, ALL_REPORTS, ALL_STATES, EACH_EVENT, EACH_REPORT, MachineId, Name};
+use crate::keys::{ALL_REPORTS, ALL_STATES, EACH_EVENT, EACH_REPORT, MachineId, Name};
 use crate::reports::{ReportId, Summary};
 use crate::session::{self, Reply};
 use events::MAX_EVENT;
@@ -149,23 +149,10 @@ impl Archive {
             let queryable = session.declare_queryable(key).callback(answer.clone());
             queryables.push(queryable.await.map_err(failed)?);
         }
-        let states = session
-            .declare_subscriber(ALL_STATES)
-            .await
-            .map_err(failed)?;
-        let reports = session
-            .declare_subscriber(EACH_REPORT)
-            .await
-            .map_err(failed)?;
-        let events = session
-            .declare_subscriber(EACH_EVENT)
-            .await
-            .map_err(failed)?;
-        let tokens = session
-            .liveliness()
-            .declare_subscriber(ALL_ALIVE)
-            .history(true);
-        let tokens = tokens.await.map_err(failed)?;
+        let states = session::subscribe(session, ALL_STATES).await?;
+        let reports = session::subscribe(session, EACH_REPORT).await?;
+        let events = session::subscribe(session, EACH_EVENT).await?;
+        let tokens = session::subscribe_tokens(session).await?;
         tracing::info!(folder = %self.folder.display(), "archive");
         let (work, waiting) = mpsc::channel(MAX_WORK);
         let waiting = Arc::new(tokio::sync::Mutex::new(waiting));

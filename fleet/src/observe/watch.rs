@@ -6,7 +6,7 @@ use zenoh::sample::{Sample, SampleKind};
 use super::print;
 use crate::agent::state::unix_time;
 use crate::error::{Error, Result};
-use crate::keys::{ALL_ALIVE, EACH_EVENT, EACH_REPORT, MachineId};
+use crate::keys::{EACH_EVENT, EACH_REPORT, MachineId};
 use crate::options::Network;
 use crate::session;
 
@@ -19,20 +19,9 @@ const MAX_LINE: usize = 300;
 /// Fails if no router is reached, or the session is closed.
 pub async fn run(network: &Network, as_json: bool) -> Result<()> {
     let session = session::open_command(network).await?;
-    let failed = |error: zenoh::Error| Error::new(format!("subscribe: {error}"));
-    let tokens = session
-        .liveliness()
-        .declare_subscriber(ALL_ALIVE)
-        .history(true);
-    let tokens = tokens.await.map_err(failed)?;
-    let events = session
-        .declare_subscriber(EACH_EVENT)
-        .await
-        .map_err(failed)?;
-    let reports = session
-        .declare_subscriber(EACH_REPORT)
-        .await
-        .map_err(failed)?;
+    let tokens = session::subscribe_tokens(&session).await?;
+    let events = session::subscribe(&session, EACH_EVENT).await?;
+    let reports = session::subscribe(&session, EACH_REPORT).await?;
     let terminated = session::terminated();
     tokio::pin!(terminated);
     loop {
