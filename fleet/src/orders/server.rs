@@ -85,7 +85,8 @@ fn require_disabled(state: &Value) -> Result<()> {
     }
 }
 
-/// Brings the bus down and waits until the interface is free. Returns false if it was down.
+/// Brings the bus down and waits until the interface is free. Returns false if it was down. If it
+/// does not go down, it is to come up again.
 ///
 /// # Errors
 /// Fails if the server refuses it.
@@ -102,6 +103,7 @@ pub fn bus_down(machine: &Machine) -> Result<bool> {
             return Ok(state["bus"]["state"] != json!("down"));
         }
         if begin.elapsed() > DOWN {
+            bus_up(machine)?;
             return Err(Error::new("the server does not bring the bus down"));
         }
         std::thread::sleep(POLL);

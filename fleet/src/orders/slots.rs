@@ -119,6 +119,9 @@ impl Slots {
             let mut output = fs::File::create(&path).map_err(at(&path))?;
             let written = output.write_all(bytes).and_then(|()| output.sync_all());
             written.map_err(at(&path))?;
+            for entry in path.ancestors().take_while(|entry| *entry != new) {
+                files::sync_folder(entry).map_err(at(entry))?;
+            }
         }
         let manifest = self.manifest_path(bundle.id);
         files::write(&manifest, &bundle.text)?;

@@ -1,6 +1,6 @@
 //! Starts the program of a machine.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use serde_json::json;
 
@@ -10,8 +10,6 @@ use super::server;
 use crate::error::Error;
 
 const POLL: Duration = Duration::from_millis(100);
-/// The time in which the server refuses a start that it does not plan.
-const PLANNED: Duration = Duration::from_secs(1);
 
 impl OrderExecutor {
     /// Starts the program and holds the lease until its end: if the agent ends, the axes stop.
@@ -28,7 +26,10 @@ impl OrderExecutor {
             keys["at_unix_ns"] = json!(at);
         }
         let request = machine.command("program", "", keys).map_err(server::text)?;
-        let begin = Instant::now();
+        let state = match at_unix_ns {
+            Some(_) => "the program waits for its instant",
+            None => "the program runs",
+        };
         let mut started = false;
         loop {
             match machine.is_done(request) {
@@ -38,18 +39,12 @@ impl OrderExecutor {
                 Err(error) => return Err(Ended::Refused(server::text(error))),
             }
             if !started {
-                let state = machine.request("state", json!({}));
+                let now = machine.request("state", json!({}));
                 // The server may have started the program.
-                let state = state.map_err(|error| Ended::Failed(server::text(error)))?;
-                if state["program"]["running"] == json!(true) {
+                let now = now.map_err(|error| Ended::Failed(server::text(error)))?;
+                if now["program"]["running"] == json!(true) {
                     started = true;
-                    progress(Status::Started, "the program runs".to_owned());
-                } else if at_unix_ns.is_some() && begin.elapsed() > PLANNED {
-                    started = true;
-                    progress(
-                        Status::Started,
-                        "the program waits for its instant".to_owned(),
-                    );
+                    progress(Status::Started, state.to_owned());
                 }
             }
             let kept = machine.sleep(POLL);

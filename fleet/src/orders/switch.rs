@@ -104,7 +104,8 @@ impl OrderExecutor {
         };
         if self.table.compare {
             progress("compare with the bus".to_owned());
-            let down = machine.as_ref().map(server::bus_down).transpose()?;
+            let down = machine.as_ref().map(server::bus_down).transpose();
+            let down = down.map_err(Ended::Failed)?;
             let compared = self.compare(&machine_file, &mut keep).and_then(|()| {
                 let machine = machine.as_ref();
                 machine.map_or(Ok(()), server::take_disabled)

@@ -62,14 +62,17 @@ impl OrderExecutor {
         };
         let machine = server::connect(&self.socket, sender).map_err(server::text)?;
         server::take_disabled(&machine)?;
-        self.free_bus(&machine)?;
+        let was_up = server::bus_down(&machine).map_err(Ended::Failed)?;
         progress("read the version".to_owned());
         let known = self.records().map_err(Ended::Failed)?.remove(device);
         if known.is_some_and(|known| {
-            let info = self.firmware_info(device);
+            let info = self.firmware_info(&machine, device);
             info.is_ok_and(|info| record(&info) == known)
         }) {
-            self.restore_bus(&machine, device, sender)?;
+            // A bus that was down waits for the repair of another device.
+            if was_up {
+                self.restore_bus(&machine, device, sender)?;
+            }
             return Ok(format!("`{device}` has this firmware already"));
         }
         let held = machine.keep().map_err(server::text);
@@ -87,7 +90,7 @@ impl OrderExecutor {
             return Err(failed(device, &output.reason()));
         }
         let info = self
-            .firmware_info(device)
+            .firmware_info(&machine, device)
             .map_err(|e| failed(device, &e.to_string()))?;
         self.restore_bus(&machine, device, sender)?;
         let mut records = self.records().map_err(Ended::Failed)?;
@@ -117,7 +120,7 @@ impl OrderExecutor {
         let path = self.place(name, file, None, progress)?;
         let machine = server::connect(&self.socket, sender).map_err(server::text)?;
         server::take_disabled(&machine)?;
-        self.free_bus(&machine)?;
+        server::bus_down(&machine).map_err(Ended::Failed)?;
         let steps = [
             (
                 self.words(&["sdo", "restore"], device, &[], Some(&path)),
@@ -137,14 +140,6 @@ impl OrderExecutor {
         }
         self.restore_bus(&machine, device, sender)?;
         Ok(format!("`{device}` has the parameters, stored"))
-    }
-
-    /// Brings the bus down. If it does not go down, it is to come up again.
-    fn free_bus(&self, machine: &Machine) -> std::result::Result<(), Ended> {
-        server::bus_down(machine).map(drop).map_err(|error| {
-            let _ = server::bus_up(machine);
-            Ended::Failed(error)
-        })
     }
 
     /// Brings the bus up and waits until the machine is healthy.
@@ -195,9 +190,10 @@ impl OrderExecutor {
         serde_json::from_slice(&text).map_err(|e| Error::new(format!("{}: {e}", path.display())))
     }
 
-    fn firmware_info(&self, device: &str) -> Result<Value> {
+    /// Reads identity and versions while the bus is down, and keeps the lease meanwhile.
+    fn firmware_info(&self, machine: &Machine, device: &str) -> Result<Value> {
         let words = self.words(&["firmware", "info"], device, &["--json"], None);
-        let output = program::run(&words, INFO, &mut || Ok(()))?;
+        let output = program::run(&words, INFO, &mut || machine.keep().map_err(server::text))?;
         if !output.ok {
             return Err(Error::new(output.reason()));
         }
