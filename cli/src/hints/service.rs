@@ -130,6 +130,9 @@ pub(super) fn eoe(error: &EoeError) -> String {
         EoeError::Result(_) => {
             "remove what the device does not support from `eoe`, or write `eoe = {}`: it keeps its own parameters".to_owned()
         }
+        EoeError::TooLong { .. } => {
+            "omit `filters`, or use an ESI file with a longer mailbox".to_owned()
+        }
         EoeError::Mailbox(CoeCause::Refused(_)) => {
             "the device has no EoE: omit `eoe`, or use the ESI file of its firmware".to_owned()
         }

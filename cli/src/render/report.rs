@@ -249,6 +249,20 @@ fn ethernet(ports: &[EthernetCounters], out: &mut Document) {
     }
     out.gap();
     out.table(table);
+    for port in ports {
+        let delays = [(port.from_delay, "from"), (port.to_delay, "to")];
+        for (delay, direction) in delays {
+            if let Some(mean) = delay.mean_ns() {
+                out.line(format!(
+                    "delay {direction} the port of `{}`: mean {} µs, at most {} µs ({} frames)",
+                    port.name,
+                    mean / 1000,
+                    delay.max_ns / 1000,
+                    delay.frames
+                ));
+            }
+        }
+    }
     for port in ports.iter().filter(|port| port.unsupported) {
         out.line(format!(
             "`{}` has refused EoE with mailbox error 0x0002: omit `eoe`, or use the ESI file of its firmware",

@@ -21,7 +21,7 @@
 use alloc::vec::Vec;
 use core::net::Ipv4Addr;
 
-use super::{DecodeError, Encode, Mailbox, TYPE_EOE, TYPE_ERROR};
+use super::{DecodeError, Encode, HEADER, Mailbox, TYPE_EOE, TYPE_ERROR};
 
 mod fragments;
 
@@ -316,6 +316,18 @@ impl<'a> From<Service<'a>> for Message<'a> {
 }
 
 impl<'a> Message<'a> {
+    /// The bytes of a request that sets the MAC filter, with the headers.
+    pub const FILTER_REQUEST: usize = HEADER + EOE_HEADER + 2 + 6 * (16 + 4);
+
+    /// Returns the bytes of a message, with the headers.
+    #[must_use]
+    pub fn length(&self) -> usize {
+        let mut bytes = Vec::new();
+        self.emit(0, 6, &mut bytes);
+        let body = bytes.first_chunk().map_or(0, |n| u16::from_le_bytes(*n));
+        HEADER + usize::from(body)
+    }
+
     /// Parses one whole mailbox.
     ///
     /// # Errors

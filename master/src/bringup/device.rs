@@ -1,6 +1,7 @@
 //! The steps of one SubDevice from PreOp to SafeOp.
 
 use ecaxis_ecat::mailbox::abort_code::is_no_such_object;
+use ecaxis_ecat::mailbox::eoe::Service;
 use ecaxis_ecat::registers;
 use ecaxis_esi::{StartupSdo, address};
 
@@ -9,7 +10,9 @@ use super::{BusDevice, Step};
 use crate::acyclic::{DeviceRef, Registers};
 use crate::config::duration::show;
 use crate::config::{DeviceConfig, StartupOptions};
-use crate::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, abort_text, object_name};
+use crate::mailbox::{
+    CoeClient, EoeSetting, MailboxTransport, NamedObject, SdoError, abort_text, object_name,
+};
 use crate::report::{Cause, Error};
 use crate::rt::image::DeviceRegion;
 
@@ -97,22 +100,37 @@ pub(super) async fn start_up(
     Ok(())
 }
 
-/// Sets the IP parameters of a device with EoE, if the machine file has them.
-pub(super) async fn set_ip_parameters(
+/// Sets the IP parameters and the MAC filter of a device with EoE, if the machine file has them.
+pub(super) async fn set_ethernet(
     wire: &impl MailboxTransport,
     config: &DeviceConfig,
     device: &mut BusDevice,
 ) -> Result<(), Error> {
-    let parameters = config.eoe.as_ref().and_then(|eoe| eoe.parameters.as_ref());
-    let (Some(parameters), Some(coe)) = (parameters, device.coe.as_mut()) else {
+    let (Some(eoe), Some(coe)) = (&config.eoe, device.coe.as_mut()) else {
         return Ok(());
     };
-    let set = coe.set_ip_parameters(wire, parameters).await;
-    set.map_err(|source| {
-        let parameters = config.eoe.as_ref().map(ToString::to_string);
-        let parameters = parameters.unwrap_or_default();
-        Cause::Eoe { parameters, source }.with_device(&device.at)
-    })
+    let filter = eoe.filter.as_ref();
+    let requests = [
+        (eoe.parameters.map(Service::SetIp), EoeSetting::IpParameters),
+        (
+            filter.cloned().map(Service::SetFilter),
+            EoeSetting::MacFilter,
+        ),
+    ];
+    for (request, setting) in requests {
+        let Some(request) = request else { continue };
+        let set = coe.set_ethernet(wire, request).await;
+        set.map_err(|source| {
+            let values = eoe.to_string();
+            Cause::Eoe {
+                setting,
+                values,
+                source,
+            }
+            .with_device(&device.at)
+        })?;
+    }
+    Ok(())
 }
 
 fn abort_code(error: &Error) -> Option<u32> {

@@ -463,8 +463,8 @@ async fn configure(
     let name = Some(config.name.as_str());
     let step = kept_parameters::restore_to(wire, config, device, progress);
     times.measure("parameter file", name, step).await?;
-    let step = device::set_ip_parameters(wire, config, device);
-    times.measure("IP parameters", name, step).await?;
+    let step = device::set_ethernet(wire, config, device);
+    times.measure("Ethernet (EoE)", name, step).await?;
     let step = device::start_up(wire, config, device, StartupPhase::InPreOp, progress);
     times.measure("start-up SDOs", name, step).await?;
     let step = mapping::compare(wire, config, device);

@@ -4,7 +4,7 @@ use std::fmt;
 use std::net::Ipv4Addr;
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
-use ecaxis_ecat::mailbox::eoe::{IpParameters, MacAddress, NAME};
+use ecaxis_ecat::mailbox::eoe::{IpParameters, MAX_FILTERS, MacAddress, MacFilter, Message, NAME};
 use ecaxis_esi as esi;
 use sha2::{Digest as _, Sha256};
 
@@ -41,34 +41,69 @@ impl fmt::Display for TapSetup {
 pub struct EoeSetup {
     /// The parameters that the device gets in PreOp; `None`: it keeps its own.
     pub parameters: Option<IpParameters>,
+    /// The MAC filter that the device gets in PreOp; `None`: it keeps its own.
+    pub filter: Option<MacFilter>,
+    /// True if the device sends the times of frames.
+    pub time_stamps: bool,
 }
 
 /// Shows `192.168.7.11/24, MAC 02:45:43:01:02:03`.
 impl fmt::Display for EoeSetup {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Some(parameters) = &self.parameters else {
-            return f.write_str("its own IP parameters");
-        };
-        if let (Some(ip), Some(mask)) = (parameters.ip, parameters.netmask) {
-            write!(f, "{ip}/{}, ", mask.to_bits().count_ones())?;
+        match &self.parameters {
+            Some(parameters) => format_parameters(parameters, f)?,
+            None => f.write_str("its own IP parameters")?,
         }
-        let mac = parameters.mac.unwrap_or_default();
-        write!(f, "MAC {}", format_mac(mac))?;
-        if let Some(gateway) = parameters
-            .gateway
-            .filter(|gateway| !gateway.is_unspecified())
-        {
-            write!(f, ", gateway {gateway}")?;
+        if let Some(filter) = &self.filter {
+            write!(f, ", {}", format_filter(filter))?;
         }
-        if let Some(dns) = parameters.dns.filter(|dns| !dns.is_unspecified()) {
-            write!(f, ", DNS server {dns}")?;
-        }
-        if let Some(name) = &parameters.name {
-            let name = name.split(|byte| *byte == 0).next().unwrap_or_default();
-            write!(f, ", name {}", String::from_utf8_lossy(name))?;
+        if self.time_stamps {
+            f.write_str(", with time stamps")?;
         }
         Ok(())
     }
+}
+
+fn format_parameters(parameters: &IpParameters, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+    if let (Some(ip), Some(mask)) = (parameters.ip, parameters.netmask) {
+        write!(f, "{ip}/{}, ", mask.to_bits().count_ones())?;
+    }
+    let mac = parameters.mac.unwrap_or_default();
+    write!(f, "MAC {}", format_mac(mac))?;
+    if let Some(gateway) = parameters
+        .gateway
+        .filter(|gateway| !gateway.is_unspecified())
+    {
+        write!(f, ", gateway {gateway}")?;
+    }
+    if let Some(dns) = parameters.dns.filter(|dns| !dns.is_unspecified()) {
+        write!(f, ", DNS server {dns}")?;
+    }
+    if let Some(name) = &parameters.name {
+        let name = name.split(|byte| *byte == 0).next().unwrap_or_default();
+        write!(f, ", name {}", String::from_utf8_lossy(name))?;
+    }
+    Ok(())
+}
+
+/// Returns a MAC filter as `MAC filter 01:80:c2:00:00:0e, no broadcasts`.
+#[must_use]
+pub fn format_filter(filter: &MacFilter) -> String {
+    let list = |addresses: &[MacAddress]| {
+        let each = addresses.iter().map(|mac| format_mac(*mac));
+        each.collect::<Vec<_>>().join(" ")
+    };
+    let mut text = match filter.filters.is_empty() {
+        true => "MAC filter without addresses".to_owned(),
+        false => format!("MAC filter {}", list(&filter.filters)),
+    };
+    if !filter.masks.is_empty() {
+        text += &format!(", masks {}", list(&filter.masks));
+    }
+    if filter.no_broadcasts {
+        text += ", no broadcasts";
+    }
+    text
 }
 
 fn format_mac(mac: MacAddress) -> String {
@@ -274,7 +309,73 @@ pub(super) fn device(
         dns: ip.and(dns.or(name.map(|_| Ipv4Addr::UNSPECIFIED))),
         name: ip.and(name),
     });
-    Some(EoeSetup { parameters })
+    Some(EoeSetup {
+        parameters,
+        filter: mac_filter(eoe, described, p),
+        time_stamps: time_stamps(eoe, spoken, p),
+    })
+}
+
+/// Returns the MAC filter that the keys describe.
+fn mac_filter(
+    raw: &RawDeviceEoe,
+    described: Option<&esi::Device>,
+    p: &mut Problems<'_>,
+) -> Option<MacFilter> {
+    let mut addresses = |key: &Key<Vec<String>>, max: usize, what: &str| {
+        let Some(list) = key else {
+            return Some(Vec::new());
+        };
+        let texts = list.get_ref();
+        let bytes: Option<Vec<_>> = texts.iter().map(|text| mac_bytes(text)).collect();
+        if bytes.is_none() || texts.len() > max {
+            let message = format!("`{what}` takes up to {max} addresses of six bytes");
+            let hint = format!("write `{what} = [\"01:80:c2:00:00:0e\"]`");
+            p.add_hint(list.span(), message, hint);
+        }
+        bytes
+    };
+    let filters = addresses(&raw.filters, MAX_FILTERS.0, "filters")?;
+    let masks = addresses(&raw.filter_masks, MAX_FILTERS.1, "filter_masks")?;
+    if let (None, Some(place)) = (
+        &raw.filters,
+        raw.filter_masks.place().or(raw.broadcasts.place()),
+    ) {
+        let message = "without `filters`, the device keeps its own filter";
+        p.add_hint(
+            place,
+            message,
+            "add `filters = []`, with the addresses that pass",
+        );
+    }
+    let place = raw.filters.place()?;
+    let areas = described.map_or(&[][..], |device| &device.sync_managers);
+    let mailbox = areas.iter().find(|area| area.usage == esi::SmUse::MBoxOut);
+    let needed = Message::FILTER_REQUEST;
+    if let Some(area) = mailbox.filter(|area| usize::from(area.default_size) < needed) {
+        let message = format!(
+            "a MAC filter needs a mailbox of {needed} bytes, the device has {} (ESI)",
+            area.default_size
+        );
+        p.add_hint(place, message, "omit `filters`");
+    }
+    Some(MacFilter {
+        filters,
+        masks,
+        no_broadcasts: raw.broadcasts.value() == Some(false),
+    })
+}
+
+/// Returns true if the device sends the times of frames. Reports the key for a device that cannot.
+fn time_stamps(raw: &RawDeviceEoe, described: Option<esi::Eoe>, p: &mut Problems<'_>) -> bool {
+    let Some(key) = raw.time_stamps.as_ref().filter(|key| *key.get_ref()) else {
+        return false;
+    };
+    if described.is_some_and(|eoe| eoe.time_stamp != Some(true)) {
+        let message = "the ESI of the device has no time stamps (`TimeStamp` of `EoE`)";
+        p.add_hint(key.span(), message, "omit `time_stamps`");
+    }
+    true
 }
 
 /// Returns an address that a key has; `None` without the key, or if it has been reported.
@@ -294,6 +395,11 @@ fn address(key: &Key<String>, p: &mut Problems<'_>) -> Option<Ipv4Addr> {
 
 /// Parses a MAC address of one device.
 fn parse_mac(text: &str) -> Option<MacAddress> {
+    mac_bytes(text).filter(|mac| mac[0] & 1 == 0 && *mac != [0; 6])
+}
+
+/// Parses six bytes.
+fn mac_bytes(text: &str) -> Option<MacAddress> {
     let mut mac = [0; 6];
     let mut parts = text.split([':', '-']);
     for byte in &mut mac {
@@ -301,8 +407,7 @@ fn parse_mac(text: &str) -> Option<MacAddress> {
         let hex = part.bytes().all(|digit| digit.is_ascii_hexdigit());
         *byte = hex.then(|| u8::from_str_radix(part, 16).ok())??;
     }
-    let single = mac[0] & 1 == 0 && mac != [0; 6];
-    (parts.next().is_none() && single).then_some(mac)
+    parts.next().is_none().then_some(mac)
 }
 
 fn dns_name(text: &str) -> Option<[u8; NAME]> {

@@ -20,7 +20,9 @@ pub mod switch;
 
 pub use crate::sys::tap::TapStep;
 pub use interface::Ethernet;
-pub use network::{EoeNetwork, EoePort, EthernetCounters, FRAMES_PER_PORT, HostPort, Turn};
+pub use network::{
+    EoeNetwork, EoePort, EthernetCounters, FRAMES_PER_PORT, FrameDelay, HostPort, Turn,
+};
 
 /// A network interface: the far side of the switch's port for the operating system.
 pub trait EthernetInterface: fmt::Debug + Send {

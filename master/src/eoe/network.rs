@@ -40,6 +40,39 @@ pub struct EthernetCounters {
     pub incomplete: u64,
     /// Fragments from the port that came again.
     pub repeated: u64,
+    /// From the port of the device to the switch, by its time stamps.
+    pub from_delay: FrameDelay,
+    /// From the switch to the port of the device, by its time stamps.
+    pub to_delay: FrameDelay,
+}
+
+/// The delay of frames with time stamps.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct FrameDelay {
+    /// The number of frames.
+    pub frames: u64,
+    /// The sum of their delays in ns.
+    pub total_ns: u64,
+    /// The longest delay in ns.
+    pub max_ns: u64,
+}
+
+impl FrameDelay {
+    /// Adds a frame. The instants are the lower halves of system times.
+    fn add(&mut self, from: u32, to: u32) {
+        // Times differ by the accuracy of the measurement.
+        let delay = to.wrapping_sub(from).cast_signed();
+        let delay = u64::try_from(delay).unwrap_or(0);
+        self.frames += 1;
+        self.total_ns = self.total_ns.saturating_add(delay);
+        self.max_ns = self.max_ns.max(delay);
+    }
+
+    /// Returns the mean delay in ns; `None` without frames.
+    #[must_use]
+    pub fn mean_ns(&self) -> Option<u64> {
+        self.total_ns.checked_div(self.frames)
+    }
 }
 
 #[derive(Debug, Default)]
@@ -49,6 +82,10 @@ struct Port {
     reassembler: Reassembler,
     /// The time of the last fragment while further ones are due.
     assembling: Option<Nanos>,
+    /// The device sends time stamps.
+    time_stamps: bool,
+    /// When the switch gave frames, by their numbers, whose time stamps have not come.
+    given: [Option<u32>; 16],
     counters: EthernetCounters,
 }
 
@@ -93,9 +130,20 @@ impl Port {
 struct Network {
     switch: Switch,
     ports: Vec<Port>,
+    /// System time of the bus minus session clock; `None` while it is unknown.
+    system_offset: Option<u64>,
 }
 
 impl Network {
+    /// Returns the lower half of the system time of the bus.
+    fn system_time(&self, now: Nanos) -> Option<u32> {
+        let time = now.wrapping_add(self.system_offset?);
+        time.to_le_bytes()
+            .first_chunk()
+            .copied()
+            .map(u32::from_le_bytes)
+    }
+
     fn forward(&mut self, now: Nanos, from: PortNumber, frame: &[u8]) {
         let Some(port) = self.ports.get_mut(from.0) else {
             return;
@@ -143,13 +191,21 @@ impl EoeNetwork {
         number
     }
 
-    /// Adds a port for the mailbox of a device.
+    /// Adds a port for the mailbox of a device. `time_stamps`: the device is asked for the times of
+    /// its frames.
     #[must_use]
-    pub fn add_device(&self, name: &str) -> EoePort {
+    pub fn add_device(&self, name: &str, time_stamps: bool) -> EoePort {
+        let number = self.add_port(name);
+        self.with_port(number, |port| port.time_stamps = time_stamps);
         EoePort {
             network: self.clone(),
-            number: self.add_port(name),
+            number,
         }
+    }
+
+    /// Sets the system time of the bus minus the session clock, in ns.
+    pub fn set_system_offset(&self, offset: Option<u64>) {
+        self.lock().system_offset = offset;
     }
 
     /// Adds a port for an interface.
@@ -200,6 +256,7 @@ impl EoePort {
             return false;
         }
         let mut network = self.network.lock();
+        let time = network.system_time(now);
         let Some(port) = network.ports.get_mut(self.number.0) else {
             return true;
         };
@@ -207,11 +264,25 @@ impl EoePort {
             port.counters.invalid += 1;
             return true;
         };
-        let Service::Fragment(fragment) = message.service else {
-            return true;
+        let fragment = match message.service {
+            Service::Fragment(fragment) => fragment,
+            Service::TimeStamp { frame, time } => {
+                let given = port
+                    .given
+                    .get_mut(usize::from(frame))
+                    .and_then(Option::take);
+                if let Some(given) = given {
+                    port.counters.to_delay.add(given, time);
+                }
+                return true;
+            }
+            _ => return true,
         };
         port.assembling = (!fragment.last).then_some(now);
         if let Some(frame) = port.reassembler.add(&fragment).map(<[u8]>::to_vec) {
+            if let (Some(at), Some(now), true) = (fragment.time, time, port.time_stamps) {
+                port.counters.from_delay.add(at, now);
+            }
             network.forward(now, self.number, &frame);
         }
         true
@@ -230,10 +301,23 @@ impl EoePort {
         })
     }
 
-    /// Returns the next frame for the device.
+    /// Returns the next frame for the device. It is sent with this number, 0 to 15.
     #[must_use]
-    pub fn next_frame(&self) -> Option<Vec<u8>> {
-        self.network.with_port(self.number, Port::next_frame)
+    pub fn next_frame(&self, now: Nanos, number: u8) -> Option<Vec<u8>> {
+        let mut network = self.network.lock();
+        let time = network.system_time(now);
+        let port = network.ports.get_mut(self.number.0)?;
+        let frame = port.next_frame()?;
+        if let Some(given) = port.given.get_mut(usize::from(number)) {
+            *given = time.filter(|_| port.time_stamps);
+        }
+        Some(frame)
+    }
+
+    /// Returns true if the device is asked for the time of sending of its frames.
+    #[must_use]
+    pub fn has_time_stamps(&self) -> bool {
+        self.network.with_port(self.number, |port| port.time_stamps)
     }
 
     /// Returns true if a frame waits for the device.
@@ -349,20 +433,23 @@ mod tests {
     #[test]
     fn frames_pass_from_mailboxes_to_queues() {
         let network = EoeNetwork::default();
-        let (x, y) = (network.add_device("x"), network.add_device("y"));
+        let (x, y) = (
+            network.add_device("x", false),
+            network.add_device("y", false),
+        );
         let host = network.add_host("ecat0");
         let sent = frame(9, 1, 300);
         for mailbox in mailboxes(&sent, 1) {
             assert!(x.receive(0, &mailbox));
         }
         // The receiver is not known.
-        assert_eq!(y.next_frame(), Some(sent.clone()));
+        assert_eq!(y.next_frame(0, 0), Some(sent.clone()));
         assert_eq!(host.next_frame(), Some(sent));
-        assert_eq!(x.next_frame(), None);
+        assert_eq!(x.next_frame(0, 0), None);
         let answer = frame(1, 9, 60);
         host.receive(1, &answer);
         assert!(x.has_frame() && !y.has_frame());
-        assert_eq!(x.next_frame(), Some(answer));
+        assert_eq!(x.next_frame(0, 0), Some(answer));
         assert!(!x.receive(2, &[10, 0, 0, 0, 0, 0x13]), "CoE");
         assert!(x.receive(2, &[10, 0, 0, 0, 0, 0x12]), "damaged EoE");
         let counters = network.counters();
@@ -374,15 +461,15 @@ mod tests {
     #[test]
     fn a_queue_is_bounded_and_drops_the_oldest() {
         let network = EoeNetwork::default();
-        let x = network.add_device("x");
+        let x = network.add_device("x", false);
         let host = network.add_host("ecat0");
         for n in 0..FRAMES_PER_PORT + 5 {
             host.receive(0, &frame(1, 2, 60 + n));
         }
-        assert_eq!(x.next_frame().map(|frame| frame.len()), Some(65));
+        assert_eq!(x.next_frame(0, 0).map(|frame| frame.len()), Some(65));
         assert_eq!(network.counters()[0].overflows, 5);
         x.drop_frames(1);
-        assert_eq!(x.next_frame(), None);
+        assert_eq!(x.next_frame(0, 0), None);
         assert_eq!(
             network.counters()[0].not_taken,
             FRAMES_PER_PORT as u64,
@@ -393,22 +480,25 @@ mod tests {
     #[test]
     fn own_frames_precede_floods() {
         let network = EoeNetwork::default();
-        let (x, host) = (network.add_device("x"), network.add_host("ecat0"));
+        let (x, host) = (network.add_device("x", false), network.add_host("ecat0"));
         for mailbox in mailboxes(&frame(9, 1, 60), 1) {
             x.receive(0, &mailbox);
         }
         let (flood, own) = (frame(7, 2, 60), frame(1, 2, 61));
         host.receive(1, &flood);
         host.receive(2, &own);
-        assert_eq!(x.next_frame(), Some(own));
-        assert_eq!(x.next_frame(), Some(flood));
-        assert_eq!(x.next_frame(), None);
+        assert_eq!(x.next_frame(0, 0), Some(own));
+        assert_eq!(x.next_frame(0, 0), Some(flood));
+        assert_eq!(x.next_frame(0, 0), None);
     }
 
     #[test]
     fn a_restart_ends_the_frame_and_forgets_the_addresses() {
         let network = EoeNetwork::default();
-        let (x, y) = (network.add_device("x"), network.add_device("y"));
+        let (x, y) = (
+            network.add_device("x", false),
+            network.add_device("y", false),
+        );
         for mailbox in mailboxes(&frame(9, 1, 60), 1) {
             x.receive(0, &mailbox);
         }

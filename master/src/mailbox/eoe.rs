@@ -1,11 +1,10 @@
 //! EoE at the mailbox of a device: its IP parameters, and Ethernet frames between the requests of
 //! others.
 
+use std::fmt;
 use std::time::Duration;
 
-use ecaxis_ecat::mailbox::eoe::{
-    Fragments, IpParameters, Message, RESULT_OK, Service, result_text,
-};
+use ecaxis_ecat::mailbox::eoe::{Fragments, Message, RESULT_OK, Service, result_text};
 
 use super::error::CoeCause;
 use super::transfer::explain;
@@ -20,9 +19,17 @@ const PAUSE_MAX: Nanos = 20_000_000;
 /// A device that takes no fragment for this time in ns loses the frames that wait for it.
 const TAKES_NONE: Nanos = 1_000_000_000;
 
-/// Why a device has not taken its IP parameters.
+/// Why a device has not taken its IP parameters or its MAC filter.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum EoeError {
+    /// The request is longer than the mailbox.
+    #[error("the request has {length} bytes, the mailbox of the device {mailbox}")]
+    TooLong {
+        /// The bytes of the request.
+        length: usize,
+        /// The bytes of the mailbox.
+        mailbox: u16,
+    },
     /// The result of the device.
     #[error("the device refused them with result {:#06x}: {}", .0, result_text(*.0))]
     Result(u16),
@@ -31,11 +38,29 @@ pub enum EoeError {
     Mailbox(CoeCause),
 }
 
+/// What a device with EoE is given.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum EoeSetting {
+    /// The IP parameters.
+    IpParameters,
+    /// The MAC filter.
+    MacFilter,
+}
+
+impl fmt::Display for EoeSetting {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::IpParameters => "IP parameters",
+            Self::MacFilter => "MAC filter",
+        })
+    }
+}
+
 /// The frame that is on its way to a device in fragments.
 #[derive(Debug, Default)]
 pub(super) struct EoeSender {
     frame: Vec<u8>,
-    /// The number of the frame, counted from the first one.
+    /// The number of the frame, 0 to 15.
     number: u8,
     /// The fragments that the device has taken.
     sent: usize,
@@ -61,18 +86,22 @@ impl EoeSender {
 }
 
 impl CoeClient {
-    /// Sets the IP parameters of the device.
+    /// Sends a request that sets IP parameters or the MAC filter.
     ///
     /// # Errors
     /// [`EoeError`].
-    pub async fn set_ip_parameters<W: MailboxTransport>(
+    pub async fn set_ethernet<W: MailboxTransport>(
         &mut self,
         w: &W,
-        parameters: &IpParameters,
+        request: Service<'_>,
     ) -> Result<(), EoeError> {
+        let request = Message::from(request);
+        let (length, mailbox) = (request.length(), self.port.layout.out_len);
+        if length > usize::from(mailbox) {
+            return Err(EoeError::TooLong { length, mailbox });
+        }
         let set_aside = self.port.forgotten;
-        let answered = self.ask_result(w, parameters).await;
-        match answered {
+        match self.ask_result(w, request).await {
             Ok(Ok(RESULT_OK)) => Ok(()),
             Ok(Ok(result)) => Err(EoeError::Result(result)),
             Ok(Err(code)) => Err(EoeError::Mailbox(CoeCause::Refused(code))),
@@ -87,17 +116,18 @@ impl CoeClient {
     async fn ask_result<W: MailboxTransport>(
         &mut self,
         w: &W,
-        parameters: &IpParameters,
+        request: Message<'_>,
     ) -> Result<Result<u16, u16>, TransportError> {
         self.drain_after_failure(w).await?;
-        let request = Message::from(Service::SetIp(*parameters));
+        let filter = matches!(request.service, Service::SetFilter(_));
         self.port.send(w, &request).await?;
         let mut deadline = Deadline::after(w, self.port.timeouts.answer);
         loop {
             self.port.receive(w, &mut deadline).await?;
             let answer = Message::parse(self.port.message()).map(|message| message.service);
             let answer = match answer {
-                Ok(Service::SetIpResponse(result)) => Ok(result),
+                Ok(Service::SetIpResponse(result)) if !filter => Ok(result),
+                Ok(Service::SetFilterResponse(result)) if filter => Ok(result),
                 Ok(Service::Refused(code)) => Err(code),
                 _ => {
                     self.port.set_aside(w);
@@ -137,19 +167,20 @@ impl CoeClient {
             return sender.restart();
         }
         if sender.frame.is_empty() {
-            let Some(frame) = port.next_frame() else {
+            let number = sender.number.wrapping_add(1) & 0x0f;
+            let Some(frame) = port.next_frame(w.now(), number) else {
                 return;
             };
-            (sender.frame, sender.sent) = (frame, 0);
-            sender.number = sender.number.wrapping_add(1);
+            (sender.frame, sender.sent, sender.number) = (frame, 0, number);
         }
         let out_len = self.port.layout.out_len;
         let mut fragments = Fragments::new(&sender.frame, sender.number, out_len);
-        let Some(fragment) = fragments.nth(sender.sent) else {
+        let Some(mut fragment) = fragments.nth(sender.sent) else {
             // The mailbox is too small for a fragment.
             sender.restart();
             return port.drop_frames(1);
         };
+        fragment.time_requested = port.has_time_stamps();
         let message = Message::from(Service::Fragment(fragment));
         let written = self.port.write_once(w, &message).await;
         drop(turn);

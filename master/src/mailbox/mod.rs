@@ -33,7 +33,7 @@ pub use crate::rt::exchange::MailboxStatus;
 pub use ecaxis_ecat::mailbox::{abort_text, mailbox_error_text};
 pub use ecaxis_ecat::object::{NamedObject, object_name};
 pub use emergency::{EMERGENCY_QUEUE, Emergencies, Emergency, EmergencySource, Received};
-pub use eoe::EoeError;
+pub use eoe::{EoeError, EoeSetting};
 pub use error::{CoeCause, CoeError, InfoError, Phase, SdoError, Subject};
 pub use foe::{FoeCause, FoeClient, FoeError};
 pub use raw::{RawAnswer, RawMessage};

@@ -9,7 +9,7 @@ use ecaxis_axis::{CommandError, Mode, State, Statusword, Trip};
 
 use crate::config::{LimitConflict, UnitProblem};
 use crate::link::{LinkError, OpenError};
-use crate::mailbox::{DatagramError, EoeError, IdnElement, InfoError, SdoError};
+use crate::mailbox::{DatagramError, EoeError, EoeSetting, IdnElement, InfoError, SdoError};
 use crate::rt::gateway::NodeState;
 use crate::rt::image::{NotMapped, TooLarge};
 use crate::rt::setpoint_generator::GeneratorError;
@@ -105,9 +105,10 @@ pub enum Cause {
     WrongState { state: AlState },
     #[error("{}", .0.without_station())]
     Sdo(#[source] SdoError),
-    #[error("IP parameters by EoE ({parameters}): {source}")]
+    #[error("{setting} by EoE ({values}): {source}")]
     Eoe {
-        parameters: String,
+        setting: EoeSetting,
+        values: String,
         source: EoeError,
     },
     #[error("the TAP interface `{name}`: {step}: {source}")]

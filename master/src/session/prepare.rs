@@ -252,8 +252,8 @@ impl RunBuilder<'_> {
 fn connect(machine: &Machine, bus: &mut Bus) -> EoeNetwork {
     let network = EoeNetwork::default();
     for (config, device) in machine.devices.iter().zip(bus.devices.iter_mut()) {
-        if let (Some(_), Some(coe)) = (&config.eoe, device.coe.as_mut()) {
-            coe.connect(network.add_device(&config.name));
+        if let (Some(eoe), Some(coe)) = (&config.eoe, device.coe.as_mut()) {
+            coe.connect(network.add_device(&config.name, eoe.time_stamps));
         }
     }
     network

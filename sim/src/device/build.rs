@@ -518,7 +518,9 @@ fn mailbox(device: &Device, serial: u32) -> Option<Mailbox> {
     };
     let protocols = device.mailbox.as_ref()?;
     let mut mailbox = Mailbox::new(find(SmUse::MBoxOut)?, find(SmUse::MBoxIn)?);
-    mailbox.eoe = protocols.eoe.map(|_| Box::new(EoeServer::new(serial)));
+    mailbox.eoe = protocols
+        .eoe
+        .map(|eoe| Box::new(EoeServer::new(serial, eoe.time_stamp == Some(true))));
     Some(mailbox)
 }
 

@@ -10,6 +10,7 @@ pub(super) const UNIT: usize = 32;
 const FRAME: usize = 1522;
 
 pub(super) const FRAGMENT: u8 = 0;
+pub(super) const TIME_STAMP: u8 = 1;
 pub(super) const SET_IP: u8 = 2;
 pub(super) const SET_IP_RESPONSE: u8 = 3;
 pub(super) const SET_FILTER: u8 = 4;
@@ -26,6 +27,7 @@ pub(super) struct Header {
     pub(super) port: u8,
     pub(super) last: bool,
     pub(super) time_appended: bool,
+    pub(super) time_requested: bool,
     pub(super) fragment: u16,
     /// Size of the frame in the first fragment, offset in the others.
     pub(super) units: u16,
@@ -41,6 +43,7 @@ impl Header {
             port: kind >> 4,
             last: flags & 1 != 0,
             time_appended: flags & 2 != 0,
+            time_requested: flags & 4 != 0,
             fragment: second & 0x3f,
             units: second >> 6 & 0x3f,
             frame: second >> 12,
@@ -51,7 +54,9 @@ impl Header {
     pub(super) fn to_bytes(self) -> [u8; HEADER] {
         let second = self.fragment | self.units << 6 | self.frame << 12;
         let [low, high] = second.to_le_bytes();
-        let flags = u8::from(self.last) | u8::from(self.time_appended) << 1;
+        let flags = u8::from(self.last)
+            | u8::from(self.time_appended) << 1
+            | u8::from(self.time_requested) << 2;
         [self.kind | self.port << 4, flags, low, high]
     }
 
@@ -185,5 +190,73 @@ impl Parameters {
         if new.name.is_some() {
             self.name.clone_from(&new.name);
         }
+    }
+}
+
+/// Length of a MAC filter: its head, 16 places for addresses, 4 for masks.
+const FILTER: usize = 2 + 16 * 6 + 4 * 6;
+
+/// Which frames a device passes on to its host.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Filter(Vec<u8>);
+
+impl Filter {
+    pub(super) fn parse(data: &[u8]) -> Option<Self> {
+        data.get(..FILTER).map(|bytes| Self(bytes.to_vec()))
+    }
+
+    pub(super) fn to_bytes(&self) -> &[u8] {
+        &self.0
+    }
+
+    /// Returns true if a frame for this address passes. An address passes that equals one of the
+    /// filter, in all bits or in those of a mask.
+    pub(super) fn passes(&self, to: &[u8]) -> bool {
+        let (head, places) = self.0.split_first().unwrap_or((&0, &[]));
+        if to.iter().all(|byte| *byte == 0xff) {
+            return head & 0x80 == 0;
+        }
+        let lists = places.get(1..).unwrap_or_default();
+        let addresses = lists.chunks_exact(6);
+        let masks = addresses.clone().skip(16).take(usize::from(head >> 4 & 3));
+        let masks: Vec<_> = std::iter::once(&[0xff; 6][..]).chain(masks).collect();
+        addresses.take(usize::from(head & 0x0f)).any(|address| {
+            masks.iter().any(|mask| {
+                let bytes = address.iter().zip(to).zip(*mask);
+                bytes.into_iter().all(|((a, b), mask)| (a ^ b) & mask == 0)
+            })
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two addresses and one mask; broadcasts pass unless the highest bit is set.
+    #[test]
+    fn filter_passes_addresses_and_masks() {
+        let mut bytes = vec![0; FILTER];
+        bytes[..8].copy_from_slice(&[0x12, 0, 1, 0x80, 0xc2, 0, 0, 0x0e]);
+        bytes[8..14].copy_from_slice(&[1, 0, 0x5e, 0, 0, 0]);
+        bytes[98..104].copy_from_slice(&[0xff, 0xff, 0xff, 0, 0, 0]);
+        let filter = Filter::parse(&bytes).expect("a filter");
+        for (to, passes) in [
+            ([1, 0x80, 0xc2, 0, 0, 0x0e], true),
+            ([1, 0x80, 0xc2, 9, 9, 9], true),
+            ([1, 0, 0x5e, 1, 2, 3], true),
+            ([1, 0, 0x5f, 0, 0, 0], false),
+            ([0; 6], false),
+            ([0xff; 6], true),
+        ] {
+            assert_eq!(filter.passes(&to), passes, "{to:02x?}");
+        }
+        bytes[0] = 0x81;
+        let filter = Filter::parse(&bytes).expect("a filter");
+        assert!(!filter.passes(&[0xff; 6]));
+        assert!(filter.passes(&[1, 0x80, 0xc2, 0, 0, 0x0e]));
+        assert!(!filter.passes(&[1, 0x80, 0xc2, 9, 9, 9]), "no mask");
+        assert_eq!(filter.to_bytes(), bytes);
+        assert_eq!(Filter::parse(&bytes[..FILTER - 1]), None);
     }
 }

@@ -1,6 +1,6 @@
 //! Ethernet over EtherCAT (ETG.1000.6 §5.7): a device with an IP host behind its mailbox.
 //!
-//! * `message`: fragments and IP parameters as bytes
+//! * `message`: fragments, IP parameters and MAC filters as bytes
 //! * `host`: ARP, ICMP echo, TCP, and the web page of the device
 //!
 //! The host answers once the MainDevice has set an IP address. Each fragment leaves when the
@@ -13,7 +13,7 @@ use std::collections::VecDeque;
 
 use crate::device::mailbox::{Answer, Detail, MailboxCapacity};
 use host::Host;
-use message::{Assembly, Header, Parameters};
+use message::{Assembly, Filter, Header, Parameters};
 
 /// Maximum number of frames that wait for the MainDevice; the host drops further ones, as a network
 /// interface with a full queue does.
@@ -23,7 +23,6 @@ const FLOOD_NS: u64 = 1_000_000;
 /// Results of requests.
 const RESULT_OK: u16 = 0;
 const RESULT_UNSUPPORTED_TYPE: u16 = 2;
-const RESULT_NO_FILTER: u16 = 0x0401;
 
 /// Faults of the Ethernet traffic of a device.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -38,11 +37,17 @@ pub(crate) struct EoeFaults {
 #[derive(Debug, Clone)]
 pub(crate) struct EoeServer {
     serial: u32,
+    /// The device has time stamps.
+    time_stamps: bool,
     parameters: Parameters,
+    filter: Option<Filter>,
     host: Host,
     assembly: Assembly,
-    /// Frames to the MainDevice, and the offset in the first one.
-    frames: VecDeque<Vec<u8>>,
+    /// Frames to the MainDevice with the system time of their arrival, and the offset in the first
+    /// one.
+    frames: VecDeque<(u64, Vec<u8>)>,
+    /// Times that the MainDevice has requested.
+    times: VecDeque<Vec<u8>>,
     offset: usize,
     fragment: u16,
     frame_number: u16,
@@ -54,13 +59,16 @@ pub(crate) struct EoeServer {
 }
 
 impl EoeServer {
-    pub(crate) fn new(serial: u32) -> Self {
+    pub(crate) fn new(serial: u32, time_stamps: bool) -> Self {
         Self {
             serial,
+            time_stamps,
             parameters: Parameters::default(),
+            filter: None,
             host: Host::new(serial),
             assembly: Assembly::default(),
             frames: VecDeque::new(),
+            times: VecDeque::new(),
             offset: 0,
             fragment: 0,
             frame_number: 0,
@@ -74,7 +82,7 @@ impl EoeServer {
     pub(crate) fn restarted(&self) -> Self {
         Self {
             faults: self.faults,
-            ..Self::new(self.serial)
+            ..Self::new(self.serial, self.time_stamps)
         }
     }
 
@@ -91,8 +99,21 @@ impl EoeServer {
         self.faults = faults;
     }
 
-    /// Processes a message of the MainDevice.
-    pub(crate) fn request(&mut self, body: &[u8], room: MailboxCapacity, local: u64) -> Answer {
+    /// Returns true if the host receives a frame: those for its own address always.
+    fn passes(&self, frame: &[u8]) -> bool {
+        let to = frame.get(..6).unwrap_or_default();
+        let own = self.parameters.mac.is_some_and(|mac| mac == *to);
+        own || self.filter.as_ref().is_none_or(|filter| filter.passes(to))
+    }
+
+    /// Processes a message of the MainDevice. `local` is the local time, `system` the system time.
+    pub(crate) fn request(
+        &mut self,
+        body: &[u8],
+        room: MailboxCapacity,
+        local: u64,
+        system: u64,
+    ) -> Answer {
         let Some((header, data)) = Header::parse(body) else {
             return Answer::Error(Detail::TooShort);
         };
@@ -107,7 +128,12 @@ impl EoeServer {
         match header.kind {
             message::FRAGMENT => {
                 if let Some(frame) = self.assembly.add(&header, data) {
-                    self.host.receive(frame);
+                    if self.time_stamps && header.time_requested && self.times.len() < FRAMES {
+                        self.times.push_back(time_stamp(&header, system));
+                    }
+                    if self.passes(&frame) {
+                        self.host.receive(frame);
+                    }
                     self.due = local;
                 }
                 Answer::None
@@ -124,33 +150,52 @@ impl EoeServer {
                 let parameters = self.parameters.to_bytes();
                 reply(message::GET_IP_RESPONSE, RESULT_OK, &parameters)
             }
-            message::SET_FILTER => reply(message::SET_FILTER_RESPONSE, RESULT_NO_FILTER, &[]),
-            message::GET_FILTER => reply(message::GET_FILTER_RESPONSE, RESULT_NO_FILTER, &[]),
+            message::SET_FILTER => match Filter::parse(data) {
+                Some(filter) => {
+                    self.filter = Some(filter);
+                    reply(message::SET_FILTER_RESPONSE, RESULT_OK, &[])
+                }
+                None => Answer::Error(Detail::TooShort),
+            },
+            message::GET_FILTER => {
+                let filter = self.filter.as_ref().map_or(&[][..], Filter::to_bytes);
+                reply(message::GET_FILTER_RESPONSE, RESULT_OK, filter)
+            }
             kind => reply(kind.wrapping_add(1) & 0x0f, RESULT_UNSUPPORTED_TYPE, &[]),
         }
     }
 
     /// Lets the host work. `page` returns the web page of the device.
-    pub(crate) fn work(&mut self, local: u64, page: &dyn Fn() -> String) {
+    pub(crate) fn work(&mut self, local: u64, system: u64, page: &dyn Fn() -> String) {
         self.due = self.host.work(local, page);
         while let Some(frame) = self.host.take_frame() {
             if self.frames.len() < FRAMES {
-                self.frames.push_back(frame);
+                self.frames.push_back((system, frame));
             }
         }
         if self.faults.flood {
             if self.frames.is_empty() {
-                self.frames.push_back(host::broadcast(self.serial));
+                self.frames
+                    .push_back((system, host::broadcast(self.serial)));
             }
             self.due = self.due.min(local.saturating_add(FLOOD_NS));
         }
     }
 
-    /// Returns the next fragment for a mailbox with this capacity.
-    pub(crate) fn next_fragment(&mut self, room: MailboxCapacity) -> Option<Vec<u8>> {
-        let frame = self.frames.front()?;
+    /// Returns the next message for a mailbox with this capacity: a time stamp or a fragment. The
+    /// last fragment has the time at which the host has sent the frame.
+    pub(crate) fn next_message(&mut self, room: MailboxCapacity) -> Option<Vec<u8>> {
+        if let Some(time) = self.times.pop_front() {
+            return Some(time);
+        }
+        let (arrived, frame) = self.frames.front()?;
         let rest = frame.get(self.offset..)?;
-        let capacity = room.send.saturating_sub(message::HEADER);
+        let stamp = match self.time_stamps {
+            true => arrived.to_le_bytes().first_chunk::<4>().copied(),
+            false => None,
+        };
+        let reserved = message::HEADER + stamp.map_or(0, |stamp| stamp.len());
+        let capacity = room.send.saturating_sub(reserved);
         let last = rest.len() <= capacity;
         let length = match last {
             true => rest.len(),
@@ -172,7 +217,8 @@ impl EoeServer {
             kind: message::FRAGMENT,
             port: 0,
             last,
-            time_appended: false,
+            time_appended: last && stamp.is_some(),
+            time_requested: false,
             fragment: self.fragment,
             units: u16::try_from(bytes.div_ceil(message::UNIT)).unwrap_or(0),
             frame: self.frame_number,
@@ -202,6 +248,29 @@ impl EoeServer {
         }
         let mut body = header.to_bytes().to_vec();
         body.extend_from_slice(&data);
+        body.extend(stamp.filter(|_| header.time_appended).iter().flatten());
         Some(body)
     }
+}
+
+/// Returns the time stamp of a frame that has left the port.
+fn time_stamp(of: &Header, system: u64) -> Vec<u8> {
+    let header = Header {
+        kind: message::TIME_STAMP,
+        last: true,
+        fragment: 0,
+        units: 0,
+        time_requested: false,
+        ..*of
+    };
+    let mut body = header.to_bytes().to_vec();
+    body.extend(
+        system
+            .to_le_bytes()
+            .first_chunk::<4>()
+            .iter()
+            .copied()
+            .flatten(),
+    );
+    body
 }

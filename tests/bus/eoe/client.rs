@@ -21,6 +21,9 @@ pub struct Seen {
     pub pings: u32,
     /// The time of each echo in ns.
     pub echoes: Vec<u64>,
+    /// The time of each ping, and the round-trip time of each echo in ns.
+    sent: Vec<u64>,
+    pub round_trips: Vec<u64>,
     /// Pages with the time of their end in ns.
     pub pages: Vec<(u64, String)>,
 }
@@ -132,8 +135,11 @@ impl Client {
         let mut seen = self.seen.lock().unwrap();
         let host = IpAddress::Ipv4(self.host);
         let ping = self.sockets.get_mut::<icmp::Socket<'_>>(self.ping);
-        while let Ok((_, from)) = ping.recv() {
+        while let Ok((packet, from)) = ping.recv() {
             assert_eq!(from, host);
+            let number = Icmpv4Packet::new_checked(packet).unwrap().echo_seq_no();
+            let sent = seen.sent[usize::from(number)];
+            seen.round_trips.push(now - sent);
             seen.echoes.push(now);
         }
         if now >= self.next && ping.can_send() {
@@ -143,10 +149,13 @@ impl Client {
                 seq_no: u16::try_from(seen.pings % 0x1_0000).unwrap(),
                 data: &[0xa5; 300],
             };
-            let room = ping.send(echo.buffer_len(), host).unwrap();
-            let mut packet = Icmpv4Packet::new_unchecked(room);
-            echo.emit(&mut packet, &ChecksumCapabilities::default());
-            seen.pings += 1;
+            // The buffer is full while no one answers ARP.
+            if let Ok(room) = ping.send(echo.buffer_len(), host) {
+                let mut packet = Icmpv4Packet::new_unchecked(room);
+                echo.emit(&mut packet, &ChecksumCapabilities::default());
+                seen.pings += 1;
+                seen.sent.push(now);
+            }
         }
         let page = self.sockets.get_mut::<tcp::Socket<'_>>(self.page);
         if !page.is_open() {

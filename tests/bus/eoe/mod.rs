@@ -7,7 +7,7 @@ use std::task::{Context, Poll, Waker};
 
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config::Machine;
-use ecaxis_master::eoe::EthernetInterface;
+use ecaxis_master::eoe::{EthernetInterface, FrameDelay};
 use ecaxis_master::mailbox::{MailboxError, Mailboxes};
 use ecaxis_master::session::{
     Attachments, AxisSummary, Observer, Options, Outcome, Progress, Summary, run_attached,
@@ -159,6 +159,83 @@ fn ip_parameters_are_refused_with_device_step_and_result() {
     ] {
         assert!(error.contains(part), "{error}");
     }
+}
+
+/// A bus whose two devices have longer mailboxes and time stamps.
+fn stamped(keys: &str) -> Machine {
+    let bench = Bench::new();
+    bench.change("esi/SV1.xml", |esi| {
+        esi.replace("DefaultSize=\"128\"", "DefaultSize=\"160\"")
+            .replace("TimeStamp=\"0\"", "TimeStamp=\"1\"")
+    });
+    let good = text(2, 2, MOVES);
+    bench.machine(&good.replace(".11\" }", &format!(".11\", {keys} }}")))
+}
+
+/// The host of a device hears what its filter passes. Its own address passes always, but ARP asks for
+/// it with a broadcast.
+#[test]
+fn mac_filter_decides_what_a_device_hears() {
+    let own = [192, 168, 7, 11];
+    for (keys, hears) in [
+        (
+            "filters = [\"01:80:c2:00:00:0e\"], broadcasts = false",
+            false,
+        ),
+        ("filters = [\"01:80:c2:00:00:0e\"]", true),
+        (
+            "filters = [\"ff:ff:ff:00:00:00\"], broadcasts = false",
+            false,
+        ),
+    ] {
+        let (outcome, heard, seen) = run(stamped(keys), virtual_time(), own);
+        well(outcome, &heard);
+        assert_eq!(
+            seen.echoes.len() > 50,
+            hears,
+            "{keys}: {}",
+            seen.echoes.len()
+        );
+        assert_eq!(seen.echoes.is_empty(), !hears, "{keys}");
+    }
+}
+
+/// The delays by time stamps are shorter than the round trips that a program sees, and both
+/// directions together are the larger part of them.
+#[test]
+fn time_stamps_give_the_delay_in_both_directions() {
+    let own = [192, 168, 7, 11];
+    let (outcome, heard, seen) = run(stamped("time_stamps = true"), virtual_time(), own);
+    let summary = well(outcome, &heard);
+    let [a0, a1, _] = &summary.ethernet[..] else {
+        panic!("{:?}", summary.ethernet);
+    };
+    let (from, to) = (a0.from_delay, a0.to_delay);
+    assert!(from.frames > 100 && to.frames > 100, "{a0:?}");
+    // Without times: the frames before the time of the bus was known.
+    assert!(
+        2 * from.frames > a0.from_port && 2 * to.frames > a0.to_port,
+        "{a0:?}"
+    );
+    let mean = |delay: FrameDelay| delay.mean_ns().expect("frames");
+    let round_trips = seen.round_trips.iter().sum::<u64>() / seen.round_trips.len() as u64;
+    let both = mean(from) + mean(to);
+    println!("{both} of {round_trips} ns");
+    assert!(
+        both < round_trips * 5 / 4 && both > round_trips / 2,
+        "{both} {round_trips}"
+    );
+    let longest = *seen.round_trips.iter().max().expect("echoes");
+    assert!(
+        from.max_ns >= mean(from) && from.max_ns <= longest,
+        "{a0:?} {longest}"
+    );
+    assert!(
+        to.max_ns >= mean(to) && to.max_ns <= longest,
+        "{a0:?} {longest}"
+    );
+    assert!(seen.echoes.len() > 50);
+    assert_eq!((a1.from_delay.frames, a1.to_delay.frames), (0, 0), "{a1:?}");
 }
 
 /// A device that is lost and returns gets its parameters again, and its page is back.
@@ -353,6 +430,11 @@ fn wrong_keys_have_a_message_and_a_remedy() {
         ("eoe = { ip = \"192.168.7.11\", mac = \"01:00:5e:00:00:01\" }", "", "is not the MAC address of a device", "even first one"),
         ("eoe = { ip = \"192.168.7.11\", mac = \"02:00:00:00:00\" }", "", "is not the MAC address of a device", ""),
         ("eoe = { ip = \"192.168.7.11\", name = \"a b\" }", "", "\"a b\" is not a DNS name", "32 letters"),
+        ("eoe = { ip = \"192.168.7.11\", filters = [\"01\"] }", "", "`filters` takes up to 15 addresses of six bytes", "01:80:c2:00:00:0e"),
+        ("eoe = { ip = \"192.168.7.11\", filters = [], filter_masks = [\"00:00:00:00:00:00\", \"00:00:00:00:00:00\", \"00:00:00:00:00:00\", \"00:00:00:00:00:00\"] }", "", "`filter_masks` takes up to 3", ""),
+        ("eoe = { ip = \"192.168.7.11\", filters = [] }", "", "needs a mailbox of 132 bytes, the device has 128 (ESI)", "omit `filters`"),
+        ("eoe = { ip = \"192.168.7.11\", broadcasts = false }", "", "the device keeps its own filter", "add `filters"),
+        ("eoe = { ip = \"192.168.7.11\", time_stamps = true }", "", "no time stamps (`TimeStamp` of `EoE`)", "omit `time_stamps`"),
         ("eoe = { ipp = \"192.168.7.11\" }", "", "unknown key `ipp`", "did you mean `ip`?"),
         ("eoe = {}", "[eoe]\naddress = \"192.168.7.1/24\"", "`tap` is missing", "ecat0"),
         ("eoe = {}", "[eoe]\ntap = \"sixteen-letters1\"", "is not the name of an interface", ""),

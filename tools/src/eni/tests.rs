@@ -6,6 +6,7 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
+use ecaxis_ecat::mailbox::eoe::MacFilter;
 use ecaxis_esi as esi;
 use ecaxis_master::config::{self, Machine};
 use ecaxis_master::esi_library::Library;
@@ -300,10 +301,10 @@ proptest! {
     }
 }
 
-/// The export has the IDNs that need no attribute and the IP parameters; the import keeps other
+/// The export has the IDNs that need no attribute, the IP parameters and MAC filters; the import keeps other
 /// IDNs, and lists those that follow from keys.
 #[test]
-fn idns_and_ip_parameters_are_init_commands() {
+fn idns_and_settings_of_eoe_are_init_commands() {
     let sercos = std::fs::read_to_string(root().join("configs/sercos.toml")).expect("our file");
     let entry = "{ idn = \"S-0-0091\", drive = 1, value = \"1500\" }";
     let bytes = "{ idn = \"P-0-0100\", drive = 1, value = [4, 0, 8, 0, 1, 0, 0, 0] }";
@@ -341,15 +342,27 @@ fn idns_and_ip_parameters_are_init_commands() {
     assert_eq!(unsent[0].0, "SoE write of S-0-0016, drive 0");
     assert!(unsent[0].1.contains("`mode`"), "{unsent:?}");
 
-    let web = config::load(&folder.join("web.toml")).expect("our file");
+    let mut web = config::load(&folder.join("web.toml")).expect("our file");
+    let filter = MacFilter {
+        filters: vec![[1, 0x80, 0xc2, 0, 0, 0x0e], [2, 0, 0, 0, 0, 1]],
+        masks: vec![[0xff, 0xff, 0xff, 0, 0, 0]],
+        no_broadcasts: true,
+    };
+    for device in &mut web.devices {
+        device.eoe.as_mut().expect("EoE").filter = Some(filter.clone());
+    }
     let exported = export(&web).expect("an ENI");
     let back = import_with(exported.text.as_bytes(), &folder.join("esi"));
     let imported = back.machine.expect("a machine");
-    let parameters = |machine: &Machine| {
+    let ethernet = |machine: &Machine| {
         let devices = machine.devices.iter();
-        let each = devices.map(|d| d.eoe.as_ref().and_then(|eoe| eoe.parameters));
-        each.collect::<Vec<_>>()
+        devices.map(|d| d.eoe.clone()).collect::<Vec<_>>()
     };
-    assert!(parameters(&web).iter().any(Option::is_some));
-    assert_eq!(parameters(&imported), parameters(&web));
+    assert!(
+        ethernet(&web)
+            .iter()
+            .flatten()
+            .all(|eoe| eoe.parameters.is_some())
+    );
+    assert_eq!(ethernet(&imported), ethernet(&web));
 }

@@ -27,5 +27,13 @@ table! { "`eoe`",
         name: Key<String>,
         /// MAC address (text; default a locally administered one)
         mac: Key<String>,
+        /// MAC addresses that the device passes on, up to 15 (list of text; default the device keeps its own filter)
+        filters: Key<Vec<String>>,
+        /// Masks of these addresses, up to 3 (list of text; default none)
+        filter_masks: Key<Vec<String>>,
+        /// With a filter, broadcasts pass too (true or false; default `true`)
+        broadcasts: Key<bool>,
+        /// The device sends the times of frames; the summary then has their delay (true or false; default `false`)
+        time_stamps: Key<bool>,
     }
 }

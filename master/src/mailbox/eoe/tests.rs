@@ -185,7 +185,7 @@ impl Bench {
     fn new() -> Self {
         let network = EoeNetwork::default();
         let mut coe = CoeClient::new(LAYOUT);
-        coe.connect(network.add_device("a0"));
+        coe.connect(network.add_device("a0", false));
         let mut bench = Self {
             device: Device::default(),
             coe,
@@ -334,7 +334,7 @@ fn frames_that_a_device_does_not_take_are_counted() {
 #[test]
 fn device_that_repeats_nothing_leaves_the_turn_to_others() {
     let mut bench = Bench::new();
-    let other = bench.network.add_device("a1");
+    let other = bench.network.add_device("a1", false);
     bench.device.other.replace(Some(other.clone()));
     bench.device.loses_read.set(true);
     let lost = mailbox(2, &[0; 20]);
@@ -347,7 +347,7 @@ fn device_that_repeats_nothing_leaves_the_turn_to_others() {
 #[test]
 fn sdo_is_served_while_another_device_has_the_turn() {
     let bench = Bench::new();
-    let other = bench.network.add_device("a1");
+    let other = bench.network.add_device("a1", false);
     bench.frame();
     let (mailboxes, workers) = open_one(bench.device, bench.coe);
     let _turn = other.try_turn().expect("no other has it");

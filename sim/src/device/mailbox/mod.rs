@@ -208,9 +208,9 @@ impl SimDevice {
         };
         if mailbox.queue.is_empty()
             && let Some(eoe) = &mut mailbox.eoe
-            && let Some(fragment) = eoe.next_fragment(room)
+            && let Some(message) = eoe.next_message(room)
         {
-            mailbox.queue.push(protocol::EOE, &fragment, Class::Notice);
+            mailbox.queue.push(protocol::EOE, &message, Class::Notice);
         }
         let Some(message) = mailbox.queue.next(usize::from(sm.len)) else {
             return;
@@ -334,7 +334,7 @@ impl SimDevice {
     }
 
     fn protocol_answer(&mut self, protocol: u8, payload: &[u8], room: MailboxCapacity) -> Answer {
-        let state = self.al.state;
+        let (state, system) = (self.al.state, self.system_time_at(self.local));
         let options = &self.mailbox_options;
         let Some(mailbox) = &mut self.mailbox else {
             return Answer::None;
@@ -374,7 +374,7 @@ impl SimDevice {
             // As in Bootstrap, an application without a network is in Init.
             protocol::EOE if state != AlState::Boot && mailbox.eoe.is_some() => {
                 match &mut mailbox.eoe {
-                    Some(eoe) => eoe.request(payload, room, self.local),
+                    Some(eoe) => eoe.request(payload, room, self.local, system),
                     None => Answer::Error(Detail::UnsupportedProtocol),
                 }
             }
@@ -415,11 +415,16 @@ impl SimDevice {
         self.pump_mailbox();
     }
 
+    /// Returns the system time at a local time, without distributed clocks the local time.
+    fn system_time_at(&self, local: u64) -> u64 {
+        self.esc.dc.as_ref().map_or(local, |dc| dc.system(local))
+    }
+
     /// Lets the IP host behind the mailbox work.
     fn work_ethernet(&mut self, local: u64) {
         let eoe = self.mailbox.as_mut().and_then(|mailbox| mailbox.eoe.take());
         let Some(mut eoe) = eoe else { return };
-        eoe.work(local, &|| self.web_page());
+        eoe.work(local, self.system_time_at(local), &|| self.web_page());
         if let Some(mailbox) = &mut self.mailbox {
             mailbox.eoe = Some(eoe);
         }

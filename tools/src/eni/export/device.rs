@@ -18,7 +18,7 @@ const DESCRIBED_SYNC_MANAGERS: usize = 4;
 const POLL_TIME_MS: u16 = 5;
 
 /// A mailbox that holds each request of EoE.
-const MAX_REQUEST: u16 = 128;
+const MAX_REQUEST: u16 = 256;
 
 impl PlacedDevice<'_> {
     pub(super) fn element(&self, network: &Network<'_>) -> Element {
@@ -143,7 +143,7 @@ impl PlacedDevice<'_> {
             let commands = Element::new("InitCmds").with_children(commands);
             element = element.child(Element::new("CoE").child(commands));
         }
-        for (name, commands) in [("SoE", self.start_up_idns()), ("EoE", self.ip_parameters())] {
+        for (name, commands) in [("SoE", self.start_up_idns()), ("EoE", self.ethernet())] {
             if !commands.is_empty() {
                 let commands = Element::new("InitCmds").with_children(commands);
                 element = element.child(Element::new(name).child(commands));
@@ -191,22 +191,28 @@ impl PlacedDevice<'_> {
         list.filter_map(command).collect()
     }
 
-    /// Returns the request that sets the IP parameters.
-    fn ip_parameters(&self) -> Vec<Element> {
-        let parameters = self.config.eoe.as_ref().and_then(|eoe| eoe.parameters);
-        let command = |parameters| {
-            let mut request = Vec::new();
-            Message::from(Service::SetIp(parameters)).emit(0, MAX_REQUEST, &mut request);
-            let length = request.first_chunk().map_or(0, |n| u16::from_le_bytes(*n));
-            request.truncate(HEADER + usize::from(length));
-            mailbox_command(
-                &["PS".to_owned()],
-                "IP parameters",
-                self.mailbox_timeout_ms(),
-                request.get(HEADER..).unwrap_or_default(),
-            )
+    /// Returns the requests that set IP parameters and MAC filter.
+    fn ethernet(&self) -> Vec<Element> {
+        let Some(eoe) = &self.config.eoe else {
+            return Vec::new();
         };
-        parameters.map(command).into_iter().collect()
+        let requests = [
+            (eoe.parameters.map(Service::SetIp), "IP parameters"),
+            (eoe.filter.clone().map(Service::SetFilter), "MAC filter"),
+        ];
+        let command = |(request, comment): (Option<Service<'_>>, &str)| {
+            let mut bytes = Vec::new();
+            Message::from(request?).emit(0, MAX_REQUEST, &mut bytes);
+            let length = bytes.first_chunk().map_or(0, |n| u16::from_le_bytes(*n));
+            bytes.truncate(HEADER + usize::from(length));
+            Some(mailbox_command(
+                &["PS".to_owned()],
+                comment,
+                self.mailbox_timeout_ms(),
+                bytes.get(HEADER..).unwrap_or_default(),
+            ))
+        };
+        requests.into_iter().filter_map(command).collect()
     }
 
     /// Returns the start-up SDOs.

@@ -4,7 +4,7 @@ use std::net::Ipv4Addr;
 use std::path::Path;
 
 use ecaxis_ecat::data_type::{DataType, Kind};
-use ecaxis_ecat::mailbox::eoe::{IpParameters, Message, Service};
+use ecaxis_ecat::mailbox::eoe::{IpParameters, MacAddress, MacFilter, Message, Service};
 use ecaxis_ecat::mailbox::soe::Idn;
 use ecaxis_ecat::registers;
 use ecaxis_ecat::sii::control;
@@ -38,8 +38,8 @@ pub(super) struct ImportedDevice<'n> {
     /// The entries of `sdo` and of `idn`.
     sdos: Vec<String>,
     idns: Vec<String>,
-    /// The value of `eoe`.
-    eoe: Option<String>,
+    /// The keys of `eoe` with their values.
+    eoe: Vec<(&'static str, String)>,
     /// What the SDOs and the clock of the ENI do and this device does not.
     pub unsent: Vec<Unsent>,
     cycle_ns: u64,
@@ -61,7 +61,7 @@ impl<'n> ImportedDevice<'n> {
             selection: None,
             sdos: Vec::new(),
             idns: Vec::new(),
-            eoe: None,
+            eoe: Vec::new(),
             unsent: Vec::new(),
             cycle_ns,
         };
@@ -163,8 +163,8 @@ impl<'n> ImportedDevice<'n> {
             self.add_unsent(position, "HotConnect".to_owned(), reason);
         }
         for (position, protocol, data) in &self.network.others {
-            if let ("EoE", Some(parameters)) = (*protocol, ip_parameters(data)) {
-                self.eoe = Some(eoe_value(&parameters));
+            if let ("EoE", Some(keys)) = (*protocol, eoe_keys(data)) {
+                self.eoe.extend(keys);
                 continue;
             }
             let reason = format!("ecaxis has no start-up commands of {protocol}");
@@ -332,8 +332,13 @@ impl<'n> ImportedDevice<'n> {
                 "{MARK} a drive: `mode` ({modes}) and a [device.axis] give it power"
             ));
         }
-        if let Some(eoe) = &self.eoe {
-            lines.add("eoe", eoe, "");
+        if !self.eoe.is_empty() {
+            let keys = self
+                .eoe
+                .iter()
+                .map(|(key, value)| format!("{key} = {value}"));
+            let keys = keys.collect::<Vec<_>>().join(", ");
+            lines.add("eoe", &format!("{{ {keys} }}"), "");
         }
         let mut text = lines.text();
         for (key, entries) in [("sdo", &self.sdos), ("idn", &self.idns)] {
@@ -416,28 +421,45 @@ pub(super) fn validated(command: &EcatCommand, register: u16) -> Option<&Validat
     command.validate.as_ref().filter(|_| at == register)
 }
 
-/// Returns the IP parameters that a request of EoE sets, if it sets an address.
-fn ip_parameters(data: &[u8]) -> Option<IpParameters> {
+/// Returns the keys of a request of EoE that sets an address or the MAC filter.
+fn eoe_keys(data: &[u8]) -> Option<Vec<(&'static str, String)>> {
     const TYPE_EOE: u8 = 2;
     let [low, high] = u16::try_from(data.len()).ok()?.to_le_bytes();
     let mut mailbox = vec![low, high, 0, 0, 0, TYPE_EOE];
     mailbox.extend_from_slice(data);
     match Message::parse(&mailbox).ok()?.service {
-        Service::SetIp(parameters) if parameters.ip.is_some() => Some(parameters),
+        Service::SetIp(parameters) if parameters.ip.is_some() => Some(ip_keys(&parameters)),
+        Service::SetFilter(filter) => Some(filter_keys(&filter)),
         _ => None,
     }
 }
 
-/// Returns IP parameters as TOML. Addresses of zeros are those that a request does not set.
-fn eoe_value(parameters: &IpParameters) -> String {
+fn mac_text(mac: MacAddress) -> String {
+    let bytes = mac.map(|byte| format!("{byte:02x}"));
+    bytes.join(":")
+}
+
+fn filter_keys(filter: &MacFilter) -> Vec<(&'static str, String)> {
+    let list = |addresses: &[MacAddress]| {
+        let each = addresses.iter().map(|mac| quoted(&mac_text(*mac)));
+        format!("[{}]", each.collect::<Vec<_>>().join(", "))
+    };
+    let mut keys = vec![("filters", list(&filter.filters))];
+    if !filter.masks.is_empty() {
+        keys.push(("filter_masks", list(&filter.masks)));
+    }
+    if filter.no_broadcasts {
+        keys.push(("broadcasts", "false".to_owned()));
+    }
+    keys
+}
+
+/// Returns IP parameters as keys. Addresses of zeros are those that a request does not set.
+fn ip_keys(parameters: &IpParameters) -> Vec<(&'static str, String)> {
     let address = |address: Option<Ipv4Addr>| {
         let set = address.filter(|address| !address.is_unspecified());
         set.map(|address| address.to_string())
     };
-    let mac = parameters.mac.map(|mac| {
-        let bytes = mac.map(|byte| format!("{byte:02x}"));
-        bytes.join(":")
-    });
     let name = parameters.name.map(|name| {
         let text: Vec<u8> = name.into_iter().take_while(|byte| *byte != 0).collect();
         String::from_utf8_lossy(&text).into_owned()
@@ -448,13 +470,11 @@ fn eoe_value(parameters: &IpParameters) -> String {
         ("gateway", address(parameters.gateway)),
         ("dns", address(parameters.dns)),
         ("name", name.filter(|name| !name.is_empty())),
-        ("mac", mac),
+        ("mac", parameters.mac.map(mac_text)),
     ];
-    let keys = keys.iter().filter_map(|(key, value)| {
-        let value = value.as_ref()?;
-        Some(format!("{key} = {}", quoted(value)))
-    });
-    format!("{{ {} }}", keys.collect::<Vec<_>>().join(", "))
+    let keys = keys.into_iter();
+    keys.filter_map(|(key, value)| Some((key, quoted(&value?))))
+        .collect()
 }
 
 /// Returns the entry of `idn`; `Ok(None)` if the drive gets the value without one.
