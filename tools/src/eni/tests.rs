@@ -10,6 +10,7 @@ use ecaxis_ecat::mailbox::eoe::MacFilter;
 use ecaxis_esi as esi;
 use ecaxis_master::config::{self, Machine};
 use ecaxis_master::esi_library::Library;
+use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::{fixture, root};
 use proptest::prelude::*;
 
@@ -342,7 +343,12 @@ fn idns_and_settings_of_eoe_are_init_commands() {
     assert_eq!(unsent[0].0, "SoE write of S-0-0016, drive 0");
     assert!(unsent[0].1.contains("`mode`"), "{unsent:?}");
 
-    let mut web = config::load(&folder.join("web.toml")).expect("our file");
+    let bench = Bench::new();
+    bench.change("esi/SV1.xml", |esi| {
+        esi.replace("DefaultSize=\"128\"", "DefaultSize=\"160\"")
+    });
+    let web = std::fs::read_to_string(folder.join("web.toml")).expect("our file");
+    let mut web = bench.machine(&web);
     let filter = MacFilter {
         filters: vec![[1, 0x80, 0xc2, 0, 0, 0x0e], [2, 0, 0, 0, 0, 1]],
         masks: vec![[0xff, 0xff, 0xff, 0, 0, 0]],
@@ -352,7 +358,7 @@ fn idns_and_settings_of_eoe_are_init_commands() {
         device.eoe.as_mut().expect("EoE").filter = Some(filter.clone());
     }
     let exported = export(&web).expect("an ENI");
-    let back = import_with(exported.text.as_bytes(), &folder.join("esi"));
+    let back = import_with(exported.text.as_bytes(), &bench.path().join("esi"));
     let imported = back.machine.expect("a machine");
     let ethernet = |machine: &Machine| {
         let devices = machine.devices.iter();
