@@ -66,7 +66,7 @@ pub(crate) struct Args {
     faults_on_signal: bool,
     /// Write the state of every device to this CSV file, once per millisecond: AL state and code,
     /// age of the outputs, Controlword, Statusword, velocity of the motor shaft in turns per
-    /// second; times are CLOCK_MONOTONIC
+    /// second, last pulse of SYNC0; times are CLOCK_MONOTONIC
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,
     /// Write the frames of the simulated CAN networks to this file, as candump does
