@@ -40,6 +40,8 @@ index! {
     AxisIndex
     /// The index of a reaction group. The first group holds all SubDevices without a named group.
     GroupIndex
+    /// The index of a line shaft.
+    LineShaftIndex
 }
 
 impl GroupIndex {

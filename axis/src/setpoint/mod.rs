@@ -12,6 +12,7 @@
 //! | [`Stream`] | through points that arrive during the motion |
 //! | [`Playback`] | through the points of a [`Table`] |
 //! | [`Gear`] | follows another axis, by a ratio or a [`Cam`] |
+//! | [`LineShaft`] | the motion of a master on another machine, for gears |
 //!
 //! [`Source`] is any of the sources that need only the motion. [`Ramp`] is for a single value:
 //! velocity in CSV, torque in CST.
@@ -43,6 +44,7 @@ mod error;
 mod gear;
 mod hold;
 mod jerk;
+mod line_shaft;
 mod ramp;
 mod rate;
 mod source;
@@ -60,6 +62,9 @@ pub(crate) use error::position as check_position;
 pub use gear::{Gear, GearConfig, GearInMode};
 pub use hold::Hold;
 pub use jerk::{Goal, JerkLimited, MoveRequest};
+pub use line_shaft::{
+    LineShaft, LineShaftConfig, LineShaftEnd, LineShaftPoint, LineShaftPointError, LineShaftState,
+};
 pub use ramp::Ramp;
 pub use rate::{RateCourse, TableRate};
 pub use source::Source;
