@@ -11,7 +11,8 @@ use serde::Serialize;
 use crate::clock::Nanos;
 use crate::config::Machine;
 use crate::rt::samples::{
-    AXIS_COLUMNS, COUNT_COLUMNS, CYCLE_COLUMNS, MAGIC, SampleWriter, VERSION, header, row_words,
+    AXIS_COLUMNS, COUNT_COLUMNS, CYCLE_COLUMNS, LINE_SHAFT_COLUMNS, MAGIC, SampleWriter, VERSION,
+    header, row_words,
 };
 use crate::sys::shared_memory::SharedMemory;
 
@@ -65,8 +66,18 @@ impl SampleLayout {
         for input in &machine.inputs {
             add(input.name.clone(), String::new());
         }
+        for shaft in &machine.line_shafts {
+            for (name, unit) in LINE_SHAFT_COLUMNS {
+                let unit = match unit {
+                    "s" => unit.to_owned(),
+                    per => format!("{}{per}", shaft.unit),
+                };
+                add(format!("{}.{name}", shaft.name), unit);
+            }
+        }
+        let of_shafts = machine.line_shafts.len() * LINE_SHAFT_COLUMNS.len();
         Self {
-            row_words: row_words(machine.axes.len(), machine.inputs.len()),
+            row_words: row_words(machine.axes.len(), machine.inputs.len()) + of_shafts,
             cycle_ns: machine.bus.cycle_ns,
             counts: COUNT_COLUMNS,
             signals,

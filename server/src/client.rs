@@ -359,6 +359,20 @@ impl Client {
                 *area = Some(memory);
                 Ok(keys)
             }
+            // The requests of all HTTP clients with a token are one client, which never leaves.
+            Op::LineShaft { .. } if self.waits => {
+                let message = "a line shaft needs a connection that stays";
+                Err(OpError::new(ErrorCode::BadRequest, message)
+                    .help("use the WebSocket or the Unix socket"))
+            }
+            Op::LineShaft {
+                name,
+                stream,
+                points,
+            } => {
+                let accepted = hub.feed_line_shaft(self.id, &name, &stream, &points)?;
+                Ok(object(json!({"accepted": accepted})))
+            }
             Op::Token { .. } | Op::Subscribe { .. } | Op::Unsubscribe { .. } => {
                 let message = "this connection has no subscriptions";
                 Err(OpError::new(ErrorCode::BadRequest, message)

@@ -41,9 +41,11 @@ pub enum Op {
     /// Subscribes to topics.
     Subscribe {
         topics: Vec<Topic>,
-        /// The period of state and samples, 10 to 10,000.
+        /// The period of state and samples, 10 to 10,000; that of set-points, 1 to 1,000.
         #[serde(default = "interval")]
         interval_ms: u64,
+        /// The axis of the set-points.
+        axis: Option<String>,
         /// The signals of the samples; all without this key.
         signals: Option<Vec<String>>,
     },
@@ -183,6 +185,14 @@ pub enum Op {
     StreamClose { axis: String },
     /// Passes the memory for set-points in real time, on the socket only.
     Area {},
+    /// Feeds a line shaft with set-points of an axis of another machine. Needs no lease.
+    LineShaft {
+        name: String,
+        /// The stream of the event `setpoints`.
+        stream: String,
+        #[schemars(length(max = 64))]
+        points: Vec<SetpointPoint>,
+    },
     /// Lets virtual time advance.
     Advance {
         cycles: Option<u64>,
@@ -212,6 +222,7 @@ pub enum Topic {
     Events,
     State,
     Samples,
+    Setpoints,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema, Serialize)]
@@ -246,6 +257,17 @@ pub enum Point {
     Position([f64; 1]),
     WithVelocity([f64; 2]),
     WithTorque([f64; 3]),
+}
+
+/// A set-point of an axis for other machines, in units of the axis.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize, JsonSchema, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct SetpointPoint {
+    /// The instant in ns of common time at which it takes effect.
+    pub unix_ns: u64,
+    pub position: f64,
+    pub velocity: f64,
+    pub acceleration: f64,
 }
 
 /// The index of an object: a number, or a text such as `"0x6061"`.
@@ -310,6 +332,7 @@ impl Op {
             | Self::Release {}
             | Self::SdoRead { .. }
             | Self::SimInput { .. }
+            | Self::LineShaft { .. }
             | Self::Advance { .. } => Access::Command,
             Self::Disable { axis } if axis == ALL => Access::Command,
             _ => Access::Lease,
@@ -328,6 +351,7 @@ impl Op {
                     | Self::SdoRead { .. }
                     | Self::Advance { .. }
                     | Self::StreamPush { .. }
+                    | Self::LineShaft { .. }
             )
     }
 }

@@ -4,6 +4,8 @@ use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ecaxis_axis::setpoint::LineShaftPoint;
+use ecaxis_ecat::index::AxisIndex;
 use ecaxis_master::samples::Samples;
 use serde_json::{Map, Value, json};
 use tokio::sync::broadcast::error::RecvError;
@@ -11,8 +13,9 @@ use tokio::sync::{Semaphore, mpsc};
 use tokio::time::{Interval, MissedTickBehavior, interval};
 
 use crate::client::{Answer, Client};
-use crate::command::{Op, Request, Topic};
+use crate::command::{Op, Request, SetpointPoint, Topic};
 use crate::error::{ErrorCode, OpError};
+use crate::hub::{Hub, stream_text};
 use crate::state;
 
 /// The messages that may wait for a slow reader.
@@ -149,10 +152,19 @@ struct SampleSubscription {
     timer: Interval,
 }
 
+/// The set-points of axes for other machines.
+#[derive(Debug)]
+struct SetpointSubscription {
+    /// Each axis, and the instant of the last point that was sent.
+    axes: Vec<(AxisIndex, u64)>,
+    timer: Interval,
+}
+
 #[derive(Debug)]
 enum Change {
     Subscribe {
         topics: Vec<Topic>,
+        axis: Option<AxisIndex>,
         interval: Duration,
         words: Vec<usize>,
         /// The first sample to send.
@@ -211,9 +223,10 @@ impl Connection {
             Ok(Op::Subscribe {
                 topics,
                 interval_ms,
+                axis,
                 signals,
             }) => self
-                .subscribe(topics, interval_ms, signals.as_deref())
+                .subscribe(topics, interval_ms, axis.as_deref(), signals.as_deref())
                 .map(|()| Op::Hello { name: None }),
             Ok(Op::Unsubscribe { topics }) => {
                 let _ = self.changes.send(Change::Unsubscribe(topics));
@@ -279,16 +292,30 @@ impl Connection {
         &self,
         topics: Vec<Topic>,
         interval_ms: u64,
+        axis: Option<&str>,
         signals: Option<&[String]>,
     ) -> Result<(), OpError> {
-        if !(10..=10_000).contains(&interval_ms) {
-            let message = format!("`interval_ms` is {interval_ms}: it must be 10 to 10000");
+        let setpoints = topics.contains(&Topic::Setpoints);
+        let range = match setpoints {
+            true => 1..=1_000,
+            false => 10..=10_000,
+        };
+        if !range.contains(&interval_ms) {
+            let (least, most) = (range.start(), range.end());
+            let message = format!("`interval_ms` is {interval_ms}: it must be {least} to {most}");
             return Err(OpError::new(ErrorCode::BadRequest, message));
         }
         self.client.check_read()?;
+        if setpoints != axis.is_some() || setpoints && topics.len() > 1 {
+            let message = "`setpoints` needs an `axis`, and no other topic";
+            return Err(OpError::new(ErrorCode::BadRequest, message)
+                .help("subscribe to other topics with another message"));
+        }
+        let axis = axis.map(|name| self.client.axis(name)).transpose()?;
         let words = signal_words(&self.client.hub.samples, signals)?;
         let _ = self.changes.send(Change::Subscribe {
             topics,
+            axis,
             interval: Duration::from_millis(interval_ms),
             words,
             // The first cycle after the answer belongs to the client.
@@ -321,6 +348,7 @@ async fn publish(
     let mut topics: HashSet<u8> = HashSet::new();
     let mut states: Option<Interval> = None;
     let mut samples: Option<SampleSubscription> = None;
+    let mut setpoints: Option<SetpointSubscription> = None;
     loop {
         let message = tokio::select! {
             biased;
@@ -332,10 +360,11 @@ async fn publish(
                         match topic {
                             Topic::State => states = None,
                             Topic::Samples => samples = None,
+                            Topic::Setpoints => setpoints = None,
                             Topic::Events => {}
                         }
                     },
-                    Some(Change::Subscribe { topics: begun, interval, words, next }) => {
+                    Some(Change::Subscribe { topics: begun, axis, interval, words, next }) => {
                         for topic in begun {
                             topics.insert(topic as u8);
                             match topic {
@@ -345,6 +374,13 @@ async fn publish(
                                     next,
                                     timer: timer(interval),
                                 }),
+                                Topic::Setpoints => {
+                                    let mut axes = setpoints.map_or(Vec::new(), |s| s.axes);
+                                    axes.retain(|(known, _)| Some(*known) != axis);
+                                    axes.extend(axis.map(|axis| (axis, 0)));
+                                    let timer = timer(interval);
+                                    setpoints = Some(SetpointSubscription { axes, timer });
+                                }
                                 Topic::Events => {}
                             }
                         }
@@ -365,6 +401,23 @@ async fn publish(
                 Err(RecvError::Closed) => return,
                 _ => continue,
             },
+            // A set-point that waits is of no use: before all that takes longer.
+            () = tick(&mut setpoints) => {
+                let Some(subscription) = &mut setpoints else { continue };
+                for (axis, last) in &mut subscription.axes {
+                    let point = hub.setpoint(*axis).filter(|point| point.at_ns != *last);
+                    let Some(point) = point else { continue };
+                    if outgoing.max_capacity() - outgoing.capacity() > BACKLOG {
+                        break;
+                    }
+                    *last = point.at_ns;
+                    let message = Outgoing::Object(setpoints_event(&hub, *axis, &point));
+                    if outgoing.send(message).await.is_err() {
+                        return;
+                    }
+                }
+                continue;
+            }
             () = tick(&mut states) => {
                 if outgoing.max_capacity() - outgoing.capacity() > BACKLOG {
                     continue;
@@ -399,6 +452,23 @@ async fn publish(
     }
 }
 
+fn setpoints_event(hub: &Hub, axis: AxisIndex, point: &LineShaftPoint) -> Map<String, Value> {
+    let name = hub.machine.axes.get(axis).map(|axis| &axis.name);
+    let motion = point.motion;
+    let point_object = SetpointPoint {
+        unix_ns: point.at_ns,
+        position: motion.position,
+        velocity: motion.velocity,
+        acceleration: motion.acceleration,
+    };
+    let mut object = Map::new();
+    object.insert("event".to_owned(), json!("setpoints"));
+    object.insert("axis".to_owned(), json!(name));
+    object.insert("stream".to_owned(), json!(stream_text(point.stream)));
+    object.insert("points".to_owned(), json!([point_object]));
+    object
+}
+
 fn timer(period: Duration) -> Interval {
     let mut timer = interval(period);
     timer.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -416,6 +486,12 @@ impl Timer for Interval {
 }
 
 impl Timer for SampleSubscription {
+    fn timer(&mut self) -> &mut Interval {
+        &mut self.timer
+    }
+}
+
+impl Timer for SetpointSubscription {
     fn timer(&mut self) -> &mut Interval {
         &mut self.timer
     }

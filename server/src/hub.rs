@@ -33,9 +33,11 @@ use crate::external::{AreaCounters, StreamPoint};
 use crate::lease::{ClientId, Lease, Owner};
 use crate::sampler::Sampler;
 
+pub use line_shafts::stream_text;
 pub use work::{Outcome, QueuedWork, Transfer, Work};
 use work::{PendingCommand, abandon, finish, stop_all};
 
+mod line_shafts;
 mod published;
 mod work;
 
@@ -178,6 +180,7 @@ pub struct Hub {
     pub topics: Arc<Topics>,
     pub options: HubOptions,
     pub area: Arc<AreaCounters>,
+    setpoints: line_shafts::Setpoints,
     inner: Mutex<Inner>,
     /// The queue, the time or the wanted state has changed.
     work: Condvar,
@@ -214,6 +217,7 @@ impl Hub {
         };
         Self {
             sampler: Sampler::new(samples.layout().signals.len(), machine.bus.cycle_ns),
+            setpoints: line_shafts::Setpoints::new(&machine),
             topics: Arc::new(Topics::new(&machine, epoch(options.virtual_time))),
             machine: Arc::new(machine),
             inner: Mutex::new(Inner {
@@ -264,6 +268,7 @@ impl Hub {
 
     /// Ends whatever a client owned.
     pub fn disconnect(&self, client: ClientId) {
+        self.setpoints.disconnect(client);
         let mut inner = self.lock();
         if let Some(owner) = inner.lease.release(client) {
             self.end_lease(&mut inner, &owner, None, "disconnected");

@@ -35,6 +35,7 @@ pub fn keep_up(hub: &Arc<Hub>, options: &Options, stop: &Arc<CancelToken>, descr
             samples: hub.samples.writer(),
             link: None,
             ethernet: None,
+            setpoints: hub.setpoints(),
         };
         let machine = (*hub.machine).clone();
         let mut observer = Reporter {

@@ -6,7 +6,8 @@ use std::sync::atomic::Ordering;
 use std::task::{Context, Poll, Waker};
 use std::time::{Duration, Instant};
 
-use ecaxis_ecat::index::{AxisIndex, IndexVec};
+use ecaxis_axis::setpoint::LineShaftState;
+use ecaxis_ecat::index::{AxisIndex, IndexVec, LineShaftIndex};
 use ecaxis_master::supervise::operator::{
     Activity, LimitShares, Operator, OperatorInput, Presence, ProgramRequest, Request,
     RequestEvent, View,
@@ -16,6 +17,7 @@ use serde_json::{Map, Value, json};
 use crate::error::{ErrorCode, OpError};
 use crate::external::{AreaStop, ExternalClient, MESSAGES_PER_CYCLE, Message, Report, StreamEnd};
 use crate::hub::{Count, Hub, Latest, QueuedWork, RunningStep, Transfer, Work};
+use crate::state::state_name;
 
 /// The pieces of work that one call takes; the machine accepts 64 requests, and each piece is at
 /// most two.
@@ -36,6 +38,8 @@ pub struct ServerOperator {
     jogs: IndexVec<AxisIndex, u64>,
     /// Faults and trips that were reported.
     troubles: IndexVec<AxisIndex, Option<String>>,
+    /// The states of the line shafts that were reported.
+    line_shafts: IndexVec<LineShaftIndex, LineShaftState>,
     /// Jogs of the last call. They are accepted unless they are refused before the next call.
     new_jogs: Vec<u64>,
     transfers: Vec<(u64, Transfer)>,
@@ -59,6 +63,7 @@ impl ServerOperator {
             commands: HashMap::new(),
             jogs: IndexVec::from(vec![0; axes]),
             troubles: IndexVec::from(vec![None; axes]),
+            line_shafts: vec![LineShaftState::Waiting; hub.machine.line_shafts.len()].into(),
             new_jogs: Vec::new(),
             transfers: Vec::new(),
             published: None,
@@ -259,6 +264,21 @@ impl ServerOperator {
         }
     }
 
+    /// Reports each change of the state of a line shaft.
+    fn report_line_shafts(&mut self, view: &View<'_>) {
+        let shafts = view.snapshot.line_shafts.enumerate();
+        for ((shaft, status), known) in shafts.zip(&mut self.line_shafts) {
+            if std::mem::replace(known, status.state) == status.state {
+                continue;
+            }
+            let runs = status.state == LineShaftState::Running;
+            self.hub.event(json!({
+                "event": "line_shaft", "name": self.hub.machine.line_shaft_name(shaft),
+                "state": state_name(status.state), "why": (!runs).then(|| status.end.to_string()),
+            }));
+        }
+    }
+
     fn take_work(&mut self, view: &View<'_>) -> Vec<Request> {
         let mut requests = Vec::new();
         // The rest of the queue is for stops.
@@ -407,6 +427,7 @@ impl Operator for ServerOperator {
         self.take_reports();
         self.poll_transfers();
         self.report_troubles(view);
+        self.report_line_shafts(view);
         self.hub.expire_lease();
         let requests = self.take_work(view);
         OperatorInput {

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::atomic::Ordering;
 
+use ecaxis_axis::setpoint::LineShaftState;
 use ecaxis_axis::{AxisStatus, Controlword, Mode, Statusword};
 use ecaxis_ecat::al_status_code::al_status_text;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
@@ -15,12 +16,14 @@ use ecaxis_master::link::redundant::{RingState, RingStatus};
 use ecaxis_master::report::events::describe_stop;
 use ecaxis_master::rt::common_time::CommonTimeStatus;
 use ecaxis_master::rt::exchange::{DiagnosticRegister, SubDeviceDiagnostics};
+use ecaxis_master::rt::line_shaft::LineShaftStatus;
 use ecaxis_master::rt::overrides::Override;
 use ecaxis_master::rt::samples::CYCLE_COLUMNS;
 use ecaxis_master::supervise::operator::MAX_MANUAL_SPEED;
 use serde_json::{Map, Value, json};
 
-use crate::hub::{Hub, Latest};
+use crate::hub::{Hub, Latest, stream_text};
+use crate::lease::ClientId;
 
 /// Returns the object `machine`.
 #[must_use]
@@ -54,6 +57,12 @@ pub fn machine(hub: &Hub) -> Value {
         input["input"] = json!(name);
         input
     });
+    let line_shafts = machine.line_shafts.iter().map(|setup| {
+        let config = &setup.config;
+        json!({"name": setup.name, "unit": setup.unit, "velocity": config.velocity,
+               "acceleration": config.acceleration, "timeout_s": config.timeout_s,
+               "smoothing_s": config.smoothing_s, "max_error": config.max_error})
+    });
     let steps = machine.steps.iter().enumerate().map(|(index, step)| {
         json!({"number": (index + 1).to_string(), "line": step.line,
                "text": machine.describe_step(step)})
@@ -73,6 +82,7 @@ pub fn machine(hub: &Hub) -> Value {
         "outputs": hub.outputs.iter().map(|(_, output)| signal(output)).collect::<Vec<_>>(),
         "sim_inputs": sim_inputs.collect::<Vec<_>>(),
         "steps": steps.collect::<Vec<_>>(),
+        "line_shafts": line_shafts.collect::<Vec<_>>(),
         "samples": hub.samples.layout(),
     })
 }
@@ -191,6 +201,10 @@ pub fn state(hub: &Hub) -> Value {
         .zip(hub.sampler.percentiles())
         .map(|(name, percentiles)| (name.to_owned(), json!(percentiles)))
         .collect();
+    let line_shafts = machine.line_shafts.enumerate().map(|(index, setup)| {
+        let status = latest.and_then(|latest| latest.snapshot.line_shafts.get(index));
+        line_shaft_state(&setup.name, status, hub.feeder(index))
+    });
     let count = |counter: &std::sync::atomic::AtomicU64| counter.load(Ordering::Relaxed);
     let time = latest.map(|latest| latest.snapshot.time);
     json!({
@@ -212,6 +226,7 @@ pub fn state(hub: &Hub) -> Value {
         "inputs": inputs.collect::<Vec<_>>(),
         "outputs": outputs.collect::<Vec<_>>(),
         "timing": timing,
+        "line_shafts": line_shafts.collect::<Vec<_>>(),
         "area": {
             "attached": count(&hub.area.attached) != 0,
             "used": count(&hub.area.used),
@@ -253,6 +268,37 @@ fn bus_state(hub: &Hub, latest: Option<&Latest>) -> Value {
         }
     }
     Value::Object(bus)
+}
+
+fn line_shaft_state(
+    name: &str,
+    status: Option<&LineShaftStatus>,
+    feeder: Option<ClientId>,
+) -> Value {
+    let status = status.copied().unwrap_or_default();
+    let runs = status.state == LineShaftState::Running;
+    let moves = status.state != LineShaftState::Waiting;
+    json!({
+        "name": name,
+        "state": state_name(status.state),
+        "why": (!runs).then(|| status.end.to_string()),
+        "position": moves.then_some(status.motion.position),
+        "velocity": moves.then_some(status.motion.velocity),
+        "age_ns": status.age_ns,
+        "error": runs.then_some(status.error),
+        "stream": runs.then(|| stream_text(status.newest.stream)),
+        "client": feeder,
+    })
+}
+
+/// Returns the name of the state of a line shaft in the protocol.
+#[must_use]
+pub fn state_name(state: LineShaftState) -> &'static str {
+    match state {
+        LineShaftState::Waiting => "waiting",
+        LineShaftState::Running => "running",
+        LineShaftState::Stopping => "stopping",
+    }
 }
 
 fn common_time(common: &CommonTimeStatus) -> Value {

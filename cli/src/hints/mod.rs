@@ -215,6 +215,8 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
             return Failure { hints: self::failure(cause, nic).hints, ..failure };
         }
         Cause::FollowLost { cause: None, .. } => "keep the followed axis under power and within what the follower's limits and range allow".to_owned(),
+        Cause::LineShaftWaits { .. } => "start the step when `line_shafts` of the server's state shows \"running\"".to_owned(),
+        Cause::LineShaftEnded { .. } => "restore the stream of set-points, then `reset`, `enable` and start the program again".to_owned(),
         Cause::EnableRefused { .. } => "`reset` the axis first, or look at what stopped it".to_owned(),
         Cause::GroupStopped { cause, .. } => {
             let cause = self::failure(cause, nic).hints.into_iter();

@@ -14,6 +14,7 @@ use super::duration::show;
 use super::eoe;
 use super::fields::KeyExt;
 use super::gantry;
+use super::line_shaft;
 use super::mailbox_gateway;
 use super::needed;
 use super::optional::OptionalPlaces;
@@ -114,6 +115,8 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         })
         .collect();
     let cams = cam::check(&raw.cams, folder, p);
+    let cycle_ns = bus.as_ref().map_or(0, |b| b.cycle_ns);
+    let line_shafts = line_shaft::check(&raw.line_shafts, (&devices, &axes), cycle_ns, p);
     let mut tables = Vec::new();
     let cycle_s = bus.as_ref().map_or(1e-3, |b| b.cycle_ns as f64 * 1e-9);
     let paths = path::check(&raw.paths, &axes, folder, cycle_s, &mut tables, p);
@@ -126,6 +129,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         cycle_s,
         gantries: &gantries,
         cams: &cams,
+        line_shafts: &line_shafts,
         paths: &paths,
         tables: &tables,
     };
@@ -198,6 +202,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         axes: axes.into(),
         gantries: gantries.iter().map(|gantry| gantry.config).collect(),
         cams,
+        line_shafts,
         steps: program.steps,
         inputs: program.inputs,
         outputs: program.outputs,

@@ -64,7 +64,7 @@ fn document_lists_every_key() {
 
 /// The tables of the schema that a section of the document describes.
 #[rustfmt::skip] // one row per section
-const SECTIONS: [(&str, &str); 19] = [
+const SECTIONS: [(&str, &str); 20] = [
     ("[bus]", "/properties/bus"),
     ("[[device]]", "/properties/device/items"),
     ("[device.axis]", "/definitions/axis"),
@@ -79,6 +79,7 @@ const SECTIONS: [(&str, &str); 19] = [
     ("[[device.node]]", "/properties/device/items/properties/node/items"),
     ("[device.sim]", "/properties/device/items/properties/sim"),
     ("[[copy]]", "/properties/copy/items"),
+    ("[[line_shaft]]", "/properties/line_shaft/items"),
     ("[stop]", "/properties/stop"),
     ("[override]", "/properties/override"),
     ("[server]", "/properties/server"),

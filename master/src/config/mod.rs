@@ -10,6 +10,7 @@
 //! | `check.rs` | raw → [`Machine`]: bus, names, positions |
 //! | `position_output.rs` | outputs that follow the position of an axis |
 //! | `cam.rs`, `path.rs`, `csv.rs` | cams, paths, and files with rows of numbers |
+//! | `line_shaft.rs` | master axes on other machines |
 //! | `compensation.rs` | backlash and pitch error of an axis |
 //! | `second_encoder.rs` | the encoder at the load of an axis |
 //! | `copy.rs` | inputs that are copied to outputs |
@@ -59,6 +60,7 @@ mod eoe;
 mod fields;
 mod gantry;
 mod gateway;
+mod line_shaft;
 mod locator;
 mod mailbox_gateway;
 mod needed;
@@ -96,6 +98,7 @@ pub use drive_limits::LimitConflict;
 pub use drive_units::{AdoptedUnits, UnitProblem};
 pub use eoe::{EoeSetup, TapSetup};
 pub use gateway::{GatewaySetup, NodeSetup};
+pub use line_shaft::LineShaftSetup;
 pub use locator::{Locator, SegmentHead};
 pub use mailbox_gateway::MailboxGatewaySetup;
 pub use position_output::PositionOutputSetup;
@@ -109,7 +112,7 @@ pub use startup::{Startup, StartupOptions};
 pub use state_timeouts::StateTimeouts;
 pub use units::si_factor;
 
-use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec, LineShaftIndex};
 use ecaxis_esi as esi;
 
 pub(crate) use fields::LARGEST;
@@ -149,6 +152,7 @@ pub struct Machine {
     pub gantries: Vec<GantryConfig>,
     /// The cams, by index in [`Action::Gear`].
     pub cams: Vec<NamedCam>,
+    pub line_shafts: IndexVec<LineShaftIndex, LineShaftSetup>,
     pub steps: Vec<Step>,
     /// The signals that the steps read; `outputs` are those they set.
     pub inputs: Vec<Signal>,
@@ -450,6 +454,7 @@ impl Machine {
             overrides: self.overrides.clone(),
             gantries: self.gantries.clone(),
             cams: self.cams.iter().map(|named| named.cam.clone()).collect(),
+            line_shafts: self.line_shafts.iter().map(|setup| setup.shaft).collect(),
             copies: self.copies.iter().map(CopySetup::rt).collect(),
             repeats: device::repeats(&self.devices),
         }

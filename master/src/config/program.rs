@@ -8,6 +8,8 @@ pub use variables::{NumberPlace, Variable, VariableRef, VariableUse};
 use ecaxis_axis::{AxisStatus, Edge, StopMethod};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex};
 
+use crate::rt::setpoint_generator::GearMaster;
+
 use super::{AxisSetup, Bounds, Condition, GroupStopScope, InputRef, OutputRef, Signal};
 
 /// One step of the program.
@@ -97,12 +99,10 @@ pub enum Action {
         speed: f64,
         ramp: f64,
     },
-    /// Make one axis follow another until its next motion.
+    /// Make one axis follow another, or a line shaft, until its next motion.
     Gear {
         axis: AxisIndex,
-        master: AxisIndex,
-        /// `true` to follow the master's actual position instead of its set-point.
-        actual: bool,
+        master: GearMaster,
         /// The number of follower units per master unit.
         ratio: f64,
         /// The follower's position at master position 0. `None`: the present relation stays.

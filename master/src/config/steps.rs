@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec, LineShaftIndex};
 use toml::Spanned;
 
 mod cams;
@@ -30,8 +30,8 @@ use super::raw::{
 };
 use super::subprograms::MOST_STEPS;
 use super::{
-    Action, AxisSetup, DeviceConfig, NamedCam, NamedSignal, NumberPlace, OverrideConfig,
-    ProgramInputs, Signal, Step, StopSetup, SwitchedInput, Variable, VariableUse,
+    Action, AxisSetup, DeviceConfig, LineShaftSetup, NamedCam, NamedSignal, NumberPlace,
+    OverrideConfig, ProgramInputs, Signal, Step, StopSetup, SwitchedInput, Variable, VariableUse,
 };
 use crate::rt::gantry::GantryConfig;
 use ecaxis_axis::Mode;
@@ -79,6 +79,7 @@ pub(crate) struct Resolved<'c> {
     pub cycle_s: f64,
     pub gantries: &'c [CheckedGantry],
     pub cams: &'c [NamedCam],
+    pub line_shafts: &'c IndexVec<LineShaftIndex, LineShaftSetup>,
     /// The paths, with indices into `tables`.
     pub paths: &'c [NamedPath],
     pub tables: &'c [Table],
@@ -123,6 +124,7 @@ pub(crate) fn check(
         cycle_s: known.cycle_s,
         gantries: known.gantries.iter().map(|gantry| gantry.config).collect(),
         cams: known.cams,
+        line_shafts: known.line_shafts,
         paths: known.paths,
         tables: known.tables.to_vec(),
         inputs: Vec::new(),
@@ -182,6 +184,7 @@ struct ProgramChecker<'c> {
     cycle_s: f64,
     gantries: Vec<GantryConfig>,
     cams: &'c [NamedCam],
+    line_shafts: &'c IndexVec<LineShaftIndex, LineShaftSetup>,
     paths: &'c [NamedPath],
     tables: Vec<Table>,
     inputs: Vec<Signal>,

@@ -5,6 +5,7 @@ use std::fmt;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
+use ecaxis_axis::setpoint::LineShaftEnd;
 use ecaxis_axis::{CommandError, Mode, State, Statusword, Trip};
 
 use crate::config::{LimitConflict, UnitProblem};
@@ -394,6 +395,10 @@ pub enum Cause {
         #[source]
         cause: Option<Arc<Error>>,
     },
+    #[error("cannot follow the line shaft `{name}`, which does not run: {end}")]
+    LineShaftWaits { name: String, end: LineShaftEnd },
+    #[error("has stopped with the line shaft `{name}`: {end}")]
+    LineShaftEnded { name: String, end: LineShaftEnd },
     #[error("is not enabled: {reason}")]
     EnableRefused { reason: String },
     #[error("stopped with its group `{group}`: {cause}")]
@@ -544,6 +549,7 @@ impl Error {
                 | Cause::DriveFault { .. }
                 | Cause::Trip { .. }
                 | Cause::FollowLost { .. }
+                | Cause::LineShaftEnded { .. }
                 | Cause::NodeLost { .. }
                 | Cause::EmergencyStop { .. }
                 | Cause::Controller

@@ -1,7 +1,7 @@
 //! The only paths into and out of the real-time thread: bounded and wait-free.
 
 use ecaxis_axis::{AxisStatus, Command, CommandError};
-use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec, LineShaftIndex};
 
 use super::bus_monitor::StopCause;
 use super::common_time::CommonTimeStatus;
@@ -9,6 +9,7 @@ use super::controller::OutputRef;
 use super::cycle::StartState;
 use super::exchange::SubDeviceDiagnostics;
 use super::heartbeat::Heartbeat;
+use super::line_shaft::LineShaftStatus;
 use super::reaction_group::GroupStatus;
 use super::setpoint_generator::{GeneratorRequest, GeneratorState};
 use super::stats::Counters;
@@ -165,6 +166,7 @@ pub struct Snapshot {
     pub al_status: Option<(u8, u16)>,
     pub axes: IndexVec<AxisIndex, AxisStatus>,
     pub generators: IndexVec<AxisIndex, GeneratorState>,
+    pub line_shafts: IndexVec<LineShaftIndex, LineShaftStatus>,
     /// The program's input signals, in the order of [`super::cycle::Signals::inputs`]. Each value
     /// is from the last cycle in which it was fresh.
     pub inputs: Vec<f64>,

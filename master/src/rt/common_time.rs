@@ -354,6 +354,28 @@ impl CommonTime {
         Some(common.saturating_sub(after))
     }
 
+    /// Returns the common time at which set-points take effect that a cycle with this planned
+    /// release stages: they leave with the next frame, and the pulse of SYNC0 after it takes them.
+    /// Without distributed clocks it is that next release. `None`: common time is not locked.
+    #[must_use]
+    pub fn effect_of(&self, release: Nanos) -> Option<u64> {
+        if !self.locked() {
+            return None;
+        }
+        let next = self.pulse_before(release.saturating_add(self.cycle as Nanos))?;
+        let Some(plan) = self.plan else {
+            return Some(next);
+        };
+        let pulse = next.saturating_add(plan.cycle_ns);
+        // The release has the jitter of the phase controller. The line knows the pulses better.
+        let passed = release.saturating_sub(self.last.1) as f64 + 2.0 * self.cycle;
+        let phase = (pulse % plan.cycle_ns.max(1)) as f64;
+        let off = phase - self.sync0(&plan) - self.line.rate * passed;
+        let half = self.cycle / 2.0;
+        let off = (off + half).rem_euclid(self.cycle) - half;
+        Some(pulse.saturating_add_signed(-off.round() as i64))
+    }
+
     #[must_use]
     pub fn status(&self) -> CommonTimeStatus {
         let alignment = self.plan.filter(|plan| plan.align).map(|plan| {

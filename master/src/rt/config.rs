@@ -1,7 +1,7 @@
 //! The settings of the cycle, as plain data.
 
 use ecaxis_axis::StopMethod;
-use ecaxis_axis::setpoint::Cam;
+use ecaxis_axis::setpoint::{Cam, LineShaft};
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 
 use super::controller::InputRef;
@@ -35,6 +35,8 @@ pub struct RtConfig {
     pub overrides: OverrideConfig,
     pub gantries: Vec<GantryConfig>,
     pub cams: Vec<Cam>,
+    /// The line shafts as they begin.
+    pub line_shafts: Vec<LineShaft>,
     /// Inputs that are copied to outputs in every cycle.
     pub copies: Vec<ProcessDataCopy>,
     /// Outputs that repeat other outputs of their device.

@@ -3,7 +3,7 @@
 use std::panic::AssertUnwindSafe;
 
 use ecaxis_axis::setpoint::Table;
-use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec, LineShaftIndex};
 
 use super::axis::RtAxis;
 use super::bus_monitor::{BusMonitor, StopCause};
@@ -18,11 +18,13 @@ use super::gantry::Gantry;
 use super::gateway::{Gateway, NodeState};
 use super::heartbeat;
 use super::image::SignalBits;
+use super::line_shaft::{self, AxisSetpoints, LineShaftStatus, RtLineShaft};
 use super::overrides::Overrides;
 use super::phase::Phase;
 use super::position_output::PositionOutput;
 use super::reaction_group::{GroupStatus, ReactionGroup};
 use super::samples::{CycleSample, SampleWriter, flags};
+use super::setpoint_cell::SetpointCells;
 use super::setpoint_generator::GeneratorState;
 use super::spin::SpinWindow;
 use super::stats::Stats;
@@ -71,6 +73,11 @@ pub struct Engine {
     /// The controller panicked and is no longer called.
     panicked: bool,
     tables: Box<[Table]>,
+    line_shafts: IndexVec<LineShaftIndex, RtLineShaft>,
+    /// The set-points of the axes for other machines; empty: none need them.
+    setpoints: Box<[AxisSetpoints]>,
+    /// The common time at which the set-points of this cycle take effect, if it is locked.
+    effect_at: Option<u64>,
     finished: bool,
     phase: Option<Phase>,
     common: CommonTime,
@@ -126,6 +133,7 @@ pub struct EngineConfig {
     pub controller: Option<Box<dyn Controller>>,
     pub samples: Option<SampleWriter>,
     pub tables: Box<[Table]>,
+    pub setpoints: SetpointCells,
     pub phase: Option<Phase>,
     pub common: CommonTime,
     pub end: RtEndpoint,
@@ -189,6 +197,9 @@ impl Engine {
             controller: parts.controller,
             panicked: false,
             tables: parts.tables,
+            line_shafts: line_shaft::shafts(&config.line_shafts, &parts.setpoints),
+            setpoints: line_shaft::axis_setpoints(&parts.setpoints),
+            effect_at: None,
             finished: false,
             phase: parts.phase,
             common: parts.common,
@@ -341,21 +352,6 @@ impl Engine {
         }
     }
 
-    /// Reports restarts of devices to their axes. Their groups have stopped. RT: O(devices × axes)
-    /// while a device returns, else O(devices).
-    fn take_restarts(&mut self) {
-        for device in self.exchange.device_answers().indices() {
-            if let Some(same) = self.exchange.take_restart(device) {
-                let own = self.axes.iter_mut().filter(|slot| slot.device == device);
-                own.for_each(|slot| slot.axis.restarted(same));
-                let at =
-                    |slot: &&mut RtAxis| slot.second_encoder.is_some_and(|(_, at)| at == device);
-                let encoders = self.axes.iter_mut().filter(at);
-                encoders.for_each(|slot| slot.axis.restart_second_encoder());
-            }
-        }
-    }
-
     fn observe(&mut self) {
         self.observe_gateways();
         let image = self.exchange.inputs();
@@ -437,6 +433,7 @@ impl Engine {
             self.window = self.next + flight_recorder::COUNTER_WINDOW;
             self.exchange.begin_windows();
         }
+        self.publish_setpoints();
         let stopping = self.stopping();
         let stop_ended = stopping.is_some() && self.stop_ended();
         let mut stops = self.groups.iter().filter_map(ReactionGroup::stop);
@@ -462,6 +459,9 @@ impl Engine {
         }
         for (to, slot) in snapshot.generators.iter_mut().zip(&self.axes) {
             *to = slot.generator.state();
+        }
+        for (to, slot) in snapshot.line_shafts.iter_mut().zip(&self.line_shafts) {
+            *to = LineShaftStatus::new(&slot.shaft, self.effect_at);
         }
         snapshot.late_wake_ups = self.late_wake_ups;
         snapshot.finished = self.finished;
@@ -520,7 +520,8 @@ impl Engine {
                 work: self.work,
                 next: self.next + self.config.cycle_ns,
             };
-            samples.write(&sample, &snapshot.axes, &snapshot.inputs);
+            let (axes, inputs) = (&snapshot.axes, &snapshot.inputs);
+            samples.write(&sample, axes, inputs, &snapshot.line_shafts);
         }
         self.end.snapshots.publish();
     }
@@ -560,7 +561,7 @@ impl Engine {
 )]
 pub fn first_snapshot(
     axes: &[RtAxis],
-    groups: usize,
+    (groups, line_shafts): (usize, usize),
     signals: &Signals,
     devices: usize,
 ) -> Snapshot {
@@ -574,6 +575,7 @@ pub fn first_snapshot(
         al_status: None,
         axes: axes.iter().map(|slot| slot.axis.status()).collect(),
         generators: vec![GeneratorState::None; axes.len()].into(),
+        line_shafts: vec![LineShaftStatus::default(); line_shafts].into(),
         inputs: vec![0.0; signals.inputs.len()],
         late_wake_ups: 0,
         finished: false,

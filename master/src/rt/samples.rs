@@ -8,7 +8,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering, fence};
 
 use ecaxis_axis::AxisStatus;
+use ecaxis_axis::setpoint::LineShaftState;
 
+use super::line_shaft::LineShaftStatus;
 use crate::clock::Nanos;
 
 /// Word 0 of the header, as bytes.
@@ -62,6 +64,15 @@ pub const AXIS_COLUMNS: [(&str, &str); 11] = [
     ("controlword", "bits"),
     ("mode", "code"),
     ("encoder_difference", ""),
+];
+
+/// The numbers of a line shaft (f64), behind the inputs; units as those of an axis. NaN: it does not
+/// run.
+pub const LINE_SHAFT_COLUMNS: [(&str, &str); 4] = [
+    ("position", ""),
+    ("velocity", "/s"),
+    ("age", "s"),
+    ("error", ""),
 ];
 
 /// Bits of the flags.
@@ -136,7 +147,13 @@ impl SampleWriter {
     }
 
     /// Writes one row. Values beyond the row's length are left out. RT.
-    pub fn write(&mut self, cycle: &CycleSample, axes: &[AxisStatus], inputs: &[f64]) {
+    pub fn write(
+        &mut self,
+        cycle: &CycleSample,
+        axes: &[AxisStatus],
+        inputs: &[f64],
+        line_shafts: &[LineShaftStatus],
+    ) {
         let words = (*self.memory).as_ref();
         // Below `rows`, which fits the memory.
         let slot = usize::try_from(self.written % self.rows).unwrap_or(0);
@@ -176,6 +193,9 @@ impl SampleWriter {
         for input in inputs {
             put(input.to_bits());
         }
+        for value in line_shafts.iter().flat_map(line_shaft_values) {
+            put(value.to_bits());
+        }
         self.written += 1;
         number.store(self.written, Ordering::Release);
         if let (Some(written), Some(next)) =
@@ -201,6 +221,19 @@ fn axis_values(axis: &AxisStatus) -> [f64; AXIS_COLUMNS.len()] {
         f64::from(axis.controlword),
         f64::from(axis.mode.code()),
         axis.encoder_difference.unwrap_or(f64::NAN),
+    ]
+}
+
+/// The values in the order of [`LINE_SHAFT_COLUMNS`].
+fn line_shaft_values(shaft: &LineShaftStatus) -> [f64; LINE_SHAFT_COLUMNS.len()] {
+    if shaft.state == LineShaftState::Waiting {
+        return [f64::NAN; LINE_SHAFT_COLUMNS.len()];
+    }
+    [
+        shaft.motion.position,
+        shaft.motion.velocity,
+        shaft.age_ns.map_or(f64::NAN, |ns| ns as f64 * 1e-9),
+        shaft.error,
     ]
 }
 

@@ -7,11 +7,11 @@
 
 use ecaxis_axis::group::LinePath;
 use ecaxis_axis::setpoint::{
-    self, Cam, Gear, GearConfig, GearInMode, Goal, JerkLimited, Motion, Playback, PositionWave,
-    RateCourse, Setpoint, SetpointError, Table,
+    self, Cam, Gear, GearConfig, GearInMode, Goal, JerkLimited, LineShaftEnd, Motion, Playback,
+    PositionWave, RateCourse, Setpoint, SetpointError, Table,
 };
 use ecaxis_axis::{Axis, AxisStatus, Command, CommandError, HomingStatus};
-use ecaxis_ecat::index::AxisIndex;
+use ecaxis_ecat::index::{AxisIndex, LineShaftIndex};
 
 use super::overrides::Rates;
 
@@ -31,15 +31,35 @@ pub enum GeneratorRequest {
         table: usize,
         playback: Playback,
     },
-    /// The motion of another axis.
+    /// The motion of another axis or of a line shaft.
     Gear {
-        master: AxisIndex,
-        /// True for the master's reported position, false for its set-point.
-        actual: bool,
+        master: GearMaster,
         /// The cam between both.
         cam: Option<CamRef>,
         config: GearConfig,
     },
+}
+
+/// What a gear follows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum GearMaster {
+    Axis {
+        axis: AxisIndex,
+        /// True for the master's reported position, false for its set-point.
+        actual: bool,
+    },
+    LineShaft(LineShaftIndex),
+}
+
+impl GearMaster {
+    /// Returns the followed axis of this machine.
+    #[must_use]
+    pub const fn axis(self) -> Option<AxisIndex> {
+        match self {
+            Self::Axis { axis, .. } => Some(axis),
+            Self::LineShaft(_) => None,
+        }
+    }
 }
 
 /// A cam and the way on it per way of the master.
@@ -71,8 +91,7 @@ enum Source {
         playback: Playback,
     },
     Gear {
-        master: AxisIndex,
-        actual: bool,
+        master: GearMaster,
         cam: Option<CamRef>,
         gear: Gear,
     },
@@ -109,6 +128,11 @@ pub enum GeneratorError {
     Ring,
     #[error("the followed axis has no power or is homing")]
     NoMaster,
+    #[error("the line shaft does not run: {end}")]
+    LineShaft {
+        shaft: LineShaftIndex,
+        end: LineShaftEnd,
+    },
     /// Of time-based sources only. A line continues where it was interrupted, but points in time
     /// are past.
     #[error("lost frames delayed the axis, and the time of its set-points is past")]
@@ -192,24 +216,20 @@ impl SetpointGenerator {
         self.source.is_some()
     }
 
-    /// Starts a source. `master` is the motion of the gear's master. `ring` is true if the master
-    /// follows this axis. `rate` is the override of the axis. RT: O(1).
+    /// Starts a source. `master` is the motion of the gear's master. `rate` is the override of the
+    /// axis. RT: O(1).
     pub fn begin(
         &mut self,
         start: GeneratorRequest,
         axis: &AxisStatus,
-        master: Option<Motion>,
-        ring: bool,
+        master: Result<Motion, GeneratorError>,
         rate: f64,
     ) {
         self.slipping_s = 0.0;
-        if ring || (matches!(start, GeneratorRequest::Gear { .. }) && master.is_none()) {
-            self.fail(match ring {
-                true => GeneratorError::Ring,
-                false => GeneratorError::NoMaster,
-            });
-            return;
-        }
+        let master = match master {
+            Ok(master) => master,
+            Err(error) => return self.fail(error),
+        };
         let source = match start {
             GeneratorRequest::Line { along, first } => Ok(Source::Single {
                 source: setpoint::Source::Line(along),
@@ -226,17 +246,13 @@ impl SetpointGenerator {
             }),
             GeneratorRequest::Table { table, playback } => Ok(Source::Table { table, playback }),
             GeneratorRequest::Gear {
-                master: index,
-                actual,
+                master: of,
                 cam,
                 config,
-            } => Gear::new(config, master.unwrap_or_default(), commanded(axis)).map(|gear| {
-                Source::Gear {
-                    master: index,
-                    actual,
-                    cam,
-                    gear,
-                }
+            } => Gear::new(config, master, commanded(axis)).map(|gear| Source::Gear {
+                master: of,
+                cam,
+                gear,
             }),
         };
         self.superimposed = None;
@@ -315,21 +331,19 @@ impl SetpointGenerator {
         }
     }
 
-    /// Returns the index of the followed axis, and whether its reported values are followed.
+    /// Returns what the axis follows, and the cam between both.
     #[must_use]
-    pub fn master(&self) -> Option<(AxisIndex, bool)> {
+    pub fn master(&self) -> Option<(GearMaster, Option<CamRef>)> {
         match self.source {
-            Some(Source::Gear { master, actual, .. }) => Some((master, actual)),
+            Some(Source::Gear { master, cam, .. }) => Some((master, cam)),
             _ => None,
         }
     }
 
-    /// Returns the cam between the followed axis and this one.
-    pub(super) fn cam(&self) -> Option<CamRef> {
-        match self.source {
-            Some(Source::Gear { cam, .. }) => cam,
-            _ => None,
-        }
+    /// Returns the followed axis of this machine.
+    #[must_use]
+    pub fn followed(&self) -> Option<AxisIndex> {
+        self.master()?.0.axis()
     }
 
     /// Shifts a follower against its master. RT: O(1).
@@ -426,21 +440,25 @@ impl SetpointGenerator {
     }
 
     /// Gives the axis this cycle's set-point; call it between the axis' `observe` and `act`.
-    /// Returns true if the source has just ended without a command. RT: O(1).
+    /// `master` is the motion of its master. Returns true if the source has just ended without a
+    /// command. RT: O(1).
     pub fn advance(
         &mut self,
         axis: &mut Axis,
-        master: Option<Motion>,
+        master: Result<Motion, GeneratorError>,
         rates: Rates,
         dt_s: f64,
     ) -> bool {
         let Some(mut source) = self.source else {
             return false;
         };
-        if self.master().is_some() && master.is_none() {
-            self.fail(GeneratorError::NoMaster);
-            return true;
-        }
+        let master = match master {
+            Ok(master) => master,
+            Err(error) => {
+                self.fail(error);
+                return true;
+            }
+        };
         if let Some([velocity, acceleration]) = self.continues_at() {
             self.end();
             let ramp = (acceleration / axis.config().limits.acceleration).min(1.0);
@@ -475,7 +493,7 @@ impl SetpointGenerator {
             }
             Source::Gear { gear, .. } => {
                 gear.set_rate(rates.own.min(1.0), dt_s);
-                let next = gear.advance(master.unwrap_or_default(), before, dt_s);
+                let next = gear.advance(master, before, dt_s);
                 let state = if gear.engaged() {
                     GeneratorState::Engaged
                 } else {
@@ -501,7 +519,10 @@ impl SetpointGenerator {
             }
         }
         let timeout = match source {
-            Source::Gear { actual: true, .. } => SLIP_ACTUAL_S,
+            Source::Gear {
+                master: GearMaster::Axis { actual: true, .. },
+                ..
+            } => SLIP_ACTUAL_S,
             _ => SLIP_S,
         };
         if self.slipping_s > timeout {

@@ -66,6 +66,7 @@ impl Rig {
         };
         self.axis.observe(&inputs, DT);
         self.before = self.axis.status().target_position;
+        let master = Ok(master.unwrap_or_default());
         let _ = self
             .generator
             .advance(&mut self.axis, master, Rates::WHOLE, DT);
@@ -75,7 +76,8 @@ impl Rig {
 
     fn begin(&mut self, start: GeneratorRequest, master: Option<Motion>) {
         let status = self.axis.status();
-        self.generator.begin(start, &status, master, false, 1.0);
+        let master = Ok(master.unwrap_or_default());
+        self.generator.begin(start, &status, master, 1.0);
     }
 
     fn part(&self, target: f64, speed: f64) -> LineAxis {
@@ -145,8 +147,10 @@ fn six_axes_on_lines_there_and_back_arrive_in_the_same_cycle() {
 fn a_gear_follows_within_the_same_cycle_and_ends_with_a_command() {
     let (mut master, mut follower) = (Rig::new(250.0), Rig::new(250.0));
     let start = GeneratorRequest::Gear {
-        master: AxisIndex(0),
-        actual: false,
+        master: GearMaster::Axis {
+            axis: AxisIndex(0),
+            actual: false,
+        },
         cam: None,
         config: GearConfig {
             ratio: -0.5,

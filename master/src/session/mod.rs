@@ -24,6 +24,7 @@ use crate::post_mortem::FaultReport;
 use crate::rt::controller::Controller;
 use crate::rt::cycle::EngineReport;
 use crate::rt::samples::SampleWriter;
+use crate::rt::setpoint_cell::SetpointCells;
 use crate::rt::stats::Stats;
 use crate::supervise::operator::{self, Operator};
 use crate::supervise::{ProgramControl, Supervisor};
@@ -136,6 +137,8 @@ pub struct Attachments {
     pub control: Arc<ProgramControl>,
     /// The interface at the virtual switch in place of the file's `tap`.
     pub ethernet: Option<Box<dyn EthernetInterface>>,
+    /// The set-points of the axes for other machines, and those of other machines.
+    pub setpoints: SetpointCells,
 }
 
 /// Runs a machine until its program, its time limit, `stop` ([`stop_on_signals`]) or an error ends

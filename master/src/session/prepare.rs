@@ -122,7 +122,7 @@ impl RunBuilder<'_> {
                 let members: Vec<_> = members.collect();
                 let (rt_end, outer) = channel(&first_snapshot(
                     &slots,
-                    config.groups.len(),
+                    (config.groups.len(), config.line_shafts.len()),
                     &signals,
                     members.len(),
                 ));
@@ -150,6 +150,7 @@ impl RunBuilder<'_> {
                     link: _,
                     control,
                     ethernet,
+                    setpoints,
                 } = attachments;
                 let sim_inputs = link.take_sim_inputs();
                 let controlled = controller.is_some();
@@ -165,6 +166,7 @@ impl RunBuilder<'_> {
                     controller,
                     samples,
                     tables: machine.tables.clone().into(),
+                    setpoints,
                     phase: bus.dc.as_ref().map(Phase::new),
                     common: CommonTime::new(machine.bus.cycle_ns, bus.dc.as_ref()),
                     end: rt_end,

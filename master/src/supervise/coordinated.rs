@@ -11,9 +11,11 @@ use ecaxis_ecat::index::AxisIndex;
 use super::program::{Settling, TargetKind, Turn};
 use crate::clock::{self, Nanos};
 use crate::config::Step;
-use crate::report::Error;
+use crate::report::{Cause, Error};
 use crate::rt::channel::RtCommand;
-use crate::rt::setpoint_generator::{CamRef, GeneratorRequest, GeneratorState, commanded};
+use crate::rt::setpoint_generator::{
+    CamRef, GearMaster, GeneratorError, GeneratorRequest, GeneratorState, commanded,
+};
 
 /// The timeout in ns for a follower to catch up.
 const ENGAGE_TIMEOUT: Nanos = 30_000_000_000;
@@ -124,13 +126,12 @@ impl Turn<'_, '_> {
         &mut self,
         step: &Step,
         start: Nanos,
-        [axis, master]: [AxisIndex; 2],
-        (actual, cam): (bool, Option<CamRef>),
+        axis: AxisIndex,
+        (master, cam): (GearMaster, Option<CamRef>),
         config: GearConfig,
     ) -> Result<(), Error> {
         let generator = GeneratorRequest::Gear {
             master,
-            actual,
             cam,
             config,
         };
@@ -247,6 +248,11 @@ impl Turn<'_, '_> {
             let mut late = None;
             for &axis in axes {
                 match snapshot.generators[axis] {
+                    GeneratorState::Failed(GeneratorError::LineShaft { shaft, end }) => {
+                        let name = this.machine.line_shaft_name(shaft).to_owned();
+                        let cause = Cause::LineShaftWaits { name, end };
+                        return Err(cause.with_device(this.device_of(axis)).with_step(step));
+                    }
                     GeneratorState::Failed(error) => return Err(this.refusal(step, axis, &error)),
                     // Another command has taken over the axis.
                     GeneratorState::None => {}

@@ -16,7 +16,7 @@ use crate::post_mortem::{DeviceSnapshot, Witnessed};
 use crate::report::{Cause, DriveReport, Error, Progress, SercosDiagnosis};
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::{RtCommand, Snapshot};
-use crate::rt::setpoint_generator::GeneratorState;
+use crate::rt::setpoint_generator::{GeneratorError, GeneratorState};
 
 const ERROR_CODE: u16 = 0x603f;
 pub(super) const MODES_OF_OPERATION_DISPLAY: u16 = 0x6061;
@@ -51,11 +51,17 @@ impl Supervisor {
                     condition: pressed.map_or(String::new(), |c| self.machine.condition(c)),
                 }
             }
-            StopCause::FollowLost { axis } => Cause::FollowLost {
-                cause: self.cause_of_others(axis, group, snapshot).await,
-                reason: match snapshot.generators.get(axis) {
-                    Some(GeneratorState::Failed(error)) => Some(*error),
-                    _ => None,
+            StopCause::FollowLost { axis } => match snapshot.generators.get(axis) {
+                Some(GeneratorState::Failed(GeneratorError::LineShaft { shaft, end })) => {
+                    let name = self.machine.line_shaft_name(*shaft).to_owned();
+                    Cause::LineShaftEnded { name, end: *end }
+                }
+                state => Cause::FollowLost {
+                    reason: match state {
+                        Some(GeneratorState::Failed(error)) => Some(*error),
+                        _ => None,
+                    },
+                    cause: self.cause_of_others(axis, group, snapshot).await,
                 },
             },
             StopCause::Absent => Cause::Absent,

@@ -135,7 +135,7 @@ impl Supervisor {
 pub(super) fn needed(action: &Action) -> Vec<AxisIndex> {
     match action {
         Action::Disable { .. } | Action::Reset { .. } => Vec::new(),
-        Action::Gear { axis, master, .. } => vec![*axis, *master],
+        Action::Gear { axis, master, .. } => std::iter::once(*axis).chain(master.axis()).collect(),
         action => action.commanded(),
     }
 }

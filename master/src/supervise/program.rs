@@ -358,7 +358,6 @@ impl Turn<'_, '_> {
             Action::Gear {
                 axis,
                 master,
-                actual,
                 ratio,
                 offset,
                 smoothing_ns,
@@ -372,8 +371,7 @@ impl Turn<'_, '_> {
                     limits: self.limits(*axis).motion(),
                     range: self.limits(*axis).position,
                 };
-                self.gear(step, start, [*axis, *master], (*actual, cam), config)
-                    .await
+                self.gear(step, start, *axis, (*master, cam), config).await
             }
             Action::Phase { targets } => self.shift(step, start, targets, false).await,
             Action::Superimpose { targets } => self.shift(step, start, targets, true).await,

@@ -183,7 +183,7 @@ impl Client {
         self.hub.now().saturating_sub(seen_ns) > OLD_NS
     }
 
-    fn axis(&self, name: &str) -> Result<AxisIndex, OpError> {
+    pub(crate) fn axis(&self, name: &str) -> Result<AxisIndex, OpError> {
         let mut axes = self.hub.machine.axes.enumerate();
         let found = axes.find(|(_, axis)| axis.name == name);
         found.map(|(index, _)| index).ok_or_else(|| {

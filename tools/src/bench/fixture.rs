@@ -21,6 +21,7 @@ use ecaxis_master::rt::cycle::{EngineConfig, Signals, first_snapshot};
 use ecaxis_master::rt::exchange::{Exchange, ExchangeDevice};
 use ecaxis_master::rt::image::{self, AxisBits, ImagePlan, OpOnly, ProcessData};
 use ecaxis_master::rt::phase::{ClockPlan, Phase};
+use ecaxis_master::rt::setpoint_cell::SetpointCells;
 use ecaxis_master::rt::setpoint_generator::GeneratorRequest;
 use ecaxis_master::rt::spin::Spin;
 
@@ -179,7 +180,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
         align: false,
     };
     let signals = Signals::default();
-    let (end, outer) = channel(&first_snapshot(&slots, 1, &signals, members.len()));
+    let (end, outer) = channel(&first_snapshot(&slots, (1, 0), &signals, members.len()));
     let parts = EngineConfig {
         clock: Clock::Real,
         config: RtConfig {
@@ -197,6 +198,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
             overrides: config::OverrideConfig::default(),
             gantries: Vec::new(),
             cams: Vec::new(),
+            line_shafts: Vec::new(),
             copies: Vec::new(),
             repeats: Vec::new(),
         },
@@ -209,6 +211,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
         controller: None,
         samples: None,
         tables: Box::default(),
+        setpoints: SetpointCells::default(),
         phase: Some(Phase::new(&clock)),
         common: CommonTime::new(cycle_ns, Some(&clock)),
         end,

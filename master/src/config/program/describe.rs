@@ -1,10 +1,11 @@
 //! The text of steps and conditions, for `explain`, progress and errors.
 
 use ecaxis_axis::Edge;
-use ecaxis_ecat::index::AxisIndex;
+use ecaxis_ecat::index::{AxisIndex, LineShaftIndex};
 
 use super::{Action, AxisValue, Bound, NumberPlace, Step, Subject, Test, When};
 use crate::config::{Bounds, Condition, Machine, Signal, duration};
+use crate::rt::setpoint_generator::GearMaster;
 use crate::text::rounded;
 
 impl Machine {
@@ -113,19 +114,23 @@ impl Machine {
             Action::Gear {
                 axis,
                 master,
-                actual,
                 ratio,
                 cam,
                 ..
             } => format!(
-                "gear {} to {}{} with a ratio of {ratio}{}",
+                "gear {} to {} with a ratio of {ratio}{}",
                 self.names(&[*axis]),
-                if *actual {
-                    "the reported position of "
-                } else {
-                    ""
+                match *master {
+                    GearMaster::Axis { axis, actual } => {
+                        let of = if actual {
+                            "the reported position of "
+                        } else {
+                            ""
+                        };
+                        format!("{of}{}", self.names(&[axis]))
+                    }
+                    GearMaster::LineShaft(shaft) => self.line_shaft_name(shaft).to_owned(),
                 },
-                self.names(&[*master]),
                 cam.and_then(|cam| self.cams.get(cam))
                     .map_or_else(String::new, |cam| format!(", by the cam {}", cam.name)),
             ),
@@ -261,6 +266,13 @@ impl Machine {
             name.as_deref().unwrap_or("?"),
             bounds.join(" and ")
         )
+    }
+
+    /// Returns the name of a line shaft.
+    #[must_use]
+    pub fn line_shaft_name(&self, shaft: LineShaftIndex) -> &str {
+        let setup = self.line_shafts.get(shaft);
+        setup.map_or("?", |setup| setup.name.as_str())
     }
 
     fn names(&self, axes: &[AxisIndex]) -> String {

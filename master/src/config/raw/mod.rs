@@ -22,6 +22,7 @@ use super::{
 mod axis;
 mod condition;
 mod eoe;
+mod line_shaft;
 mod number;
 mod path;
 mod server;
@@ -33,6 +34,7 @@ pub(crate) use axis::{
 };
 pub(crate) use condition::{Conditions, Levels, NamedValues, RawCondition, RawSignal, RawWhen};
 pub(crate) use eoe::{RawDeviceEoe, RawEoe};
+pub(crate) use line_shaft::RawLineShaft;
 pub(crate) use number::{RawNumber, RawVariable};
 pub(crate) use path::{RawPath, RawPoint};
 pub(crate) use server::{RawMailboxGateway, RawServer};
@@ -54,6 +56,8 @@ table! { "the machine file",
         gantries: Vec<RawGantry> as "gantry",
         /// Cams that steps `gear` name
         cams: Vec<RawCam> as "cam",
+        /// Master axes on other machines that steps `gear` name
+        line_shafts: Vec<RawLineShaft> as "line_shaft",
         /// Lines and arcs of several axes that steps `path` name
         paths: Vec<RawPath> as "path",
         /// Outputs that are on at positions of an axis

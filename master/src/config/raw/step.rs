@@ -134,7 +134,7 @@ table! { "a wave",
 
 table! { "a gear",
     table RawGear {
-        /// Axis that is followed
+        /// Axis or line shaft that is followed
         to: Key<String> = "\"x\"",
         /// Motion of this axis per motion of the other; negative reverses the direction (default 1)
         ratio: Key<f64>,

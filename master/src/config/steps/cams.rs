@@ -5,6 +5,7 @@ use ecaxis_ecat::index::AxisIndex;
 use super::ProgramChecker;
 use crate::config::problem::Problems;
 use crate::config::{Action, AxisSetup, NumberPlace, Step};
+use crate::rt::setpoint_generator::GearMaster;
 use crate::text::rounded;
 
 /// A larger excess of a limit is not rounding.
@@ -33,7 +34,7 @@ impl ProgramChecker<'_> {
                 ..
             } = step.action
             {
-                self.check_cam(all, step, [axis, master], (cam, ratio), p);
+                self.check_cam(all, step, (axis, master), (cam, ratio), p);
             }
             for inner in step.action.lists() {
                 self.check_cams(all, inner, p);
@@ -45,21 +46,32 @@ impl ProgramChecker<'_> {
         &self,
         all: &[Step],
         step: &Step,
-        [axis, master]: [AxisIndex; 2],
+        (axis, master): (AxisIndex, GearMaster),
         (cam, ratio): (usize, f64),
         p: &mut Problems<'_>,
     ) {
         let setup = |axis: AxisIndex| self.axes.get(axis)?.setup;
-        let (Some(cam), Some(follower), Some(leader)) =
-            (self.cams.get(cam), setup(axis), setup(master))
-        else {
+        let (Some(cam), Some(follower)) = (self.cams.get(cam), setup(axis)) else {
             return;
         };
-        let limit = leader.config.limits.velocity;
-        let (speed, origin) = match self.speed(all, master, leader) {
-            Speed::Free => (limit, "`limits.velocity` of"),
-            Speed::Known(speed) => (speed.min(limit), "the velocity of"),
-            Speed::Unknown => return,
+        let (speed, origin, name, unit_of_master) = match master {
+            GearMaster::Axis { axis: master, .. } => {
+                let Some(leader) = setup(master) else { return };
+                let limit = leader.config.limits.velocity;
+                let (speed, origin) = match self.speed(all, master, leader) {
+                    Speed::Free => (limit, "`limits.velocity` of"),
+                    Speed::Known(speed) => (speed.min(limit), "the velocity of"),
+                    Speed::Unknown => return,
+                };
+                (speed, origin, &leader.name, &leader.unit)
+            }
+            GearMaster::LineShaft(shaft) => {
+                let Some(shaft) = self.line_shafts.get(shaft) else {
+                    return;
+                };
+                let speed = shaft.config.velocity;
+                (speed, "`velocity` of", &shaft.name, &shaft.unit)
+            }
         };
         let limits = &follower.config.limits;
         let jerk = limits.jerk.unwrap_or(f64::INFINITY);
@@ -76,13 +88,11 @@ impl ProgramChecker<'_> {
             }
             let unit = format!("{}{unit}", follower.unit);
             let message = format!(
-                "`{}` cannot follow the cam `{}`: at {} of it, with {} {}/s, {origin} `{}`, its {what} is {} {unit}, and its limit {}",
+                "`{}` cannot follow the cam `{}`: at {} of it, with {} {unit_of_master}/s, {origin} `{name}`, its {what} is {} {unit}, and its limit {}",
                 follower.name,
                 cam.name,
                 rounded(peak.at),
                 rounded(speed),
-                leader.unit,
-                leader.name,
                 rounded(needed),
                 rounded(limit),
             );

@@ -10,12 +10,18 @@ use super::ProgramChecker;
 use super::target::TargetKind;
 use crate::config::fields::KeyExt;
 use crate::config::path::NamedPath;
-use crate::config::problem::{Problems, suggestion};
+use crate::config::problem::{Problems, Span, suggestion};
 use crate::config::raw::{Named, RawGear, RawWave};
-use crate::config::{Action, AxisSetup, NamedCam, Step, StopSetup, csv};
+use crate::config::{Action, AxisSetup, LineShaftSetup, NamedCam, Step, StopSetup, csv};
+use crate::rt::setpoint_generator::GearMaster;
+use crate::text::rounded;
 
 /// The default smoothing of a gear that follows actual positions, in ns.
 const SMOOTHING_NS: u64 = 10_000_000;
+
+/// The largest excess of a limit by the cycles of a follower, which differ in common time by the
+/// drift of its clock.
+const CLOCK_MARGIN: f64 = 1.0 + 1e-3;
 
 impl ProgramChecker<'_> {
     /// Returns an axis that follows positions in at least one of its modes.
@@ -46,8 +52,36 @@ impl ProgramChecker<'_> {
     ) -> Option<Action> {
         let axis = self.positioned(name, "gear", p)?.0;
         let to = raw.to.as_ref()?;
-        let master = self.axis(to, p)?.0;
-        if axis == master {
+        let actual = raw.actual.value().unwrap_or(false);
+        let mut shafts = self.line_shafts.enumerate();
+        let shaft = shafts.find(|(_, setup)| setup.name == *to.get_ref());
+        let master = match shaft {
+            Some((shaft, setup)) => {
+                if let Some(at) = raw.actual.place().filter(|_| actual) {
+                    let message = "a line shaft has set-points only, no reported positions";
+                    p.add_hint(at, message, "take `actual` out");
+                    return None;
+                }
+                if raw.cam.is_none() {
+                    let ratio = raw.ratio.value().unwrap_or(1.0).abs();
+                    self.check_line_shaft(axis, (to.span(), ratio), setup, p)?;
+                }
+                GearMaster::LineShaft(shaft)
+            }
+            None if self.axis_named(to).is_none() && !self.line_shafts.is_empty() => {
+                let shafts = self.line_shafts.iter().map(|setup| setup.name.as_str());
+                let names = self.axes.iter().map(|axis| axis.name).chain(shafts);
+                let hint = suggestion(to.get_ref(), names, "axes and line shafts");
+                let message = format!("nothing to follow is named `{}`", to.get_ref());
+                p.add_hint(to.span(), message, hint);
+                return None;
+            }
+            None => GearMaster::Axis {
+                axis: self.axis(to, p)?.0,
+                actual,
+            },
+        };
+        if master.axis() == Some(axis) {
             let message = format!("`{}` cannot follow itself", name.get_ref());
             p.add_hint(to.span(), message, "name another axis in `to`");
             return None;
@@ -73,18 +107,55 @@ impl ProgramChecker<'_> {
                 Some(index)
             }
         };
-        let actual = raw.actual.value().unwrap_or(false);
         // Actual positions are whole counts, so they need smoothing.
         let smoothing_ns = if actual { SMOOTHING_NS } else { 0 };
         Some(Action::Gear {
             axis,
             master,
-            actual,
             ratio: raw.ratio.value().unwrap_or(1.0),
             offset: raw.offset.value(),
             cam,
             smoothing_ns: raw.smoothing.value().unwrap_or(smoothing_ns),
         })
+    }
+
+    /// Reports a follower that could not stay in gear with the stop of a line shaft, or at its
+    /// velocity.
+    fn check_line_shaft(
+        &self,
+        axis: AxisIndex,
+        (at, ratio): (Span, f64),
+        shaft: &LineShaftSetup,
+        p: &mut Problems<'_>,
+    ) -> Option<()> {
+        let setup = self.axes.get(axis)?.setup?;
+        let limits = &setup.config.limits;
+        let rows = [
+            ("velocity", "/s", shaft.config.velocity, limits.velocity),
+            (
+                "acceleration",
+                "/s²",
+                shaft.config.acceleration,
+                limits.acceleration,
+            ),
+        ];
+        for (what, per, of_shaft, limit) in rows {
+            let needed = ratio * of_shaft * CLOCK_MARGIN;
+            if needed > limit {
+                let unit = format!("{}{per}", setup.unit);
+                let message = format!(
+                    "`{}` cannot follow `{}`: its {what} would be up to {} {unit}, and its limit is {}",
+                    setup.name,
+                    shaft.name,
+                    rounded(needed),
+                    rounded(limit),
+                );
+                let hint = format!("reduce the `ratio`, or `{what}` of the line shaft");
+                p.add_hint(at, message, hint);
+                return None;
+            }
+        }
+        Some(())
     }
 
     pub(super) fn wave(

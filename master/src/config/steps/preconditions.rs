@@ -258,7 +258,9 @@ impl ProgramState<'_, '_, '_, '_> {
                     rest: false,
                     free: false,
                 };
-                self.need(step, *master, need);
+                if let Some(master) = master.axis() {
+                    self.need(step, master, need);
+                }
                 self.follow_setpoints(step, "gear", *axis, false);
                 self.each(&[*axis], |state| {
                     state.follows_since = Some(number.clone());

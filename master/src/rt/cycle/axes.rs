@@ -1,6 +1,7 @@
 //! Steps every axis once per cycle, from its inputs to its outputs.
 
 use ecaxis_axis::StopPhase;
+use ecaxis_axis::setpoint::Motion;
 use ecaxis_ecat::index::AxisIndex;
 
 use super::{Engine, Nanos};
@@ -10,7 +11,7 @@ use crate::rt::channel::Event;
 use crate::rt::exchange::DeviceAnswer;
 use crate::rt::gantry;
 use crate::rt::gateway::Gateway;
-use crate::rt::setpoint_generator::{self, CamRef};
+use crate::rt::setpoint_generator::{self, CamRef, GearMaster, GeneratorError};
 
 impl Engine {
     /// Reads the status words of the gateways, stops the groups of lost nodes, and writes the
@@ -33,6 +34,21 @@ impl Engine {
                 if let Some(group) = self.groups.get_mut(slot.group) {
                     group.found = group.found.or(Some(StopCause::NodeLost { axis, state }));
                 }
+            }
+        }
+    }
+
+    /// Reports restarts of devices to their axes. Their groups have stopped. RT: O(devices × axes)
+    /// while a device returns, else O(devices).
+    pub(super) fn take_restarts(&mut self) {
+        for device in self.exchange.device_answers().indices() {
+            if let Some(same) = self.exchange.take_restart(device) {
+                let own = self.axes.iter_mut().filter(|slot| slot.device == device);
+                own.for_each(|slot| slot.axis.restarted(same));
+                let at =
+                    |slot: &&mut RtAxis| slot.second_encoder.is_some_and(|(_, at)| at == device);
+                let encoders = self.axes.iter_mut().filter(at);
+                encoders.for_each(|slot| slot.axis.restart_second_encoder());
             }
         }
     }
@@ -68,6 +84,7 @@ impl Engine {
     pub(super) fn act(&mut self) {
         self.stop_missing_axes();
         self.update_gantries();
+        self.update_line_shafts();
         self.set_rates();
         // Gears form no loops, so every pass steps at least one axis.
         for _ in 0..self.axes.len() {
@@ -79,7 +96,7 @@ impl Engine {
                 if slot.acted {
                     continue;
                 }
-                let followed = slot.generator.master().map(|(master, _)| master);
+                let followed = slot.generator.followed();
                 let followed = followed.or(slot.leader.map(|leader| leader.axis));
                 let followed = followed.and_then(|master| self.axes.get(master));
                 if followed.is_some_and(|master| !master.acted) {
@@ -115,6 +132,43 @@ impl Engine {
         }
     }
 
+    /// Returns the motion of the master of a gear.
+    pub(super) fn master_motion(&self, master: GearMaster) -> Result<Motion, GeneratorError> {
+        match master {
+            GearMaster::Axis { axis, actual } => {
+                let status = self.axes.get(axis).map(|slot| slot.axis.status());
+                status
+                    .and_then(|status| setpoint_generator::master_motion(&status, actual))
+                    .ok_or(GeneratorError::NoMaster)
+            }
+            GearMaster::LineShaft(shaft) => {
+                let known = self.line_shafts.get(shaft);
+                let known = known.ok_or(GeneratorError::NoMaster)?;
+                let motion = known.shaft.motion();
+                motion.map_err(|end| GeneratorError::LineShaft { shaft, end })
+            }
+        }
+    }
+
+    /// Advances every line shaft to the instant of the set-points of this cycle.
+    fn update_line_shafts(&mut self) {
+        self.effect_at = self.common.effect_of(self.next);
+        let dt_s = self.config.cycle_ns as f64 * 1e-9;
+        for shaft in &mut self.line_shafts {
+            shaft.advance(self.effect_at, dt_s);
+        }
+    }
+
+    /// Publishes the set-points of this cycle for other machines.
+    pub(super) fn publish_setpoints(&mut self) {
+        let at = self.effect_at.filter(|_| self.guarding);
+        for (setpoints, slot) in self.setpoints.iter_mut().zip(&self.axes) {
+            let velocity = slot.axis.config().limits.velocity;
+            let dt_s = slot.dt_s(self.config.cycle_ns);
+            setpoints.publish(at, &slot.axis.status(), velocity, dt_s);
+        }
+    }
+
     /// Advances every gantry. Their second halves follow in this cycle.
     fn update_gantries(&mut self) {
         let cycle_ns = self.config.cycle_ns;
@@ -128,15 +182,13 @@ impl Engine {
 
     /// Steps one axis. A cause that must stop its group is stored in the group.
     fn step_axis(&mut self, index: AxisIndex) {
-        let master = self.axes.get(index).and_then(|slot| {
-            let (master, actual) = slot.generator.master()?;
-            let status = self.axes.get(master)?.axis.status();
-            let motion = setpoint_generator::master_motion(&status, actual)?;
-            Some(CamRef::through(
-                slot.generator.cam(),
-                &self.config.cams,
-                motion,
-            ))
+        let master = self
+            .axes
+            .get(index)
+            .and_then(|slot| slot.generator.master());
+        let master = master.map_or(Ok(Motion::default()), |(master, cam)| {
+            let motion = self.master_motion(master)?;
+            Ok(CamRef::through(cam, &self.config.cams, motion))
         });
         let leader = self.axes.get(index).and_then(|slot| {
             let leader = slot.leader?;

@@ -1,5 +1,6 @@
 //! Commands to the cycle, and stops.
 
+use ecaxis_axis::setpoint::Motion;
 use ecaxis_axis::{Command, CommandError, StopMethod};
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex};
 
@@ -12,7 +13,7 @@ use crate::rt::flight_recorder::Trigger;
 use crate::rt::gantry;
 use crate::rt::gateway::Gateway;
 use crate::rt::reaction_group::{ActiveStop, ReactionGroup, check_permitted};
-use crate::rt::setpoint_generator::{self, CamRef, GeneratorRequest};
+use crate::rt::setpoint_generator::{CamRef, GearMaster, GeneratorError, GeneratorRequest};
 
 impl Engine {
     /// Takes all queued commands, so that commands of one batch take effect in the same cycle.
@@ -326,20 +327,11 @@ impl Engine {
             return;
         }
         let master = match start {
-            GeneratorRequest::Gear {
-                master,
-                actual,
-                cam,
-                ..
-            } => self
-                .axes
-                .get(master)
-                .and_then(|slot| setpoint_generator::master_motion(&slot.axis.status(), actual))
+            GeneratorRequest::Gear { master, cam, .. } => self
+                .new_master_motion(axis, master)
                 .map(|motion| CamRef::through(cam, &self.config.cams, motion)),
-            _ => None,
+            _ => Ok(Motion::default()),
         };
-        let ring =
-            matches!(start, GeneratorRequest::Gear { master, .. } if self.follows(master, axis));
         let allowed = self.check_generator(axis);
         if let Some(slot) = self.axes.get_mut(axis) {
             if let Err(reason) = allowed {
@@ -348,7 +340,28 @@ impl Engine {
             }
             let status = slot.axis.status();
             let rate = self.overrides.rate(slot.group);
-            slot.generator.begin(start, &status, master, ring, rate);
+            slot.generator.begin(start, &status, master, rate);
+        }
+    }
+
+    /// Returns the motion of a master that `axis` is to follow.
+    fn new_master_motion(
+        &self,
+        axis: AxisIndex,
+        master: GearMaster,
+    ) -> Result<Motion, GeneratorError> {
+        match master {
+            GearMaster::Axis { axis: of, .. } if self.follows(of, axis) => {
+                Err(GeneratorError::Ring)
+            }
+            // Not while the shaft stops.
+            GearMaster::LineShaft(shaft) => match self.line_shafts.get(shaft) {
+                Some(known) => {
+                    (known.shaft.running()).map_err(|end| GeneratorError::LineShaft { shaft, end })
+                }
+                None => Err(GeneratorError::NoMaster),
+            },
+            master => self.master_motion(master),
         }
     }
 
@@ -358,12 +371,7 @@ impl Engine {
         for _ in 0..=self.axes.len() {
             match at {
                 Some(axis) if axis == leader => return true,
-                Some(axis) => {
-                    at = self
-                        .axes
-                        .get(axis)
-                        .and_then(|s| Some(s.generator.master()?.0))
-                }
+                Some(axis) => at = self.axes.get(axis).and_then(|s| s.generator.followed()),
                 None => return false,
             }
         }

@@ -1,0 +1,134 @@
+//! Line shafts in the cycle, and the set-points of the axes for those of other machines.
+
+use std::sync::Arc;
+
+use ecaxis_axis::setpoint::{LineShaft, LineShaftEnd, LineShaftPoint, LineShaftState, Motion};
+use ecaxis_axis::{AxisStatus, HomingStatus};
+use ecaxis_ecat::index::{IndexVec, LineShaftIndex};
+
+use super::setpoint_cell::{SetpointCell, SetpointCells};
+
+/// A line shaft and the points that arrive for it.
+#[derive(Debug)]
+pub(super) struct RtLineShaft {
+    pub shaft: LineShaft,
+    cell: Option<Arc<SetpointCell>>,
+    arrived: Option<LineShaftPoint>,
+}
+
+impl RtLineShaft {
+    pub fn new(shaft: LineShaft, cell: Option<Arc<SetpointCell>>) -> Self {
+        Self {
+            shaft,
+            cell,
+            arrived: None,
+        }
+    }
+
+    /// RT: O(1).
+    pub fn advance(&mut self, now_ns: Option<u64>, dt_s: f64) {
+        if let Some(cell) = &self.cell {
+            cell.read(&mut self.arrived);
+        }
+        self.shaft.advance(now_ns, self.arrived, dt_s);
+    }
+}
+
+/// What other threads see of a line shaft.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct LineShaftStatus {
+    pub state: LineShaftState,
+    /// The last motion.
+    pub motion: Motion,
+    /// The newest point.
+    pub newest: LineShaftPoint,
+    /// The age of the newest point in this cycle; `None` unless the shaft runs.
+    pub age_ns: Option<i64>,
+    /// The difference from the prediction.
+    pub error: f64,
+    /// Why the shaft does not run.
+    pub end: LineShaftEnd,
+}
+
+impl LineShaftStatus {
+    pub(super) fn new(shaft: &LineShaft, now_ns: Option<u64>) -> Self {
+        let newest = shaft.newest();
+        let runs = shaft.state() == LineShaftState::Running;
+        let age = now_ns.map(|now| now.wrapping_sub(newest.at_ns).cast_signed());
+        Self {
+            state: shaft.state(),
+            motion: shaft.last_motion(),
+            newest,
+            age_ns: age.filter(|_| runs),
+            error: shaft.error(),
+            end: shaft.end(),
+        }
+    }
+}
+
+/// The set-points of an axis for other machines.
+#[derive(Debug)]
+pub(super) struct AxisSetpoints {
+    cell: Arc<SetpointCell>,
+    /// The stream of the last cycle's point.
+    stream: Option<u64>,
+    last: f64,
+}
+
+impl AxisSetpoints {
+    pub fn new(cell: Arc<SetpointCell>) -> Self {
+        Self {
+            cell,
+            stream: None,
+            last: 0.0,
+        }
+    }
+
+    /// Publishes the set-point that takes effect at `at_ns`; `None`: there is none for other
+    /// machines. `velocity` is the velocity limit of the axis. RT: O(1).
+    pub fn publish(&mut self, at_ns: Option<u64>, axis: &AxisStatus, velocity: f64, dt_s: f64) {
+        let homes = axis.homing == HomingStatus::Running;
+        let Some(at_ns) = at_ns.filter(|_| axis.enabled && !homes) else {
+            if self.stream.take().is_some() {
+                self.cell.write(None);
+            }
+            return;
+        };
+        // A mode of the drive's own profiles: the set-point is the target.
+        let jumped = (axis.target_position - self.last).abs() > 2.0 * velocity * dt_s;
+        let stream = self.stream.filter(|_| !jumped);
+        let stream = stream.unwrap_or_else(|| self.cell.stream().wrapping_add(1));
+        (self.stream, self.last) = (Some(stream), axis.target_position);
+        let acceleration = axis.target_acceleration;
+        let motion = Motion {
+            position: axis.target_position,
+            // The velocity of a set-point is the mean one of its cycle.
+            velocity: axis.target_velocity + acceleration * dt_s / 2.0,
+            acceleration,
+        };
+        self.cell.write(Some(LineShaftPoint {
+            stream,
+            at_ns,
+            motion,
+        }));
+    }
+}
+
+/// Returns the line shafts with their cells. Runs before the loop.
+#[allow(clippy::disallowed_methods, reason = "runs before the loop")]
+pub(super) fn shafts(
+    shafts: &[LineShaft],
+    cells: &SetpointCells,
+) -> IndexVec<LineShaftIndex, RtLineShaft> {
+    let cells = cells.line_shafts.iter().cloned().map(Some);
+    let cells = cells.chain(std::iter::repeat(None));
+    let each = shafts.iter().zip(cells);
+    each.map(|(shaft, cell)| RtLineShaft::new(*shaft, cell))
+        .collect()
+}
+
+/// Returns the set-points of the axes for other machines. Runs before the loop.
+#[allow(clippy::disallowed_methods, reason = "runs before the loop")]
+pub(super) fn axis_setpoints(cells: &SetpointCells) -> Box<[AxisSetpoints]> {
+    cells.axes.iter().cloned().map(AxisSetpoints::new).collect()
+}
