@@ -39,6 +39,7 @@ use ecaxis_test_support::{axes, faults, load, machine, virtual_time};
 
 mod common_time;
 mod corrections;
+mod line_shaft;
 
 /// The machine time whose samples are kept.
 const SAMPLES_NS: u64 = 1_000_000_000;

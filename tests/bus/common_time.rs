@@ -14,6 +14,7 @@ use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
 use ecaxis_master::rt::common_time::CommonTimeStatus;
 use ecaxis_master::rt::cycle::Engine;
+use ecaxis_master::rt::setpoint_cell::SetpointCells;
 use ecaxis_master::session::{
     self, Attachments, Options, Prepared, Progress, RunBuilder, simulated_bus,
 };
@@ -23,10 +24,12 @@ use ecaxis_master::supervise::operator::{
 use ecaxis_test_support::random::Random;
 use ecaxis_test_support::{Heard, faults, machine, virtual_time};
 
-const MS: u64 = 1_000_000;
-const SECOND: u64 = 1_000 * MS;
+use crate::line_shaft::EachCycle;
+
+pub(crate) const MS: u64 = 1_000_000;
+pub(crate) const SECOND: u64 = 1_000 * MS;
 /// 2026-11-26, in ns since 1970: the common time at which the runs begin, plus a part of a second.
-const BEGIN: u64 = 1_795_651_200 * SECOND;
+pub(crate) const BEGIN: u64 = 1_795_651_200 * SECOND;
 
 /// What the outside world sees of one bus, in common time.
 #[derive(Debug, Default)]
@@ -43,6 +46,7 @@ struct Observed {
     bus: SimLink,
     start: Nanos,
     seen: Arc<Mutex<Seen>>,
+    each_cycle: Option<EachCycle>,
 }
 
 /// Returns the process data of a cyclic frame.
@@ -82,6 +86,9 @@ impl Link for Observed {
                 }
             }
         }
+        if let (Some(each), Some(data)) = (&mut self.each_cycle, process_data(frame)) {
+            each.0(common(clock::now()), data);
+        }
         if let Some(data) = process_data(frame)
             && data != seen.outputs
         {
@@ -102,7 +109,7 @@ impl Link for Observed {
 
 /// What happens at a common time.
 #[derive(Debug, Clone, Copy)]
-enum Act {
+pub(crate) enum Act {
     Request(Request),
     /// Common time is set: it advances by this.
     Set(i64),
@@ -117,8 +124,8 @@ struct Scripted {
 }
 
 #[derive(Debug, Default)]
-struct Kept {
-    events: Vec<RequestEvent>,
+pub(crate) struct Kept {
+    pub events: Vec<RequestEvent>,
     /// The state each 10 ms, with the common time.
     states: Vec<(u64, CommonTimeStatus)>,
 }
@@ -182,7 +189,7 @@ impl Run {
     }
 
     /// Returns the results of the requests to the program.
-    fn results(&self) -> Vec<Result<(), String>> {
+    pub(crate) fn results(&self) -> Vec<Result<(), String>> {
         let events = self.kept.events.iter().filter_map(|event| match event {
             RequestEvent::Program { result, .. } => Some(result.clone()),
             _ => None,
@@ -197,24 +204,26 @@ fn bounds(values: &[i64]) -> [i64; 2] {
 }
 
 /// The run of one bus.
-struct Run {
+pub(crate) struct Run {
     seen: Seen,
-    kept: Kept,
-    warnings: Vec<String>,
-    error: Option<String>,
+    pub kept: Kept,
+    pub warnings: Vec<String>,
+    pub error: Option<String>,
 }
 
-struct Plan {
-    machine: Machine,
-    options: Options,
-    seed: u64,
+pub(crate) struct Plan {
+    pub machine: Machine,
+    pub options: Options,
+    pub seed: u64,
     /// Common time as virtual time begins.
-    begin: u64,
-    acts: Vec<(u64, Act)>,
-    until: u64,
+    pub begin: u64,
+    pub acts: Vec<(u64, Act)>,
+    pub until: u64,
+    pub setpoints: SetpointCells,
+    pub each_cycle: Option<EachCycle>,
 }
 
-fn run(plan: Plan) -> Run {
+pub(crate) fn run(plan: Plan) -> Run {
     let options = plan.options;
     options.clock.enter();
     set_common_offset(plan.begin.cast_signed() - clock::now().cast_signed());
@@ -226,6 +235,7 @@ fn run(plan: Plan) -> Run {
         bus: SimLink::new(bus),
         start: clock::now(),
         seen: Arc::clone(&seen),
+        each_cycle: plan.each_cycle,
     };
     let operator = Scripted {
         acts: plan.acts.into(),
@@ -240,6 +250,7 @@ fn run(plan: Plan) -> Run {
         progress,
         attachments: Attachments {
             operator: Some(Box::new(operator)),
+            setpoints: plan.setpoints,
             ..Attachments::default()
         },
     };
@@ -259,6 +270,7 @@ fn run(plan: Plan) -> Run {
     drop(engine);
     let warnings = reported.try_iter().filter_map(|progress| match progress {
         Progress::Warning(text) => Some(text),
+        Progress::GroupStopped { cause, .. } => Some(cause.to_string()),
         _ => None,
     });
     let warnings = warnings.collect();
@@ -285,7 +297,7 @@ fn drives(cycle: &str, bus: &str, drifts: &[f64]) -> String {
     text + "[[step]]\nmove = { d0 = 3.0 }\n"
 }
 
-const ALIGN: &str = "common_time = \"align\"";
+pub(crate) const ALIGN: &str = "common_time = \"align\"";
 
 fn start_at(at_unix_ns: u64) -> Act {
     Act::Request(Request::Program(ProgramRequest::StartAt { at_unix_ns }))
@@ -329,6 +341,8 @@ fn two_buses_fire_and_start_together() {
                     begin: BEGIN + random.below(SECOND),
                     acts: vec![(asked, start_at(at))],
                     until: at + 300 * MS,
+                    setpoints: SetpointCells::default(),
+                    each_cycle: None,
                 })
             })
             .collect();
@@ -372,6 +386,8 @@ fn plan(bus: &str, acts: &[(u64, Act)], seconds: u64) -> Plan {
         begin: BEGIN + 123_456,
         acts: acts.collect(),
         until: BEGIN + seconds * SECOND,
+        setpoints: SetpointCells::default(),
+        each_cycle: None,
     }
 }
 

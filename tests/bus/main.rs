@@ -23,6 +23,7 @@ mod fsoe;
 mod gateway_axes;
 mod gateway_stops;
 mod homing;
+mod line_shaft;
 mod long_segment;
 mod lrw;
 mod mailbox_gateway;

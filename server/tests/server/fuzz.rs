@@ -6,6 +6,7 @@ use std::os::unix::net::UnixStream;
 use serde_json::{Value, json};
 
 use crate::harness::{Server, demo};
+use crate::line_shaft::with_shaft;
 
 /// A small generator with a fixed seed (xorshift64).
 pub struct Random(pub u64);
@@ -37,6 +38,8 @@ const LINES: &[&str] = &[
     r#"{"op": "stream_push", "axis": "x", "points": [[0.1, 1.0], [0.2]]}"#,
     r#"{"op": "sdo_read", "device": "x", "index": "0x6061", "sub": 0}"#,
     r#"{"op": "subscribe", "topics": ["events", "state", "samples"], "interval_ms": 10}"#,
+    r#"{"op": "subscribe", "topics": ["setpoints"], "axis": "x", "interval_ms": 1}"#,
+    r#"{"op": "line_shaft", "name": "shaft", "stream": "00000000000000ab", "points": [{"unix_ns": 1795651200000000000, "position": 1.0, "velocity": 0.5, "acceleration": 0}]}"#,
     r#"{"op": "unsubscribe", "topics": ["samples"]}"#,
     r#"{"op": "state"}"#,
     r#"{"op": "disable", "axis": "*"}"#,
@@ -104,7 +107,7 @@ fn random_lines_break_nothing() {
         .ok()
         .and_then(|n| n.parse().ok());
     let lines: u32 = lines.unwrap_or(20_000);
-    let server = Server::in_virtual_time(demo());
+    let server = Server::in_virtual_time(with_shaft());
     server.client();
     let mut random = Random(0x9e37_79b9_7f4a_7c15);
     for round in 0..lines.div_ceil(1000) {

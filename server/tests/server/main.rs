@@ -12,6 +12,7 @@ mod harness;
 mod hostile;
 mod http;
 mod lease;
+mod line_shaft;
 mod ros2;
 mod rust_client;
 mod samples;

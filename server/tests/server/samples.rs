@@ -31,7 +31,7 @@ fn a_reader_that_keeps_up_misses_none_of_a_million_rows() {
     let mut writer = samples.writer().unwrap();
     let (mut next, mut expected, mut missed) = (0, 0, 0);
     for n in 0..1_000_000 {
-        writer.write(&row(n), &[], &[]);
+        writer.write(&row(n), &[], &[], &[]);
         if n % 1000 == 999 {
             missed += samples.read_new(&mut next, |number, words| {
                 assert_eq!((number, words[2]), (expected, expected));
@@ -47,7 +47,7 @@ fn a_slow_reader_learns_how_many_rows_it_missed() {
     let samples = ring(4096);
     let mut writer = samples.writer().unwrap();
     for n in 0..10_000 {
-        writer.write(&row(n), &[], &[]);
+        writer.write(&row(n), &[], &[], &[]);
     }
     let (mut next, mut first, mut count) = (0, None, 0);
     let missed = samples.read_new(&mut next, |number, _| {
@@ -67,7 +67,7 @@ fn no_torn_row_is_read() {
     let mut writer = samples.writer().unwrap();
     std::thread::scope(|scope| {
         scope.spawn(|| {
-            (0..2_000_000).for_each(|n| writer.write(&row(n), &[], &[]));
+            (0..2_000_000).for_each(|n| writer.write(&row(n), &[], &[], &[]));
             done.store(true, Ordering::Release);
         });
         let (mut next, mut read, mut missed, mut last) = (0, 0, 0, false);
@@ -96,7 +96,7 @@ fn a_spike_of_one_cycle_in_an_hour_is_visible() {
     let sampler = Sampler::new(samples.layout().signals.len(), CYCLE_NS);
     for n in 0..3_600_000 {
         let wake_up = if n == SPIKE { 900_000 } else { 1000 };
-        writer.write(&CycleSample { wake_up, ..row(n) }, &[], &[]);
+        writer.write(&CycleSample { wake_up, ..row(n) }, &[], &[], &[]);
         if n % 2000 == 1999 {
             sampler.take_new(&samples);
         }
