@@ -6,7 +6,8 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand};
 
 use crate::keys::MachineId;
-use crate::orders::commands::{BundleAction, PushArgs, StartArgs, UpdateArgs};
+use crate::orders::commands::{BundleAction, PushArgs, UpdateArgs};
+use crate::orders::together::{StartArgs, StopArgs};
 use crate::reports::ReportId;
 
 /// Machines of `ecaxis serve` as a fleet over Zenoh
@@ -104,13 +105,19 @@ pub enum Command {
                             ecaxis-fleet push hall-1/press-3 --back --key anna.key"
     )]
     Push(PushArgs),
-    /// Start the programs of machines
+    /// Start the programs of machines: of all, or of none
     #[command(
         after_help = "Examples:\n  ecaxis-fleet start hall-1/press-3 --key anna.key\n  \
                             ecaxis-fleet start hall-1/press-3 hall-1/press-4 \\\n    \
                             --at 1795718434.5 --key anna.key"
     )]
     Start(StartArgs),
+    /// Stop all axes and the programs of machines, also before their start
+    #[command(
+        after_help = "Examples:\n  ecaxis-fleet stop hall-1/press-3 hall-1/press-4 \\\n    \
+                            --key anna.key"
+    )]
+    Stop(StopArgs),
     /// Update firmware or parameters, device by device, up to the first failure
     #[command(
         after_help = "Examples:\n  ecaxis-fleet update new.msdc hall-1/press-3:x,y \\\n    \

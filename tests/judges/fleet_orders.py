@@ -230,7 +230,9 @@ class Fleet:
 
 def install(fleet):
     for machine in MACHINES:
-        text = fleet.ordered("push", f"hall/{machine}", fleet.bundle(machine, "first"))
+        bundle = fleet.bundle(machine, "first")
+        fleet.refused("no server answers at", "push", f"hall/{machine}", bundle)
+        text = fleet.ordered("push", f"hall/{machine}", bundle, "--no-server")
         require("runs the bundle" in text, text)
 
 
@@ -265,6 +267,9 @@ def bundles(fleet):
     client.close()
     require(fleet.sha256("m1") == first, "after all refusals, the server runs the first bundle")
 
+    left = [path for path in (fleet.folder / "m1/orders").iterdir() if re.fullmatch("[0-9a-f]{64}", path.name)]
+    require(len(left) == 1, "no file of a refused bundle is left")
+
     text = fleet.ordered("push", "hall/m1", second)
     require("runs the bundle" in text, text)
     require(fleet.sha256("m1") != first, "the server runs the second bundle")
@@ -284,7 +289,9 @@ def start(fleet):
     require(state["program"]["running"], "the program runs")
     require(state["lease"]["owner"]["name"] == "fleet: anna", "the lease has the name of the sender")
     fleet.refused("is not done yet", "push", "hall/m1", "--back")
-    client.do("stop")
+    for _ in range(2):
+        print(fleet.ordered("stop", "hall/m1"), flush=True)
+    require(not client.do("state")["program"]["running"], "the order `stop` ends the program")
     client.do("disable", axis="*", wait=True)
     client.close()
     time.sleep(1)
@@ -332,7 +339,7 @@ def logs(fleet):
     entries = [json.loads(line) for line in (fleet.folder / "m1/changes.jsonl").read_text().splitlines()]
     notes = [e for e in entries if e["command"] and isinstance(e["command"], dict) and e["command"]["op"] == "note"]
     require(notes and all(e["client"]["name"] == "fleet: anna" for e in notes), f"{len(notes)} notes of anna")
-    for what in ["refused: the axis `d1`", "done: the machine runs", "order `start`: started", "order `firmware"]:
+    for what in ["refused: the axis `d1`", "done: the machine runs", "order `start`: started", "order `stop`: done", "order `firmware"]:
         require(any(what in e["command"]["text"] for e in notes), f"the change log has: {what}")
 
 

@@ -30,7 +30,7 @@ pub struct KeyArgs {
 }
 
 impl KeyArgs {
-    fn load(&self) -> Result<Signer> {
+    pub(super) fn load(&self) -> Result<Signer> {
         Signer::load(&self.key, self.password_file.as_deref())
     }
 }
@@ -120,6 +120,9 @@ pub struct PushArgs {
     /// Go back to the previous bundle
     #[arg(long, conflicts_with = "bundle")]
     back: bool,
+    /// The machine has no server now, as before its first bundle
+    #[arg(long)]
+    no_server: bool,
     #[command(flatten)]
     key: KeyArgs,
 }
@@ -141,9 +144,12 @@ pub async fn push(args: PushArgs) -> Result<()> {
             Action::Push {
                 manifest: FileRef::of(&bundle.text),
                 signature: bundle.signature,
+                no_server: args.no_server,
             }
         }
-        None => Action::Back {},
+        None => Action::Back {
+            no_server: args.no_server,
+        },
     };
     let _files = sender.serve(&args.machine, served).await?;
     let machine = args.machine.to_string();
@@ -151,64 +157,6 @@ pub async fn push(args: PushArgs) -> Result<()> {
         .send(&args.machine, action, &mut progress(machine.clone()))
         .await?;
     succeed(&machine, &reply)
-}
-
-#[derive(Debug, Args)]
-pub struct StartArgs {
-    #[command(flatten)]
-    network: Network,
-    /// The machines
-    #[arg(value_name = "SITE/MACHINE", required = true)]
-    machines: Vec<MachineId>,
-    /// The common instant, in seconds since 1970
-    #[arg(long, value_name = "TIME", value_parser = instant)]
-    at: Option<u64>,
-    #[command(flatten)]
-    key: KeyArgs,
-}
-
-/// Starts the programs of machines.
-///
-/// # Errors
-/// Fails with the reasons of the machines that do not start.
-pub async fn start(args: StartArgs) -> Result<()> {
-    let signer = args.key.load()?;
-    let session = session::open_command(&args.network).await?;
-    let sender = OrderSender::new(session, signer);
-    let mut failed = Vec::new();
-    for machine in &args.machines {
-        let name = machine.to_string();
-        let action = Action::Start {
-            at_unix_ns: args.at,
-        };
-        let reply = sender
-            .send(machine, action, &mut progress(name.clone()))
-            .await;
-        if let Err(error) = reply.and_then(|reply| succeed(&name, &reply)) {
-            failed.push(error);
-        }
-    }
-    match failed
-        .into_iter()
-        .reduce(|a, b| Error::new(format!("{a}\n{b}")))
-    {
-        Some(error) => Err(error),
-        None => Ok(()),
-    }
-}
-
-fn instant(text: &str) -> std::result::Result<u64, String> {
-    let wrong = || "write seconds since 1970, such as 1795718434.5".to_owned();
-    let (whole, fraction) = text.split_once('.').unwrap_or((text, ""));
-    if fraction.len() > 9 {
-        return Err(wrong());
-    }
-    let seconds: u64 = whole.parse().map_err(|_| wrong())?;
-    let nanos: u64 = format!("{fraction:0<9}").parse().map_err(|_| wrong())?;
-    let total = seconds
-        .checked_mul(1_000_000_000)
-        .and_then(|ns| ns.checked_add(nanos));
-    total.ok_or_else(wrong)
 }
 
 /// A machine and devices of it, in their order.
@@ -331,7 +279,7 @@ pub async fn update(args: UpdateArgs) -> Result<()> {
 }
 
 /// Reports the steps of an order on standard error.
-fn progress(name: String) -> impl FnMut(&str) + Send {
+pub(super) fn progress(name: String) -> impl FnMut(&str) + Send {
     let mut last = String::new();
     move |text| {
         // The counts of a transfer change with each answer.
@@ -343,7 +291,7 @@ fn progress(name: String) -> impl FnMut(&str) + Send {
     }
 }
 
-fn succeed(name: &str, reply: &OrderReply) -> Result<()> {
+pub(super) fn succeed(name: &str, reply: &OrderReply) -> Result<()> {
     let with = |word: &str| {
         let (what, help) = reply
             .text

@@ -2,9 +2,10 @@
 
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use serde::Deserialize;
 
@@ -15,6 +16,7 @@ use super::server;
 use super::signing::{KeyTable, Keyring};
 use super::slots::Slots;
 use super::store::{FileSource, FileStore};
+use super::switch::SwitchOrder;
 use crate::config;
 use crate::error::{Error, Result};
 use crate::keys::MachineId;
@@ -63,8 +65,20 @@ pub struct OrderExecutor {
     pub(super) slots: Slots,
     pub(super) source: Arc<dyn FileSource>,
     journal: Mutex<OrderJournal>,
-    running: Mutex<Option<String>>,
+    running: Mutex<Option<Running>>,
 }
+
+/// The order that is executed.
+#[derive(Debug)]
+struct Running {
+    summary: String,
+    nonce: String,
+    /// An order `stop` ends a start.
+    stop: Arc<AtomicBool>,
+}
+
+/// The time in which a start ends after an order `stop`.
+const STOPPED: Duration = Duration::from_secs(5);
 
 impl fmt::Debug for OrderExecutor {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -87,6 +101,14 @@ pub(super) enum Ended {
 impl From<Error> for Ended {
     fn from(error: Error) -> Self {
         Self::Refused(error)
+    }
+}
+
+fn reply(done: std::result::Result<String, Ended>) -> OrderReply {
+    match done {
+        Ok(text) => OrderReply::new(Status::Done, text),
+        Err(Ended::Refused(error)) => OrderReply::new(Status::Refused, error.to_string()),
+        Err(Ended::Failed(error)) => OrderReply::new(Status::Failed, error.to_string()),
     }
 }
 
@@ -139,17 +161,34 @@ impl OrderExecutor {
         let Some(switch) = self.slots.pending()? else {
             return Ok(());
         };
-        *lock(&self.running) = Some(format!("the switch by `{}`", switch.sender));
+        let nonce = switch.nonce.clone().unwrap_or_default();
+        *lock(&self.running) = Some(Running {
+            summary: format!("the switch by `{}`", switch.sender),
+            nonce: nonce.clone(),
+            stop: Arc::default(),
+        });
         let executor = Arc::clone(self);
+        let enter = move |executor: &Self, reply: OrderReply| {
+            let kept = reply.status != Status::Running;
+            let entered = lock(&executor.journal).update(&nonce, unix_time(), reply, kept);
+            if let Err(error) = entered {
+                tracing::error!("the log of orders: {error}");
+            }
+        };
+        // The log has no end of this order: its sender still waits.
+        let text = "the switch continues after a restart of the agent";
+        enter(self, OrderReply::new(Status::Running, text));
         thread::spawn(move || {
-            let done = executor.finish(&switch, &mut |_| ());
-            let text = match done {
-                Ok(text) => text,
-                Err(Ended::Refused(error) | Ended::Failed(error)) => error.to_string(),
-            };
-            tracing::warn!(sender = switch.sender, "switch after a restart: {text}");
-            let text = format!("switch after a restart of the agent: {text}");
+            let reply = reply(executor.finish(&switch, &mut |_| ()));
+            executor.discard([]);
+            tracing::warn!(
+                sender = switch.sender,
+                "switch after a restart: {}",
+                reply.text
+            );
+            let text = format!("switch after a restart of the agent: {}", reply.text);
             server::note(&executor.socket, &switch.sender, &text);
+            enter(&executor, reply);
             *lock(&executor.running) = None;
         });
         Ok(())
@@ -187,9 +226,12 @@ impl OrderExecutor {
             return refused(error);
         }
         let mut running = lock(&self.running);
+        let stops = matches!(order.action, Action::Stop { .. });
         let reply = match &*running {
-            Some(other) => refused(Error::new(format!("{other} is not done yet"))),
-            None => OrderReply::new(Status::Running, "accepted"),
+            Some(other) if !stops => {
+                refused(Error::new(format!("{} is not done yet", other.summary)))
+            }
+            _ => OrderReply::new(Status::Running, "accepted"),
         };
         let begins = reply.status == Status::Running;
         if let Err(error) = journal.begin(&order, sha256, &key.name, now, reply.clone()) {
@@ -201,15 +243,62 @@ impl OrderExecutor {
             self.log(&order, &key.name, &reply);
             return reply;
         }
-        *running = Some(format!("`{}` by `{}`", order.action.summary(), key.name));
+        if stops {
+            drop(running);
+            return self.execute(&order, &key.name, &AtomicBool::new(false));
+        }
+        let stop = Arc::default();
+        *running = Some(Running {
+            summary: format!("`{}` by `{}`", order.action.summary(), key.name),
+            nonce: order.nonce.clone(),
+            stop: Arc::clone(&stop),
+        });
         let (executor, sender) = (Arc::clone(self), key.name.clone());
         let first = reply.clone();
         thread::spawn(move || {
             executor.log(&order, &sender, &first);
-            executor.execute(&order, &sender);
+            executor.execute(&order, &sender, &stop);
             *lock(&executor.running) = None;
         });
         reply
+    }
+
+    /// Stops all axes and the start under way; with the nonce of a start, this start alone.
+    fn stop(
+        &self,
+        order: &Order,
+        start: Option<&str>,
+        sender: &str,
+    ) -> std::result::Result<String, Ended> {
+        let Some(start) = start else {
+            if let Some(running) = &*lock(&self.running) {
+                running.stop.store(true, Ordering::SeqCst);
+            }
+            let machine = server::connect(&self.socket, sender).map_err(server::text)?;
+            machine
+                .stop()
+                .map_err(server::text)
+                .map_err(Ended::Failed)?;
+            return Ok("all axes decelerate and hold; the program has ended".to_owned());
+        };
+        // It may come later than this order.
+        lock(&self.journal).revoke(start, order.not_after, sender, unix_time())?;
+        let runs = || {
+            let running = lock(&self.running);
+            let running = running.as_ref().filter(|running| running.nonce == start);
+            running.map(|running| Arc::clone(&running.stop))
+        };
+        if let Some(stop) = runs() {
+            stop.store(true, Ordering::SeqCst);
+        }
+        let begin = Instant::now();
+        while runs().is_some() {
+            if begin.elapsed() > STOPPED {
+                return Err(Ended::Failed(Error::new("the start does not end")));
+            }
+            thread::sleep(Duration::from_millis(20));
+        }
+        Ok("the start is cancelled".to_owned())
     }
 
     /// Enters an order with its state in the change log of the machine.
@@ -229,7 +318,12 @@ impl OrderExecutor {
         }
     }
 
-    fn execute(self: &Arc<Self>, order: &Order, sender: &str) {
+    fn execute(self: &Arc<Self>, order: &Order, sender: &str, stop: &AtomicBool) -> OrderReply {
+        let switch = |no_server| SwitchOrder {
+            sender,
+            nonce: &order.nonce,
+            no_server,
+        };
         let mut progress = |status: Status, text: String| {
             let reply = OrderReply::new(status, text);
             let kept = status == Status::Started;
@@ -245,11 +339,15 @@ impl OrderExecutor {
             Action::Push {
                 manifest,
                 signature,
-            } => self.push(*manifest, signature, sender, &mut |text| {
+                no_server,
+            } => self.push(*manifest, signature, &switch(*no_server), &mut |text| {
                 progress(Status::Running, text);
             }),
-            Action::Back {} => self.back(sender, &mut |text| progress(Status::Running, text)),
-            Action::Start { at_unix_ns } => self.start(*at_unix_ns, sender, &mut progress),
+            Action::Back { no_server } => self.back(&switch(*no_server), &mut |text| {
+                progress(Status::Running, text);
+            }),
+            Action::Start { at_unix_ns } => self.start(*at_unix_ns, sender, stop, &mut progress),
+            Action::Stop { start } => self.stop(order, start.as_deref(), sender),
             Action::Firmware {
                 device,
                 name,
@@ -267,15 +365,26 @@ impl OrderExecutor {
                 })
             }
         };
-        let reply = match done {
-            Ok(text) => OrderReply::new(Status::Done, text),
-            Err(Ended::Refused(error)) => OrderReply::new(Status::Refused, error.to_string()),
-            Err(Ended::Failed(error)) => OrderReply::new(Status::Failed, error.to_string()),
-        };
+        let reply = reply(done);
         self.log(order, sender, &reply);
-        let updated = lock(&self.journal).update(&order.nonce, unix_time(), reply, true);
+        let updated = lock(&self.journal).update(&order.nonce, unix_time(), reply.clone(), true);
         if let Err(error) = updated {
             tracing::error!("the log of orders: {error}");
+        }
+        reply
+    }
+
+    /// Removes received files and unpacked bundles of neither a slot nor the order under way.
+    pub(super) fn discard(&self, needed: impl IntoIterator<Item = FileDigest>) {
+        let discarded = self.slots.clean().and_then(|used| match used {
+            Some(mut used) => {
+                used.extend(needed);
+                self.store.keep(&used)
+            }
+            None => Ok(()),
+        });
+        if let Err(error) = discarded {
+            tracing::warn!("removing old files: {error}");
         }
     }
 

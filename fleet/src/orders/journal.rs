@@ -124,7 +124,7 @@ impl OrderJournal {
         if self.known.len() >= MAX_NONCES {
             return Err(Error::new("the agent had too many orders today"));
         }
-        let entry = Entry {
+        self.enter(Entry {
             unix_time: now,
             latest: self.latest,
             nonce: order.nonce.clone(),
@@ -133,9 +133,33 @@ impl OrderJournal {
             sender: sender.to_owned(),
             order: order.action.summary(),
             reply,
-        };
+        })
+    }
+
+    /// Enters the nonce of a start that is not to begin. A known order stays as it is.
+    ///
+    /// # Errors
+    /// Fails if the log cannot be written.
+    pub fn revoke(&mut self, nonce: &str, not_after: u64, sender: &str, now: u64) -> Result<()> {
+        if self.known.contains_key(nonce) {
+            return Ok(());
+        }
+        self.enter(Entry {
+            unix_time: now,
+            latest: self.latest,
+            nonce: nonce.to_owned(),
+            not_after,
+            // The order itself is not known.
+            sha256: FileDigest::of(b""),
+            sender: sender.to_owned(),
+            order: "start".to_owned(),
+            reply: OrderReply::new(Status::Refused, "cancelled before it came"),
+        })
+    }
+
+    fn enter(&mut self, entry: Entry) -> Result<()> {
         self.append(&entry)?;
-        self.known.insert(order.nonce.clone(), entry);
+        self.known.insert(entry.nonce.clone(), entry);
         Ok(())
     }
 
@@ -207,7 +231,7 @@ mod tests {
 
     fn begin(journal: &mut OrderJournal, nonce: &str, now: u64) -> Result<()> {
         let machine = "hall/m1".parse().unwrap();
-        let action = Action::Back {};
+        let action = Action::Back { no_server: false };
         let order = Order::new(machine, action, now, now + 60, nonce.to_owned());
         let reply = OrderReply::new(Status::Done, "done");
         journal.begin(&order, FileDigest::of(nonce.as_bytes()), "anna", now, reply)

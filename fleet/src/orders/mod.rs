@@ -8,7 +8,7 @@
 //! | [`slots`], `switch` | the current and the previous bundle |
 //! | `update`, `start` | the other orders |
 //! | [`executor`], [`journal`] | executes each order once |
-//! | [`sender`] | the other end: the commands |
+//! | [`sender`], [`commands`], [`together`] | the other end: the commands |
 
 pub mod bundle;
 pub mod commands;
@@ -28,6 +28,7 @@ pub mod store;
 mod switch;
 #[cfg(test)]
 mod tests;
+pub mod together;
 mod update;
 
 use std::path::{Path, PathBuf};

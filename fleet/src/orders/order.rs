@@ -21,13 +21,25 @@ pub enum Action {
     Push {
         manifest: FileRef,
         signature: String,
+        /// The sender says that no server of this machine runs.
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        no_server: bool,
     },
     /// Go back to the previous bundle.
-    Back {},
+    Back {
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        no_server: bool,
+    },
     /// Start the program of the machine file.
     Start {
         /// The instant of the start in ns since 1970; at once without it.
         at_unix_ns: Option<u64>,
+    },
+    /// Stop all axes and the program.
+    Stop {
+        /// The nonce of an order `start`: stop only what this order has started, or will start.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        start: Option<String>,
     },
     /// Write firmware to a device.
     Firmware {
@@ -50,8 +62,9 @@ impl Action {
     #[must_use]
     pub fn right(&self) -> Right {
         match self {
-            Self::Push { .. } | Self::Back {} => Right::Push,
+            Self::Push { .. } | Self::Back { .. } => Right::Push,
             Self::Start { .. } => Right::Start,
+            Self::Stop { .. } => Right::Stop,
             Self::Firmware { .. } | Self::Parameters { .. } => Right::Update,
         }
     }
@@ -61,11 +74,13 @@ impl Action {
     pub fn summary(&self) -> String {
         match self {
             Self::Push { manifest, .. } => format!("push bundle {}", manifest.sha256),
-            Self::Back {} => "push back".to_owned(),
+            Self::Back { .. } => "push back".to_owned(),
             Self::Start { at_unix_ns: None } => "start".to_owned(),
             Self::Start {
                 at_unix_ns: Some(at),
             } => format!("start at {at} ns"),
+            Self::Stop { start: None } => "stop".to_owned(),
+            Self::Stop { start: Some(_) } => "stop of a start".to_owned(),
             Self::Firmware { device, file, .. } => {
                 format!("firmware {} to `{device}`", file.sha256)
             }
@@ -144,7 +159,12 @@ impl Order {
             return Err(Error::new(what).help("use the same version of ecaxis-fleet"));
         }
         let digit = |b: u8| b.is_ascii_digit() || (b'a'..=b'f').contains(&b);
-        if order.nonce.len() != 32 || !order.nonce.bytes().all(digit) {
+        let is_nonce = |text: &str| text.len() == 32 && text.bytes().all(digit);
+        let stopped = match &order.action {
+            Action::Stop { start } => start.as_deref(),
+            _ => None,
+        };
+        if !is_nonce(&order.nonce) || !stopped.is_none_or(is_nonce) {
             return Err(Error::new(
                 "the nonce has 32 hexadecimal digits, lower case",
             ));

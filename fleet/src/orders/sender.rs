@@ -71,6 +71,23 @@ impl OrderSender {
         Ok(FileServer(task))
     }
 
+    /// Signs an order to a machine, which is valid from now on.
+    ///
+    /// # Errors
+    /// Fails if the system has no random numbers.
+    pub fn sign(&self, machine: &MachineId, action: Action) -> Result<SentOrder> {
+        let (now, nonce) = (unix_time(), nonce()?);
+        let (from, until) = (now.saturating_sub(EARLY), now + LATE);
+        let order = Order::new(machine.clone(), action, from, until, nonce.clone());
+        let order = serde_json::to_string(&order).map_err(|e| Error::new(e.to_string()))?;
+        let signature = self.signer.sign(order.as_bytes(), "order.json", now)?;
+        Ok(SentOrder {
+            machine: machine.clone(),
+            nonce,
+            message: SignedOrder { order, signature }.emit(),
+        })
+    }
+
     /// Sends an order and follows it until it is started, done, refused or failed.
     ///
     /// # Errors
@@ -81,20 +98,22 @@ impl OrderSender {
         action: Action,
         progress: &mut (dyn FnMut(&str) + Send),
     ) -> Result<OrderReply> {
-        let now = unix_time();
-        let order = Order::new(
-            machine.clone(),
-            action,
-            now.saturating_sub(EARLY),
-            now + LATE,
-            nonce()?,
-        );
-        let order = serde_json::to_string(&order).map_err(|e| Error::new(e.to_string()))?;
-        let signature = self.signer.sign(order.as_bytes(), "order.json", now)?;
-        let message = SignedOrder { order, signature }.emit();
+        self.follow(&self.sign(machine, action)?, progress).await
+    }
+
+    /// As [`Self::send`], with a signed order.
+    ///
+    /// # Errors
+    /// Fails if the machine does not answer. The order may have been executed.
+    pub async fn follow(
+        &self,
+        order: &SentOrder,
+        progress: &mut (dyn FnMut(&str) + Send),
+    ) -> Result<OrderReply> {
+        let machine = &order.machine;
         let mut heard = Instant::now();
         loop {
-            match self.query(machine, &message).await? {
+            match self.query(machine, &order.message).await? {
                 Some(reply) if reply.status == Status::Running => {
                     heard = Instant::now();
                     progress(&reply.text);
@@ -133,6 +152,14 @@ impl OrderSender {
         }
         Ok(None)
     }
+}
+
+/// A signed order.
+#[derive(Debug, Clone)]
+pub struct SentOrder {
+    pub machine: MachineId,
+    pub nonce: String,
+    message: Vec<u8>,
 }
 
 /// Serves files until it is dropped.

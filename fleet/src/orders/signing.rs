@@ -25,6 +25,8 @@ const KDF: std::ops::Range<usize> = 2..4;
 pub enum Right {
     /// Order a machine to start its program.
     Start,
+    /// Order a machine to stop. [`Right::Start`] includes it.
+    Stop,
     /// Order a machine to take a bundle, or to go back.
     Push,
     /// Order firmware and parameters.
@@ -37,6 +39,7 @@ impl fmt::Display for Right {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Start => "start",
+            Self::Stop => "stop",
             Self::Push => "push",
             Self::Update => "update",
             Self::Bundle => "bundle",
@@ -69,7 +72,8 @@ impl TrustedKey {
     /// # Errors
     /// Fails without it.
     pub fn require(&self, right: Right) -> Result<()> {
-        if self.rights.contains(&right) {
+        let included = right == Right::Stop && self.rights.contains(&Right::Start);
+        if included || self.rights.contains(&right) {
             return Ok(());
         }
         Err(Error::new(format!(

@@ -26,6 +26,9 @@ pub struct Switch {
     pub current: Option<FileDigest>,
     pub previous: Option<FileDigest>,
     pub sender: String,
+    /// The nonce of its order.
+    #[serde(default)]
+    pub nonce: Option<String>,
 }
 
 /// A bundle of a slot.
@@ -170,22 +173,36 @@ impl Slots {
         self.link(PREVIOUS, switch.previous)
     }
 
-    /// Ends a switch, and removes the bundles that no slot has. Returns the files in use.
+    /// Ends a switch.
     ///
     /// # Errors
-    /// Fails if a file cannot be removed.
-    pub fn confirm(&self) -> Result<BTreeSet<FileDigest>> {
+    /// Fails if its file cannot be removed.
+    pub fn confirm(&self) -> Result<()> {
         let journal = self.folder.join(JOURNAL);
         if journal.exists() {
             fs::remove_file(&journal).map_err(at(&journal))?;
             // A loss of power must not revive the switch.
             files::sync_folder(&journal).map_err(at(&journal))?;
         }
+        Ok(())
+    }
+
+    /// Removes the bundles that no slot has. Returns the files in use; `None` during a switch,
+    /// which removes nothing.
+    ///
+    /// # Errors
+    /// Fails if a file cannot be removed.
+    pub fn clean(&self) -> Result<Option<BTreeSet<FileDigest>>> {
+        if self.pending()?.is_some() {
+            return Ok(None);
+        }
         let used = [self.current(), self.previous()];
         let entries = fs::read_dir(&self.folder).map_err(at(&self.folder))?;
         for entry in entries.flatten() {
             let name = entry.file_name();
-            let id = name.to_str().and_then(|name| name.parse().ok());
+            // Also a manifest whose bundle was not unpacked to its end.
+            let id = name.to_str().and_then(|name| name.split('.').next());
+            let id = id.and_then(|id| id.parse().ok());
             if let Some(id) = id.filter(|id| !used.contains(&Some(*id))) {
                 self.remove(id)?;
             }
@@ -194,10 +211,8 @@ impl Slots {
             .into_iter()
             .flatten()
             .filter_map(|id| self.unpacked(id).ok());
-        Ok(kept
-            .flat_map(|unpacked| unpacked.manifest.files)
-            .map(|file| file.sha256)
-            .collect())
+        let files = kept.flat_map(|unpacked| unpacked.manifest.files);
+        Ok(Some(files.map(|file| file.sha256).collect()))
     }
 
     /// Removes an unpacked bundle.

@@ -1,5 +1,6 @@
 //! Starts the program of a machine.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use serde_json::json;
@@ -9,14 +10,16 @@ use super::order::Status;
 use super::server;
 use crate::error::Error;
 
-const POLL: Duration = Duration::from_millis(100);
+const POLL: Duration = Duration::from_millis(50);
 
 impl OrderExecutor {
     /// Starts the program and holds the lease until its end: if the agent ends, the axes stop.
+    /// `stop` ends it.
     pub(super) fn start(
         &self,
         at_unix_ns: Option<u64>,
         sender: &str,
+        stop: &AtomicBool,
         progress: &mut dyn FnMut(Status, String),
     ) -> Result<String, Ended> {
         let machine = server::connect(&self.socket, sender).map_err(server::text)?;
@@ -25,6 +28,9 @@ impl OrderExecutor {
         if let Some(at) = at_unix_ns {
             keys["at_unix_ns"] = json!(at);
         }
+        if stop.load(Ordering::SeqCst) {
+            return Err(Error::new("an order `stop` came first").into());
+        }
         let request = machine.command("program", "", keys).map_err(server::text)?;
         let state = match at_unix_ns {
             Some(_) => "the program waits for its instant",
@@ -32,6 +38,11 @@ impl OrderExecutor {
         };
         let mut started = false;
         loop {
+            // On this connection, it cannot overtake the start.
+            if stop.swap(false, Ordering::SeqCst) {
+                let stopped = machine.stop().map_err(server::text);
+                stopped.map_err(Ended::Failed)?;
+            }
             match machine.is_done(request) {
                 Ok(true) => return Ok("the program has ended".to_owned()),
                 Ok(false) => {}

@@ -111,7 +111,7 @@ impl FileStore {
         }
     }
 
-    /// Removes all files but these.
+    /// Removes all files but these and their parts.
     ///
     /// # Errors
     /// Fails if the folder cannot be read.
@@ -119,7 +119,8 @@ impl FileStore {
         let folder = &self.folder;
         for entry in fs::read_dir(folder).map_err(at(folder))?.flatten() {
             let name = entry.file_name();
-            let digest = name.to_str().and_then(|name| name.parse().ok());
+            let digest = name.to_str().and_then(|name| name.split('.').next());
+            let digest = digest.and_then(|digest| digest.parse().ok());
             if digest.is_none_or(|digest| !kept.contains(&digest)) {
                 fs::remove_file(entry.path()).map_err(at(folder))?;
             }

@@ -6,8 +6,10 @@ use std::thread;
 use std::time::Duration;
 
 use ecaxis_client::Machine;
+use serde_json::json;
 
 use super::bundle;
+use super::digest::FileDigest;
 use super::executor::{Ended, OrderExecutor};
 use super::manifest::{FileRef, MAX_MANIFEST, Manifest};
 use super::program;
@@ -21,12 +23,21 @@ const RESTART: Duration = Duration::from_secs(120);
 /// The time between two tries to go back.
 const RETRY: Duration = Duration::from_secs(2);
 
+/// Who orders a switch.
+#[derive(Debug)]
+pub(super) struct SwitchOrder<'a> {
+    pub sender: &'a str,
+    pub nonce: &'a str,
+    /// The sender says that no server of this machine runs.
+    pub no_server: bool,
+}
+
 impl OrderExecutor {
     pub(super) fn push(
         &self,
         file: FileRef,
         signature: &str,
-        sender: &str,
+        order: &SwitchOrder<'_>,
         progress: &mut dyn FnMut(String),
     ) -> std::result::Result<String, Ended> {
         if self.table.restart.is_empty() {
@@ -57,6 +68,8 @@ impl OrderExecutor {
         if self.slots.current() == Some(file.sha256) {
             return Ok("this bundle is the current one".to_owned());
         }
+        let listed = manifest.files.iter().map(|listed| listed.sha256);
+        self.discard(listed.chain([file.sha256]));
         let contents = manifest.files.iter();
         let contents = contents.map(|file| self.fetch(file.content(), progress));
         let contents = contents.collect::<Result<Vec<_>>>()?;
@@ -66,27 +79,33 @@ impl OrderExecutor {
             signature: signature.to_owned(),
             manifest,
         };
-        self.slots.unpack(&unpacked, &contents)?;
-        self.take(&unpacked, sender, progress)
+        let taken = match self.slots.unpack(&unpacked, &contents) {
+            Ok(_) => self.take(&unpacked, order, progress),
+            Err(error) => Err(error.into()),
+        };
+        self.discard([]);
+        taken
     }
 
     pub(super) fn back(
         &self,
-        sender: &str,
+        order: &SwitchOrder<'_>,
         progress: &mut dyn FnMut(String),
     ) -> std::result::Result<String, Ended> {
         let Some(previous) = self.slots.previous() else {
             return Err(Error::new("there is no previous bundle").into());
         };
         let unpacked = self.slots.unpacked(previous)?;
-        self.take(&unpacked, sender, progress)
+        let taken = self.take(&unpacked, order, progress);
+        self.discard([]);
+        taken
     }
 
     /// Checks an unpacked bundle and makes it the current one.
     fn take(
         &self,
         unpacked: &Unpacked,
-        sender: &str,
+        order: &SwitchOrder<'_>,
         progress: &mut dyn FnMut(String),
     ) -> std::result::Result<String, Ended> {
         let folder = self.slots.path(unpacked.id);
@@ -96,8 +115,18 @@ impl OrderExecutor {
         if checked.sha256 != unpacked.manifest.machine_sha256 {
             return Err(Error::new("the files are not those of the manifest").into());
         }
-        // No server: nothing of this machine has power.
-        let machine = self.without_power(sender)?;
+        let expected = self.digest()?;
+        let machine = self.without_power(order.sender)?;
+        match &machine {
+            Some(machine) => self.require_own(machine, expected)?,
+            None if order.no_server => {}
+            None => {
+                let what = format!("no server answers at {}", self.socket.display());
+                let help = "compare `socket` in the file of the agent with that of the server; if \
+                            no server of this machine runs, push with --no-server";
+                return Err(Error::new(what).help(help).into());
+            }
+        }
         let mut keep = || {
             let held = machine.as_ref().map_or(Ok(()), |machine| machine.keep());
             held.map_err(server::text)
@@ -119,7 +148,8 @@ impl OrderExecutor {
             to: unpacked.id,
             current: self.slots.current(),
             previous: self.slots.previous(),
-            sender: sender.to_owned(),
+            sender: order.sender.to_owned(),
+            nonce: Some(order.nonce.to_owned()),
         };
         let switched = self.slots.switch(&switch).and_then(|()| {
             // The disk may have taken longer than the lease.
@@ -181,12 +211,11 @@ impl OrderExecutor {
         if let Err(error) = healthy {
             return self.undo(switch, error, progress);
         }
-        let kept = self.slots.confirm().map_err(Ended::Failed)?;
-        self.store.keep(&kept).map_err(Ended::Failed)?;
+        self.slots.confirm().map_err(Ended::Failed)?;
         Ok(format!("the machine runs the bundle {}", switch.to))
     }
 
-    fn await_health(&self, sha256: Option<super::digest::FileDigest>, sender: &str) -> Result<()> {
+    fn await_health(&self, sha256: Option<FileDigest>, sender: &str) -> Result<()> {
         let timeout = self.health_timeout();
         server::await_health(&self.socket, sender, sha256, timeout)
     }
@@ -240,6 +269,33 @@ impl OrderExecutor {
 }
 
 impl OrderExecutor {
+    /// Returns the digest of the machine file that the server uses; `None` before the first bundle.
+    pub(super) fn digest(&self) -> Result<Option<FileDigest>> {
+        if let Some(current) = self.slots.current() {
+            return Ok(Some(self.slots.unpacked(current)?.manifest.machine_sha256));
+        }
+        let file = &self.table.machine_file;
+        let exists = file.exists();
+        exists
+            .then(|| bundle::check(&self.table.ecaxis, file).map(|checked| checked.sha256))
+            .transpose()
+    }
+
+    /// Requires that the server is that of this machine: a wrong `socket` is that of another.
+    pub(super) fn require_own(&self, machine: &Machine, digest: Option<FileDigest>) -> Result<()> {
+        let described = machine.request("machine", json!({}));
+        let described = described.map_err(server::text)?;
+        if digest.is_some_and(|digest| described["sha256"] == json!(digest)) {
+            return Ok(());
+        }
+        let (socket, file) = (self.socket.display(), self.table.machine_file.display());
+        let what = format!("the server at {socket} does not run {file}");
+        Err(Error::new(what).help(
+            "compare `socket` in the file of the agent with that of the server; restart the server \
+             if its files were changed",
+        ))
+    }
+
     /// Takes the lease and requires disabled axes; `None` if there is no server.
     fn without_power(&self, sender: &str) -> Result<Option<Machine>> {
         match server::connect(&self.socket, sender) {

@@ -1,5 +1,7 @@
 //! Bundles and orders against damage, and against senders without rights.
 
+mod server;
+
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
@@ -327,6 +329,13 @@ fn a_transfer_continues_and_other_content_is_refused() {
             .unwrap(),
         b"wanted"
     );
+    // Only what is needed stays, and its part.
+    let part = folder.path().join(format!("{}.part", content.sha256));
+    fs::write(&part, b"begun").unwrap();
+    store.keep(&[content.sha256].into()).unwrap();
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 2);
+    store.keep(&[].into()).unwrap();
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
 }
 
 #[test]
@@ -350,12 +359,14 @@ fn slots_change_at_once_and_go_back() {
         current: slots.current(),
         previous: slots.previous(),
         sender: "anna".to_owned(),
+        nonce: None,
     };
     let read = || fs::read(folder.path().join("current/m.toml")).unwrap();
     let take = |content| {
         let id = unpack(content);
         slots.switch(&switch(id)).unwrap();
         slots.confirm().unwrap();
+        slots.clean().unwrap();
         id
     };
     let (a, b) = (take(b"a"), take(b"b"));
@@ -367,26 +378,40 @@ fn slots_change_at_once_and_go_back() {
     // Another process continues it.
     let again = Slots::open(folder.path()).unwrap();
     assert_eq!(again.pending().unwrap(), Some(pending.clone()));
+    assert_eq!(again.clean().unwrap(), None);
     again.undo(&pending).unwrap();
-    let kept = again.confirm().unwrap();
+    again.confirm().unwrap();
+    let refused = unpack(b"d");
+    let kept = again.clean().unwrap();
     assert_eq!((read(), slots.previous()), (b"b".to_vec(), Some(a)));
     assert_eq!(again.pending().unwrap(), None);
-    assert!(!slots.path(c).exists());
-    assert_eq!(kept, [b"a", b"b"].map(|t| FileDigest::of(t)).into());
+    assert!(!slots.path(c).exists() && !slots.path(refused).exists());
+    let files = [b"a", b"b"].map(|t| FileDigest::of(t));
+    assert_eq!(kept, Some(files.into()));
+    // Two links, two folders, two manifests with their signatures.
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 8);
 }
 
 fn executor(folder: &Path, keys: &[KeyTable]) -> Arc<OrderExecutor> {
+    executor_with(folder, keys, "false", Memory::new(&[], 0))
+}
+
+fn executor_with(
+    folder: &Path,
+    keys: &[KeyTable],
+    ecaxis: &str,
+    source: Memory,
+) -> Arc<OrderExecutor> {
     let table = OrdersTable {
         folder: folder.join("orders"),
         machine_file: folder.join("orders/current/m.toml"),
-        ecaxis: "false".to_owned(),
+        ecaxis: ecaxis.to_owned(),
         restart: vec!["true".to_owned()],
         health_timeout_s: 1,
         compare: false,
     };
-    let (file, socket) = (folder.join("agent.toml"), folder.join("absent.sock"));
-    let source = Arc::new(Memory::new(&[], 0));
-    OrderExecutor::open(&file, machine(), socket, &table, keys, source).unwrap()
+    let (file, socket) = (folder.join("agent.toml"), folder.join("m.sock"));
+    OrderExecutor::open(&file, machine(), socket, &table, keys, Arc::new(source)).unwrap()
 }
 
 fn order(signer: &Signer, nonce: u8, change: impl Fn(&mut Order)) -> Vec<u8> {
@@ -435,7 +460,7 @@ fn orders_without_right_time_or_place_are_refused() {
         "longer than 86400 s",
     );
     refused(
-        &order(&signer, 5, |o| o.action = Action::Back {}),
+        &order(&signer, 5, |o| o.action = Action::Back { no_server: false }),
         "no right `push`",
     );
     refused(&order(&signer, 6, |o| o.nonce = "no".to_owned()), "nonce");

@@ -56,12 +56,14 @@ impl OrderExecutor {
     ) -> std::result::Result<String, Ended> {
         check_device(device)?;
         let path = self.place(name, file, signature, progress)?;
+        let digest = self.digest()?;
         let record = |info: &Value| FirmwareRecord {
             sha256: file.sha256,
             identity: identity(info),
         };
         let machine = server::connect(&self.socket, sender).map_err(server::text)?;
         server::take_disabled(&machine)?;
+        self.require_own(&machine, digest)?;
         let was_up = server::bus_down(&machine).map_err(Ended::Failed)?;
         progress("read the version".to_owned());
         let known = self.records().map_err(Ended::Failed)?.remove(device);
@@ -118,8 +120,10 @@ impl OrderExecutor {
     ) -> std::result::Result<String, Ended> {
         check_device(device)?;
         let path = self.place(name, file, None, progress)?;
+        let digest = self.digest()?;
         let machine = server::connect(&self.socket, sender).map_err(server::text)?;
         server::take_disabled(&machine)?;
+        self.require_own(&machine, digest)?;
         server::bus_down(&machine).map_err(Ended::Failed)?;
         let steps = [
             (
@@ -167,6 +171,7 @@ impl OrderExecutor {
         if !name.is_name() {
             return Err(Error::new(format!("`{name}` is not the name of a file")));
         }
+        self.discard([file.sha256]);
         let bytes = self.fetch(file, progress)?;
         let folder = self.table.folder.join("update");
         if folder.exists() {
