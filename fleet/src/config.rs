@@ -1,10 +1,12 @@
 //! The files of the programs: TOML, with Zenoh's own configuration in the table `zenoh`.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
-use serde::Deserialize;
-use serde::de::DeserializeOwned;
+use serde::de::{DeserializeOwned, Error as _};
+use serde::{Deserialize, Deserializer};
 use serde_json::{Map, Value, json};
 
 use crate::error::{Error, Result};
@@ -52,12 +54,57 @@ pub struct AgentFile {
     /// The keys whose orders are executed.
     #[serde(default)]
     pub key: Vec<KeyTable>,
+    /// The axes whose set-points are published, for the line shafts of other machines.
+    #[serde(default)]
+    pub setpoints: BTreeSet<Name>,
+    /// The time between two set-points of an axis, 1 to 1000 ms.
+    #[serde(default = "setpoints_interval_ms")]
+    pub setpoints_interval_ms: u64,
+    /// The line shafts of this machine.
+    #[serde(default)]
+    pub line_shaft: Vec<LineShaftTable>,
     /// The configuration of Zenoh.
     #[serde(default)]
     pub zenoh: toml::Table,
 }
 
+/// `[[line_shaft]]` of an agent's file.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LineShaftTable {
+    /// Its name in the machine file.
+    pub name: String,
+    /// The machine that leads: `SITE/MACHINE`.
+    #[serde(deserialize_with = "machine_id")]
+    pub from: MachineId,
+    /// Its axis.
+    pub axis: Name,
+}
+
+fn machine_id<'de, D: Deserializer<'de>>(
+    deserializer: D,
+) -> std::result::Result<MachineId, D::Error> {
+    String::deserialize(deserializer)?
+        .parse()
+        .map_err(D::Error::custom)
+}
+
+fn setpoints_interval_ms() -> u64 {
+    5
+}
+
 impl AgentFile {
+    /// Returns the time between two set-points.
+    ///
+    /// # Errors
+    /// Fails if it is out of its range.
+    pub fn setpoints_interval(&self) -> Result<Duration> {
+        let ms = self.setpoints_interval_ms;
+        let range = "`setpoints_interval_ms` must be 1 to 1000";
+        let given = (1..=1000).contains(&ms).then(|| Duration::from_millis(ms));
+        given.ok_or_else(|| Error::new(format!("{range}, not {ms}")))
+    }
+
     /// Returns the machine of the agent.
     #[must_use]
     pub fn id(&self) -> MachineId {
@@ -234,6 +281,14 @@ mod tests {
             "{error}"
         );
         assert!(config("mode = \"peer\"", Role::Router).is_err());
+        for (text, good) in [
+            ("from = \"a/b\"\naxis = \"x\"", true),
+            ("from = \"b\"\naxis = \"x\"", false),
+            ("from = \"a/b\"\naxis = \"*\"", false),
+        ] {
+            let table = toml::from_str::<LineShaftTable>(&format!("name = \"shaft\"\n{text}"));
+            assert_eq!(table.is_ok(), good, "{text}");
+        }
         assert!(toml::from_str::<AgentFile>("site = \"a\"\nmachin = \"b\"").is_err());
     }
 }

@@ -4,7 +4,7 @@
     python tests/judges/fleet.py [SECTION …]
 
 Two halves of a network with simulated machines, a router each, and an archive: machines that are killed, a network that is
-cut, agents, routers and archive killed at random, clients without rights, a common start. Needs root, the
+cut, agents, routers and archive killed at random, clients without rights, a line shaft, a common start. Needs root, the
 packages of requirements.txt, and minisign.
 `ECAXIS` and `ECAXIS_FLEET_PROGRAM` name the programs. ECAXIS_FLEET_MACHINES (4), ECAXIS_FLEET_SECONDS of kills (20),
 ECAXIS_FLEET_CUT seconds (8) and ECAXIS_FLEET_SEED set the size; 12, 3600 and 30 are the whole test.
@@ -25,6 +25,7 @@ import threading
 import time
 
 import fleet_access
+import fleet_shaft
 import fleet_start
 import rig
 from fleet_net import Hall
@@ -35,7 +36,7 @@ MACHINES = int(os.environ.get("ECAXIS_FLEET_MACHINES", 4))
 SECONDS = float(os.environ.get("ECAXIS_FLEET_SECONDS", 20))
 CUT = float(os.environ.get("ECAXIS_FLEET_CUT", 8))
 SEED = int(os.environ.get("ECAXIS_FLEET_SEED", 1))
-SECTIONS = ["fleet", "access", "start"]
+SECTIONS = ["fleet", "access", "shaft", "start"]
 
 # Every device is silent for a while, again after each bring-up: a fault report every few seconds.
 FAULTS = '[[fault]]\nkind = "silent"\nat = "{at}s"\nfor = "500ms"\n'
@@ -436,6 +437,8 @@ def main():
                     fleet_access.access(report, program())
                 case "start":
                     fleet_start.start(report, program())
+                case "shaft":
+                    fleet_shaft.shaft(report, program())
     except rig.Skip as skip:
         rig.count_skip(skip)
         return 0

@@ -16,7 +16,7 @@ import urllib.request
 
 import rig
 
-NAMES = ["router", "press-3", "archive", "reader", "planner", "stranger"]
+NAMES = ["router", "press-3", "press-4", "archive", "reader", "planner", "stranger"]
 ALL = "ecaxis/**"
 KEY = "ecaxis/hall-1/press-3"
 
@@ -143,9 +143,10 @@ def access(report, program):
         report.need("and its server", rows[0]["state"]["server"] == "present", (folder / "log").read_text()[-1500:])
 
         reader, planner, stranger = (Client(endpoint, tls, name) for name in ("reader", "planner", "stranger"))
+        leader, follower = (Client(endpoint, tls, name) for name in ("press-3", "press-4"))
         # A session hears itself: what must come to nothing comes from sessions of its own.
         forgers = [Client(endpoint, tls, name) for name in ("reader", "stranger")]
-        for client in (reader, planner, stranger, *forgers):
+        for client in (reader, planner, stranger, leader, follower, *forgers):
             stack.callback(client.close)
         forged = '{"site":"hall-1","machine":"press-3","unix_time":9e9}'
         for client in forgers:
@@ -155,11 +156,21 @@ def access(report, program):
             for suffix in ("state", "order", "event/1", "report/1"):
                 client.session.put(f"{KEY}/{suffix}", forged)
             client.session.delete(f"{KEY}/state")
-        time.sleep(3)
+        follower.declared.append(follower.session.declare_subscriber(f"{KEY}/setpoints/*", follower.hear))
+        publisher = leader.session.declare_publisher(f"{KEY}/setpoints/x")
+        time.sleep(1)
+        report.check("the leader knows that it is followed", publisher.matching_status.matching)
+        publisher.put("points")
+        follower.session.put(f"{KEY}/setpoints/x", "forged 9e9")
+        time.sleep(2)
         states = [text for key, text in reader.heard if key == f"{KEY}/state"]
         report.check("a reader hears states", len(states) >= 2, len(states))
         report.check("and asks for them", reader.ask(f"{KEY}/state"))
-        heard = [what for client in (reader, planner) for what in client.heard if "9e9" in what[1] or "ghost" in what[0]]
+        report.check("a follower hears set-points", (f"{KEY}/setpoints/x", "points") in follower.heard, follower.heard[:5])
+        report.equal("and nothing else", {key for key, _ in follower.heard} - {f"{KEY}/alive"}, {f"{KEY}/setpoints/x"})
+        heard = [key for client in (reader, planner, stranger) for key, _ in client.heard if "setpoints" in key]
+        report.equal("no one else hears them", heard, [])
+        heard = [what for client in (reader, planner, leader) for what in client.heard if "9e9" in what[1] or "ghost" in what[0]]
         report.equal("no forged state, event or token arrives", heard, [])
         state = command("status", "--json")[0]["state"]
         report.check("no forged answer arrives", abs(state["unix_time"] - time.time()) < 60, state["unix_time"])

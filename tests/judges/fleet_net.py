@@ -16,7 +16,7 @@ import time
 
 import rig
 
-# Of each link; a frame to another host passes two of them, one to the other half three.
+# Of each link at first; a frame to another host passes two of them, one to the other half three.
 DELAY_S = (0.003, 0.007)
 LOSS = 0.01
 TUNSETIFF, IFF_TAP, IFF_NO_PI = 0x400454CA, 0x0002, 0x1000
@@ -63,6 +63,7 @@ class Switches:
     def __init__(self, seed):
         self.random, self.trunk, self.running = random.Random(seed), True, True
         self.hosts, self.addresses, self.due, self.last = [], {}, [], {}
+        self.delay, self.loss = DELAY_S, LOSS
         self.count = self.lost = 0
         self.selector = selectors.DefaultSelector()
         self.thread = threading.Thread(target=self.run, daemon=True)
@@ -95,11 +96,11 @@ class Switches:
                 continue
             links = 3 if across else 2
             self.count += 1
-            if self.random.random() < 1 - (1 - LOSS) ** links:
+            if self.random.random() < 1 - (1 - self.loss) ** links:
                 self.lost += 1
                 continue
             # The frames of a link stay in their order.
-            due = time.monotonic() + sum(self.random.uniform(*DELAY_S) for _ in range(links))
+            due = time.monotonic() + sum(self.random.uniform(*self.delay) for _ in range(links))
             due = self.last[source, host] = max(due, self.last.get((source, host), 0.0))
             heapq.heappush(self.due, (due, self.count, host, frame))
 

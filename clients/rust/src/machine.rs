@@ -420,6 +420,16 @@ impl Machine {
         Subscription::open(&self.path, &self.name, keys)
     }
 
+    /// Returns the newest set-point of an axis each `interval`, with its instant of common time.
+    ///
+    /// # Errors
+    /// Fails if the axis is unknown or the connection is lost.
+    pub fn setpoints(&self, axis: &str, interval: Duration) -> Result<Subscription> {
+        let interval_ms = u64::try_from(interval.as_millis()).unwrap_or(u64::MAX);
+        let keys = json!({"topics": ["setpoints"], "axis": axis, "interval_ms": interval_ms});
+        Subscription::open(&self.path, &self.name, keys)
+    }
+
     /// Maps the memory for set-points in every cycle.
     ///
     /// # Errors

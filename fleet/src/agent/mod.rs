@@ -1,9 +1,11 @@
-//! The agent of a machine: from the socket of `ecaxis serve` to Zenoh. It reads; only orders change
-//! something.
+//! The agent of a machine: from the socket of `ecaxis serve` to Zenoh. It reads; only orders and
+//! line shafts change something.
 
 pub mod events;
+pub mod line_shaft;
 pub mod publish;
 pub mod reader;
+pub mod setpoints;
 pub mod state;
 
 use std::path::Path;
@@ -19,8 +21,10 @@ use crate::orders::sender::ZenohSource;
 use crate::reports::ReportStore;
 use crate::session;
 use events::Events;
+use line_shaft::LineShaft;
 use publish::Publisher;
 use reader::Reader;
+use setpoints::SetPoints;
 
 /// The fault reports that an agent keeps. The server itself has 20.
 const MAX_REPORTS: usize = 500;
@@ -48,16 +52,13 @@ pub async fn run(path: &Path) -> Result<()> {
     let reader = Reader {
         id: id.clone(),
         socket: socket.clone(),
-        page: file.page,
+        page: file.page.clone(),
         store: Arc::clone(&store),
         events: Arc::clone(&events),
         updates,
     };
     // Its connection to the server blocks. Without Zenoh, it still spools reports.
-    let named = thread::Builder::new().name("reader".to_owned());
-    named
-        .spawn(move || reader.run())
-        .map_err(|error| Error::new(format!("starting a thread: {error}")))?;
+    spawn("reader", move || reader.run())?;
     tracing::info!(machine = %id, socket = %socket.display(), "agent");
     // A switch that was interrupted is finished without Zenoh.
     let source = Arc::new(ZenohSource::new(id.clone()));
@@ -68,14 +69,32 @@ pub async fn run(path: &Path) -> Result<()> {
         Ok(orders)
     });
     let orders = orders.transpose()?;
+    let interval = file.setpoints_interval()?;
     tokio::select! {
         ended = async {
             let session = session::open(zenoh).await?;
             tracing::info!(machine = %id, "connected");
             source.connect(session.clone());
+            for axis in file.setpoints {
+                let (session, id, socket) = (session.clone(), id.clone(), socket.clone());
+                let setpoints = SetPoints { session, id, socket, axis, interval };
+                spawn("set-points", move || setpoints.run())?;
+            }
+            for table in file.line_shaft {
+                let (session, socket) = (session.clone(), socket.clone());
+                let shaft = LineShaft { session, socket, table };
+                spawn("line shaft", move || shaft.run())?;
+            }
             let publisher = Publisher::new(session, id.clone(), store, events, Some(socket));
             publisher.with_orders(orders).run(received).await
         } => ended,
         ended = session::terminated() => ended,
     }
+}
+
+/// Starts a thread, because the connection to the server blocks.
+fn spawn(name: &str, run: impl FnOnce() + Send + 'static) -> Result<()> {
+    let spawned = thread::Builder::new().name(name.to_owned()).spawn(run);
+    spawned.map_err(|error| Error::new(format!("starting a thread: {error}")))?;
+    Ok(())
 }
