@@ -20,7 +20,7 @@ import rig
 from report import Report
 from server import Server
 
-CYCLE_NS = 2_000_000
+CYCLE_NS = 4_000_000
 DRIFTS = [20.0, -30.0]
 SECONDS = float(sys.argv[1]) if len(sys.argv) > 1 else 10.0
 
@@ -31,7 +31,7 @@ def machine(folder, drift, align):
     more = 'common_time = "align"\n' if align else ""
     text = text.replace('cycle = "1ms"', f'cycle = "{CYCLE_NS // 1_000_000}ms"\n{more}')
     # This computer stalls now and then.
-    text = text.replace("lost_frames = 20", "lost_frames = 40")
+    text = text.replace("lost_frames = 20", "lost_frames = 24")
     text = text.replace("[device.axis]", f"[device.sim]\ndrift_ppm = {drift}\n\n[device.axis]")
     path = folder / "machine.toml"
     path.write_text(text)

@@ -73,7 +73,10 @@ fn line(
             };
             let (control, status) = (word(0x6040), word(0x6041));
             let velocity = drive.velocity_rev_s();
-            writeln!(lines, "0x{control:04x},0x{status:04x},{velocity:.4},{sync0}")
+            writeln!(
+                lines,
+                "0x{control:04x},0x{status:04x},{velocity:.4},{sync0}"
+            )
         }
         None => writeln!(lines, ",,,{sync0}"),
     };

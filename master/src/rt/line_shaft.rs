@@ -25,12 +25,16 @@ impl RtLineShaft {
         }
     }
 
-    /// RT: O(1).
-    pub fn advance(&mut self, now_ns: Option<u64>, dt_s: f64) {
+    /// `followed`: an axis is in gear with the shaft. RT: O(1).
+    pub fn advance(&mut self, now_ns: Option<u64>, followed: bool, dt_s: f64) {
         if let Some(cell) = &self.cell {
             cell.read(&mut self.arrived);
         }
-        self.shaft.advance(now_ns, self.arrived, dt_s);
+        // A follower behind a gateway takes a set-point in some of the cycles only. It must see the
+        // end of the stream before another one begins.
+        if !followed || self.shaft.state() != LineShaftState::Waiting {
+            self.shaft.advance(now_ns, self.arrived, dt_s);
+        }
     }
 }
 
@@ -131,4 +135,52 @@ pub(super) fn shafts(
 #[allow(clippy::disallowed_methods, reason = "runs before the loop")]
 pub(super) fn axis_setpoints(cells: &SetpointCells) -> Box<[AxisSetpoints]> {
     cells.axes.iter().cloned().map(AxisSetpoints::new).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use ecaxis_axis::setpoint::LineShaftConfig;
+
+    use super::*;
+
+    const MS: u64 = 1_000_000;
+
+    /// A follower that takes a set-point in some of the cycles only sees the end of a stream, even
+    /// if the next one is already there.
+    #[test]
+    fn another_stream_begins_once_no_axis_follows() {
+        let config = LineShaftConfig {
+            velocity: 10.0,
+            acceleration: 100.0,
+            timeout_s: 0.05,
+            smoothing_s: 0.01,
+            max_error: 1.0,
+        };
+        let cell = Arc::new(SetpointCell::new(0));
+        let shaft = LineShaft::new(config).expect("usable");
+        let mut shaft = RtLineShaft::new(shaft, Some(Arc::clone(&cell)));
+        let mut now = 1_000_000 * MS;
+        let mut cycle = |shaft: &mut RtLineShaft, stream, followed| {
+            now += MS;
+            let motion = Motion {
+                position: stream as f64,
+                ..Motion::default()
+            };
+            cell.write(Some(LineShaftPoint {
+                stream,
+                at_ns: now,
+                motion,
+            }));
+            shaft.advance(Some(now), followed, 0.001);
+            shaft.shaft.state()
+        };
+        assert_eq!(cycle(&mut shaft, 1, false), LineShaftState::Running);
+        assert_eq!(cycle(&mut shaft, 1, true), LineShaftState::Running);
+        assert_eq!(cycle(&mut shaft, 2, true), LineShaftState::Stopping);
+        let states: Vec<_> = (0..100).map(|_| cycle(&mut shaft, 2, true)).collect();
+        assert!(!states.contains(&LineShaftState::Running), "{states:?}");
+        assert_eq!(shaft.shaft.motion(), Err(LineShaftEnd::StreamChanged));
+        assert_eq!(cycle(&mut shaft, 2, false), LineShaftState::Running);
+        assert_eq!(shaft.shaft.last_motion().position, 2.0);
+    }
 }

@@ -154,8 +154,11 @@ impl Engine {
     fn update_line_shafts(&mut self) {
         self.effect_at = self.common.effect_of(self.next);
         let dt_s = self.config.cycle_ns as f64 * 1e-9;
-        for shaft in &mut self.line_shafts {
-            shaft.advance(self.effect_at, dt_s);
+        for (index, shaft) in self.line_shafts.enumerate_mut() {
+            let master = GearMaster::LineShaft(index);
+            let mut followed = self.axes.iter().filter_map(|slot| slot.generator.master());
+            let followed = followed.any(|(of, _)| of == master);
+            shaft.advance(self.effect_at, followed, dt_s);
         }
     }
 
