@@ -423,7 +423,9 @@ fn the_end_of_a_stream_stops_all_followers_in_gear() {
                 checked += 1;
             }
         }
-        assert!(fault == Fault::ClockSet || checked > 20, "{checked}");
+        // A shaft that stands already has no way to go.
+        let short = fault == Fault::ClockSet || stands_at < at + 30 * MS;
+        assert!(short || checked > 20, "{fault:?}: {checked}");
         if again {
             // A new start follows the new stream.
             let moved = followed.frames.iter().filter(|(now, _)| *now > at + SECOND);

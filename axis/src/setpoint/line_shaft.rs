@@ -9,14 +9,16 @@
 //! gear with it.
 
 use super::error::SetpointError;
-use super::{Motion, Ramp};
+use super::{Motion, Ramp, braking_velocity};
 
 /// The time constants within which a difference has decayed to 2 %.
 const TIME_CONSTANTS: f64 = 6.0;
 /// A larger deviation of a cycle from its nominal time is a skipped cycle.
 const CYCLE_TOLERANCE: f64 = 0.01;
-/// The time at rest after which the shaft has ended. Followers behind a gateway take a set-point in
-/// some of the cycles only.
+/// The fraction of the acceleration to brake after a large difference. The rest is for the motion of
+/// the master meanwhile.
+const CLOSING: f64 = 0.5;
+/// The least time at rest after which the shaft has ended.
 const REST_S: f64 = 0.02;
 /// Values at a limit are accepted although they are rounded.
 const ROUNDING: f64 = 1.0 + 1e-6;
@@ -122,7 +124,9 @@ pub struct LineShaft {
     velocity: f64,
     /// The last difference from the prediction.
     error: f64,
+    /// How long the shaft has stood, and after what time it has ended.
     rest_s: f64,
+    ends_after_s: f64,
     /// The time of a cycle by common time.
     cycle_s: f64,
     end: LineShaftEnd,
@@ -176,7 +180,8 @@ impl LineShaftConfig {
     }
 
     /// Returns the motion at an instant. The acceleration lasts until the velocity limit, at most
-    /// for the timeout.
+    /// for the timeout. A deceleration ends at a standstill: a master that stops is not predicted to
+    /// reverse.
     fn predict(&self, point: &LineShaftPoint, at_ns: u64) -> Motion {
         let dt = seconds(at_ns, point.at_ns);
         let Motion {
@@ -188,12 +193,16 @@ impl LineShaftConfig {
         let mut lasts = dt.max(-self.timeout_s).min(self.timeout_s);
         // Forwards in time only: the past of a point is its motion before.
         if acceleration != 0.0 && dt > 0.0 {
-            let limit = self.velocity.copysign(acceleration);
+            let limit = match velocity * acceleration < 0.0 {
+                true => 0.0,
+                false => self.velocity.copysign(acceleration),
+            };
             lasts = lasts.min((limit - velocity) / acceleration);
         }
+        let end = velocity + acceleration * lasts;
         Motion {
             position: position + velocity * dt + acceleration * lasts * (dt - lasts / 2.0),
-            velocity: velocity + acceleration * lasts,
+            velocity: end.max(-self.velocity).min(self.velocity),
             acceleration: if lasts == dt { acceleration } else { 0.0 },
         }
     }
@@ -225,9 +234,18 @@ impl LineShaft {
             velocity: 0.0,
             error: 0.0,
             rest_s: 0.0,
+            ends_after_s: REST_S,
             cycle_s: 0.0,
             end: LineShaftEnd::NoPoints,
         })
+    }
+
+    /// Sets the longest time between two set-points of a follower. The shaft stands for two of them
+    /// before it ends, so that each follower comes to rest with it.
+    #[must_use]
+    pub const fn with_slowest_follower(mut self, cycle_s: f64) -> Self {
+        self.ends_after_s = REST_S.max(2.0 * cycle_s);
+        self
     }
 
     /// Returns the state.
@@ -352,6 +370,12 @@ impl LineShaft {
         let share = dt_s / constant_s;
         let left = (-share).exp() * (drift - (drift + error / constant_s) * share);
         let change = config.acceleration * dt_s;
+        // Not faster than the rest of the difference permits to brake.
+        let closing = braking_velocity(error.abs(), config.acceleration * CLOSING, dt_s);
+        let left = match left * error < 0.0 {
+            true => left.max(-closing).min(closing),
+            false => left,
+        };
         let wanted = after.velocity + left;
         let velocity = wanted.max(-config.velocity).min(config.velocity);
         let velocity = velocity.max(self.velocity - change);
@@ -374,7 +398,7 @@ impl LineShaft {
             self.rest_s += dt_s;
         }
         self.pass(velocity, dt_s);
-        if self.rest_s > REST_S {
+        if self.rest_s > self.ends_after_s {
             self.state = LineShaftState::Waiting;
         }
     }

@@ -55,7 +55,7 @@ fn shaft() -> LineShaft {
 /// Points of a constant velocity and of a constant acceleration, each 10 ms, 30 ms late.
 #[test]
 fn constant_velocity_and_acceleration_are_exact_at_any_delay() {
-    for (velocity, acceleration) in [(3.0, 0.0), (-3.0, 0.0), (0.0, 50.0), (10.0, -60.0)] {
+    for (velocity, acceleration) in [(3.0, 0.0), (-3.0, 0.0), (0.0, 50.0), (10.0, -30.0)] {
         let mut shaft = shaft();
         let at = |s: f64| Motion {
             position: 7.0 + velocity * s + acceleration * s * s / 2.0,
@@ -131,6 +131,45 @@ fn the_end_of_a_stream_stops_the_shaft_and_names_the_reason() {
         shaft.advance(now(500), of(3, 500, at(500)), DT);
         assert_eq!(shaft.state(), LineShaftState::Running);
     }
+}
+
+/// A master that stops is not predicted to reverse, whatever point is the last one.
+#[test]
+fn the_end_of_a_stream_in_a_stop_reverses_nothing() {
+    let motion = |cycle: u64| {
+        let base = leader(&[(0.0, 0.1), (-100.0, 0.08)], cycle as f64 * DT);
+        Motion {
+            position: 8.0 * cycle as f64 * DT + base.position,
+            velocity: 8.0 + base.velocity,
+            acceleration: base.acceleration,
+        }
+    };
+    for last in 100..185 {
+        let mut shaft = shaft();
+        for cycle in 5..400_u64 {
+            // 5 ms late, each 5 ms.
+            let sent = ((cycle - 5) / 5 * 5).min(last);
+            let newest = point(1, BEGIN + sent * MS, motion(sent));
+            shaft.advance(Some(BEGIN + cycle * MS), newest, DT);
+            let velocity = shaft.last_motion().velocity;
+            // The change of the acceleration is known up to 10 ms later.
+            assert!(velocity > -0.5, "{last} {cycle}: {velocity}");
+        }
+        assert_eq!(shaft.last_motion().velocity, 0.0);
+    }
+}
+
+/// A point in the future does not begin above the velocity limit.
+#[test]
+fn an_early_point_begins_within_the_limits() {
+    let mut shaft = shaft();
+    let motion = Motion {
+        position: 0.0,
+        velocity: 20.0,
+        acceleration: -200.0,
+    };
+    shaft.advance(Some(BEGIN), point(1, BEGIN + 40 * MS, motion), DT);
+    assert_eq!(shaft.running().map(|motion| motion.velocity), Ok(20.0));
 }
 
 #[test]
@@ -221,21 +260,30 @@ proptest! {
         }
     }
 
-    /// A difference decays within the smoothing time, without overshoot beyond a tenth.
+    /// A difference of any size decays without overshoot beyond a tenth; a small one within the
+    /// smoothing time, a large one as fast as the limits permit.
     #[test]
-    fn a_difference_decays(jump in -0.01..0.01f64, velocity in -10.0..10.0f64) {
+    fn a_difference_decays(
+        jump in prop_oneof![-0.01..0.01f64, -0.49..0.49f64],
+        velocity in -10.0..10.0f64,
+    ) {
+        let settled = match jump.abs() < 0.01 {
+            true => 40,
+            // Half of the acceleration to brake, and the velocity that the master leaves.
+            false => 60 + (2.5e3 * (jump.abs() / 100.0).sqrt()) as u64,
+        };
         let mut shaft = shaft();
         let at = |cycle: u64| Motion { position: velocity * cycle as f64 * DT, velocity, acceleration: 0.0 };
         for cycle in 0..10 {
             shaft.advance(Some(BEGIN + cycle * MS), point(1, BEGIN + cycle * MS, at(cycle)), DT);
         }
-        for cycle in 10..60_u64 {
+        for cycle in 10..settled + 60 {
             let mut motion = at(cycle);
             motion.position += jump;
             shaft.advance(Some(BEGIN + cycle * MS), point(1, BEGIN + cycle * MS, motion), DT);
             let left = shaft.running().unwrap().position - motion.position;
             prop_assert!(left * jump.signum() < jump.abs() * 0.1, "{} {}", left, jump);
-            if cycle >= 40 {
+            if cycle >= settled {
                 prop_assert!(left.abs() <= 0.05 * jump.abs() + 1e-9, "{} {} {}", cycle, left, jump);
             }
         }

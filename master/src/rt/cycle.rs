@@ -176,6 +176,9 @@ impl Engine {
         let clocks_off = vec![false; parts.exchange.diagnoses().len()].into();
         let mode = parts.exchange.mode();
         let history = FlightRecorder::new(parts.axes.len());
+        let slowest_s = { parts.axes.iter() }
+            .map(|slot| slot.dt_s(config.cycle_ns))
+            .fold(0.0, f64::max);
         Self {
             plain: Plain::new(&parts.axes),
             clock: parts.clock,
@@ -197,7 +200,7 @@ impl Engine {
             controller: parts.controller,
             panicked: false,
             tables: parts.tables,
-            line_shafts: line_shaft::shafts(&config.line_shafts, &parts.setpoints),
+            line_shafts: line_shaft::shafts(&config.line_shafts, &parts.setpoints, slowest_s),
             setpoints: line_shaft::axis_setpoints(&parts.setpoints),
             effect_at: None,
             finished: false,

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use ecaxis_axis::setpoint::{LineShaft, LineShaftEnd, LineShaftPoint, LineShaftState, Motion};
-use ecaxis_axis::{AxisStatus, HomingStatus};
+use ecaxis_axis::{AxisStatus, HomingStatus, Mode};
 use ecaxis_ecat::index::{IndexVec, LineShaftIndex};
 
 use super::setpoint_cell::{SetpointCell, SetpointCells};
@@ -92,13 +92,14 @@ impl AxisSetpoints {
     /// machines. `velocity` is the velocity limit of the axis. RT: O(1).
     pub fn publish(&mut self, at_ns: Option<u64>, axis: &AxisStatus, velocity: f64, dt_s: f64) {
         let homes = axis.homing == HomingStatus::Running;
-        let Some(at_ns) = at_ns.filter(|_| axis.enabled && !homes) else {
+        // In other modes the set-points are those of the drive.
+        let cyclic = matches!(axis.mode, Mode::Csp | Mode::Csv);
+        let Some(at_ns) = at_ns.filter(|_| axis.enabled && cyclic && !homes) else {
             if self.stream.take().is_some() {
                 self.cell.write(None);
             }
             return;
         };
-        // A mode of the drive's own profiles: the set-point is the target.
         let jumped = (axis.target_position - self.last).abs() > 2.0 * velocity * dt_s;
         let stream = self.stream.filter(|_| !jumped);
         let stream = stream.unwrap_or_else(|| self.cell.stream().wrapping_add(1));
@@ -118,16 +119,18 @@ impl AxisSetpoints {
     }
 }
 
-/// Returns the line shafts with their cells. Runs before the loop.
+/// Returns the line shafts with their cells. `slowest_s` is the longest time between two set-points
+/// of an axis. Runs before the loop.
 #[allow(clippy::disallowed_methods, reason = "runs before the loop")]
 pub(super) fn shafts(
     shafts: &[LineShaft],
     cells: &SetpointCells,
+    slowest_s: f64,
 ) -> IndexVec<LineShaftIndex, RtLineShaft> {
     let cells = cells.line_shafts.iter().cloned().map(Some);
     let cells = cells.chain(std::iter::repeat(None));
     let each = shafts.iter().zip(cells);
-    each.map(|(shaft, cell)| RtLineShaft::new(*shaft, cell))
+    each.map(|(shaft, cell)| RtLineShaft::new(shaft.with_slowest_follower(slowest_s), cell))
         .collect()
 }
 

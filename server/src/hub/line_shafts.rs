@@ -11,6 +11,8 @@ use crate::command::SetpointPoint;
 
 /// The points of one message.
 const MAX_POINTS: usize = 64;
+/// The attempts to read common time.
+const READINGS: usize = 20;
 /// The hex digits of a stream.
 const STREAM_DIGITS: usize = 16;
 
@@ -18,7 +20,8 @@ const STREAM_DIGITS: usize = 16;
 #[derive(Debug)]
 struct Feeder {
     client: ClientId,
-    /// The instant of its newest point.
+    /// The newest point: its stream and instant.
+    stream: u64,
     newest_ns: u64,
 }
 
@@ -107,7 +110,8 @@ impl Hub {
     fn common_now(&self) -> Option<u64> {
         let offset = match self.options.virtual_time {
             true => Some(self.latest()?.snapshot.common_time.host_offset_ns),
-            false => clock::common_offset(),
+            // An interruption between two readings is ordinary here.
+            false => (0..READINGS).find_map(|_| clock::common_offset()),
         };
         Some(self.now().wrapping_add_signed(offset?))
     }
@@ -116,7 +120,8 @@ impl Hub {
     /// those that are not newer than the newest one are dropped.
     ///
     /// # Errors
-    /// Fails if another connection feeds the shaft, or with the first point that is rejected.
+    /// Fails if another connection feeds the shaft and its points are not too old, or with the first
+    /// point that is rejected.
     pub fn feed_line_shaft(
         &self,
         client: ClientId,
@@ -136,26 +141,33 @@ impl Hub {
             let message = format!("a message has at most {MAX_POINTS} points");
             return Err(OpError::new(ErrorCode::BadRequest, message).help("send the newest ones"));
         }
-        let now_ns = self.common_now();
+        let Some(now_ns) = self.common_now() else {
+            let message = "common time could not be read";
+            return Err(OpError::new(ErrorCode::Refused, message).help("send the next point"));
+        };
         let mut feeders = self.setpoints.feeders();
         let cell = self.setpoints.cells.line_shafts.get(index.0);
         let (Some(feeder), Some(cell)) = (feeders.get_mut(index.0), cell) else {
             return Ok(0);
         };
-        if feeder.as_ref().is_some_and(|known| known.client != client) {
+        // Neither a connection whose points are too old nor instants of a clock that was set since
+        // then prevent new ones.
+        let timeout_ns = (setup.config.timeout_s * 1e9) as u64;
+        let recent = |known: &Feeder| known.newest_ns.abs_diff(now_ns) <= timeout_ns;
+        let known = feeder.as_ref().filter(|known| recent(known));
+        if known.is_some_and(|known| known.client != client) {
             let message = format!("another connection feeds `{name}`");
             return Err(OpError::new(ErrorCode::Refused, message)
                 .help("close that connection first; `line_shafts` in the state names its client"));
         }
-        let feeder = feeder.get_or_insert(Feeder {
-            client,
-            newest_ns: 0,
-        });
+        let mut newest_ns = known
+            .filter(|known| known.stream == stream)
+            .map(|known| known.newest_ns);
         let mut accepted = 0;
         let mut newest = None;
         let mut rejected = None;
         for (number, point) in points.iter().enumerate() {
-            if point.unix_ns <= feeder.newest_ns {
+            if newest_ns.is_some_and(|newest| point.unix_ns <= newest) {
                 continue;
             }
             let point = LineShaftPoint {
@@ -167,17 +179,22 @@ impl Hub {
                     acceleration: point.acceleration,
                 },
             };
-            if let Err(error) = setup.config.check(&point, now_ns.unwrap_or(point.at_ns)) {
+            if let Err(error) = setup.config.check(&point, now_ns) {
                 let message = format!("point {}: {error}", number + 1);
                 rejected = Some(OpError::new(ErrorCode::Refused, message));
                 break;
             }
-            feeder.newest_ns = point.at_ns;
+            newest_ns = Some(point.at_ns);
             newest = Some(point);
             accepted += 1;
         }
         if let Some(point) = newest {
             cell.write(Some(point));
+            *feeder = Some(Feeder {
+                client,
+                stream,
+                newest_ns: point.at_ns,
+            });
         }
         match rejected {
             Some(error) => Err(error

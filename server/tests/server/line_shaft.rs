@@ -98,11 +98,15 @@ fn one_connection_feeds_a_line_shaft_until_it_closes() {
         (&json!("waiting"), &Value::Null)
     );
     let now = |client: &mut Client| {
-        let state = client.ok("state", json!({}));
-        let bus = &state["bus"]["common_time"];
-        assert_eq!(bus["locked"], json!(true));
-        // Common time is virtual time here.
-        state["time_ns"].as_u64().unwrap()
+        for _ in 0..100 {
+            let state = client.ok("state", json!({}));
+            if state["bus"]["common_time"]["locked"] == json!(true) {
+                // Common time is virtual time here.
+                return state["time_ns"].as_u64().unwrap();
+            }
+            client.advance(0.1);
+        }
+        panic!("common time is not locked");
     };
     let point = |at: u64, velocity: f64| json!({"unix_ns": at, "position": 1.0, "velocity": velocity, "acceleration": 0.0});
     let feed =
@@ -167,7 +171,19 @@ fn one_connection_feeds_a_line_shaft_until_it_closes() {
             .contains("another connection"),
         "{error}"
     );
+    // Its points are too old: another connection may feed the shaft.
+    let mut third = server.client();
+    third.advance(0.2);
+    let at = now(&mut third);
+    third.ok(
+        "line_shaft",
+        feed("00000000000000aa", json!([point(at, 0.0)])),
+    );
+    let error = client.refused("line_shaft", feed(stream, json!([point(at, 0.0)])));
+    let message = error["message"].as_str().unwrap();
+    assert!(message.contains("another connection"), "{error}");
     drop(client);
+    drop(third);
     let mut stopped = Value::Null;
     for _ in 0..200 {
         other.advance(0.01);

@@ -3,6 +3,7 @@
 use ecaxis_ecat::index::AxisIndex;
 
 use super::ProgramChecker;
+use super::follow::CLOCK_MARGIN;
 use crate::config::problem::Problems;
 use crate::config::{Action, AxisSetup, NumberPlace, Step};
 use crate::rt::setpoint_generator::GearMaster;
@@ -54,7 +55,7 @@ impl ProgramChecker<'_> {
         let (Some(cam), Some(follower)) = (self.cams.get(cam), setup(axis)) else {
             return;
         };
-        let (speed, origin, name, unit_of_master) = match master {
+        let (speed, ramp, origin, name, unit_of_master) = match master {
             GearMaster::Axis { axis: master, .. } => {
                 let Some(leader) = setup(master) else { return };
                 let limit = leader.config.limits.velocity;
@@ -63,14 +64,22 @@ impl ProgramChecker<'_> {
                     Speed::Known(speed) => (speed.min(limit), "the velocity of"),
                     Speed::Unknown => return,
                 };
-                (speed, origin, &leader.name, &leader.unit)
+                (speed, 0.0, origin, &leader.name, &leader.unit)
             }
             GearMaster::LineShaft(shaft) => {
                 let Some(shaft) = self.line_shafts.get(shaft) else {
                     return;
                 };
-                let speed = shaft.config.velocity;
-                (speed, "`velocity` of", &shaft.name, &shaft.unit)
+                // It decelerates at any place of the cam, and the followers stay in gear.
+                let (speed, ramp) = (shaft.config.velocity, shaft.config.acceleration);
+                let origin = "`velocity` and `acceleration` of";
+                (
+                    speed * CLOCK_MARGIN,
+                    ramp * CLOCK_MARGIN,
+                    origin,
+                    &shaft.name,
+                    &shaft.unit,
+                )
             }
         };
         let limits = &follower.config.limits;
@@ -81,8 +90,14 @@ impl ProgramChecker<'_> {
             ("jerk", "/s³", jerk),
         ];
         let on_cam = ratio.abs() * speed;
-        for (order, (peak, (what, unit, limit))) in (1..).zip(cam.cam.peaks().iter().zip(rows)) {
-            let needed = peak.value * on_cam.powi(order);
+        let peaks = cam.cam.peaks();
+        let [slope, ..] = peaks;
+        for (order, (peak, (what, unit, limit))) in (1..).zip(peaks.iter().zip(rows)) {
+            let braking = match order {
+                2 => slope.value * ratio.abs() * ramp,
+                _ => 0.0,
+            };
+            let needed = peak.value * on_cam.powi(order) + braking;
             if needed <= limit * ROUNDING {
                 continue;
             }

@@ -21,7 +21,7 @@ const SMOOTHING_NS: u64 = 10_000_000;
 
 /// The largest excess of a limit by the cycles of a follower, which differ in common time by the
 /// drift of its clock.
-const CLOCK_MARGIN: f64 = 1.0 + 1e-3;
+pub(super) const CLOCK_MARGIN: f64 = 1.0 + 1e-3;
 
 impl ProgramChecker<'_> {
     /// Returns an axis that follows positions in at least one of its modes.

@@ -168,6 +168,8 @@ impl Engine {
         for (setpoints, slot) in self.setpoints.iter_mut().zip(&self.axes) {
             let velocity = slot.axis.config().limits.velocity;
             let dt_s = slot.dt_s(self.config.cycle_ns);
+            // The instant of a set-point behind a gateway is that of its CAN network.
+            let at = at.filter(|_| slot.node.is_none());
             setpoints.publish(at, &slot.axis.status(), velocity, dt_s);
         }
     }
