@@ -105,6 +105,20 @@ impl AgentFile {
         given.ok_or_else(|| Error::new(format!("{range}, not {ms}")))
     }
 
+    /// Checks that each line shaft has one leader.
+    ///
+    /// # Errors
+    /// Fails with the name of two tables.
+    pub fn check_line_shafts(&self) -> Result<()> {
+        let names = self.line_shaft.iter().map(|table| &table.name);
+        let mut known = BTreeSet::new();
+        let twice = { names }.find(|name| !known.insert(*name));
+        twice.map_or(Ok(()), |name| {
+            let what = format!("two [[line_shaft]] have the name `{name}`");
+            Err(Error::new(what).help("give each shaft one leader"))
+        })
+    }
+
     /// Returns the machine of the agent.
     #[must_use]
     pub fn id(&self) -> MachineId {

@@ -139,8 +139,11 @@ impl LineShaft {
                 }
             }
             let newest = points.recv_timeout(RETRY).map_err(failed)?;
-            let message = newest.and_then(|sample| Message::parse(&sample.payload().to_bytes()));
-            if let Some(Message { stream, points }) = message {
+            let message = newest.map(|sample| Message::parse(&sample.payload().to_bytes()));
+            if let Some(None) = message {
+                warnings.warn(name, &format!("a message of {from} has no set-points"));
+            }
+            if let Some(Some(Message { stream, points })) = message {
                 let keys = json!({"name": name, "stream": stream, "points": points});
                 if let Err(error) = machine.request("line_shaft", keys) {
                     warnings.warn(name, &error);

@@ -39,6 +39,8 @@ pub const UPDATES: usize = 256;
 pub async fn run(path: &Path) -> Result<()> {
     let file: AgentFile = config::read(path)?;
     let zenoh = config::zenoh(&file.zenoh, path, Role::Service)?;
+    let interval = file.setpoints_interval()?;
+    file.check_line_shafts()?;
     let id = file.id();
     let spool = config::resolve(path, &file.spool);
     let store = ReportStore::open(&spool.join("reports"), MAX_REPORTS).map_err(|error| {
@@ -69,7 +71,6 @@ pub async fn run(path: &Path) -> Result<()> {
         Ok(orders)
     });
     let orders = orders.transpose()?;
-    let interval = file.setpoints_interval()?;
     tokio::select! {
         ended = async {
             let session = session::open(zenoh).await?;

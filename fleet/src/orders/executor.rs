@@ -219,6 +219,13 @@ impl OrderExecutor {
         }
         let permitted = order.check(&self.machine, now);
         let permitted = permitted.and_then(|()| key.require(order.action.right()));
+        let permitted = permitted.and_then(|()| match order.action {
+            Action::Start { .. } if journal.stops_after(order.not_after) => {
+                let what = "an order `stop` was sent after this start";
+                Err(Error::new(what).help("send the start again"))
+            }
+            _ => Ok(()),
+        });
         if let Err(error) = permitted {
             // Without an entry: the sender decides how many of them come, and how long they count.
             let summary = order.action.summary();
@@ -235,7 +242,11 @@ impl OrderExecutor {
         };
         let begins = reply.status == Status::Running;
         if let Err(error) = journal.begin(&order, sha256, &key.name, now, reply.clone()) {
-            return refused(error);
+            // A stop may be executed twice. It needs no log.
+            if !stops {
+                return refused(error);
+            }
+            tracing::error!("the log of orders: {error}");
         }
         drop(journal);
         if !begins {
@@ -282,7 +293,7 @@ impl OrderExecutor {
             return Ok("all axes decelerate and hold; the program has ended".to_owned());
         };
         // It may come later than this order.
-        lock(&self.journal).revoke(start, order.not_after, sender, unix_time())?;
+        let revoked = lock(&self.journal).revoke(start, order.not_after, sender, unix_time());
         let runs = || {
             let running = lock(&self.running);
             let running = running.as_ref().filter(|running| running.nonce == start);
@@ -294,10 +305,14 @@ impl OrderExecutor {
         let begin = Instant::now();
         while runs().is_some() {
             if begin.elapsed() > STOPPED {
-                return Err(Ended::Failed(Error::new("the start does not end")));
+                let what = "the start has not ended yet: its axes may still decelerate";
+                return Err(Ended::Failed(
+                    Error::new(what).help("see the server's state"),
+                ));
             }
             thread::sleep(Duration::from_millis(20));
         }
+        revoked?;
         Ok("the start is cancelled".to_owned())
     }
 

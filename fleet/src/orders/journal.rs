@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::digest::FileDigest;
 use super::files::{self, at};
-use super::order::{MAX_WINDOW, Order, OrderReply, Status};
+use super::order::{Action, MAX_WINDOW, Order, OrderReply, Status};
 use crate::error::{Error, Result};
 
 /// The size at which the log begins again.
@@ -134,6 +134,15 @@ impl OrderJournal {
             order: order.action.summary(),
             reply,
         })
+    }
+
+    /// Returns true if an order `stop` was sent after an order with this end of its time window. All
+    /// windows have the same length, and count in seconds.
+    #[must_use]
+    pub fn stops_after(&self, not_after: u64) -> bool {
+        let stop = Action::Stop { start: None }.summary();
+        let mut stops = self.known.values().filter(|entry| entry.order == stop);
+        stops.any(|entry| entry.not_after > not_after)
     }
 
     /// Enters the nonce of a start that is not to begin. A known order stays as it is.

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::io::Write;
+use std::io::{ErrorKind, Write};
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
@@ -195,6 +195,15 @@ impl Slots {
     pub fn clean(&self) -> Result<Option<BTreeSet<FileDigest>>> {
         if self.pending()?.is_some() {
             return Ok(None);
+        }
+        for link in [CURRENT, PREVIOUS] {
+            let path = self.folder.join(link);
+            let absent =
+                fs::symlink_metadata(&path).is_err_and(|e| e.kind() == ErrorKind::NotFound);
+            if !absent && self.target(link).is_none() {
+                let what = format!("{} is not a link to the digest of a bundle", path.display());
+                return Err(Error::new(what).help("restore the link; nothing was removed"));
+            }
         }
         let used = [self.current(), self.previous()];
         let entries = fs::read_dir(&self.folder).map_err(at(&self.folder))?;

@@ -390,6 +390,11 @@ fn slots_change_at_once_and_go_back() {
     assert_eq!(kept, Some(files.into()));
     // Two links, two folders, two manifests with their signatures.
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 8);
+    // A link that an operator has made by hand: nothing is removed.
+    fs::remove_file(folder.path().join("current")).unwrap();
+    std::os::unix::fs::symlink("/elsewhere/bundle", folder.path().join("current")).unwrap();
+    let error = again.clean().unwrap_err().to_string();
+    assert!(error.contains("is not a link to the digest"), "{error}");
 }
 
 fn executor(folder: &Path, keys: &[KeyTable]) -> Arc<OrderExecutor> {

@@ -36,6 +36,9 @@ pub struct StartArgs {
     key: KeyArgs,
 }
 
+/// The time in which the others answer after a machine that refuses.
+const AFTER_REFUSAL: Duration = Duration::from_secs(1);
+
 #[derive(Debug, Args)]
 pub struct StopArgs {
     #[command(flatten)]
@@ -121,7 +124,8 @@ fn sign(
         .collect()
 }
 
-/// Sends all orders at the same time. Returns a reply to each, in their order.
+/// Sends all orders at the same time. Returns a reply to each, in their order. After a machine that
+/// refuses, the others have [`AFTER_REFUSAL`].
 async fn send(
     sender: &Arc<OrderSender>,
     orders: &[SentOrder],
@@ -140,17 +144,33 @@ async fn send(
             (n, time::timeout(timeout, reply).await)
         });
     }
-    while let Some(ended) = tasks.join_next().await {
-        if let Ok((n, Ok(reply))) = ended {
-            replies[n] = reply;
+    let mut end = None;
+    loop {
+        let next = tasks.join_next();
+        let ended = match end {
+            Some(end) => time::timeout_at(end, next).await,
+            None => Ok(next.await),
+        };
+        match ended {
+            Ok(Some(Ok((n, Ok(reply))))) => {
+                let runs =
+                    |reply: &OrderReply| matches!(reply.status, Status::Started | Status::Done);
+                if !reply.as_ref().is_ok_and(runs) {
+                    end.get_or_insert(time::Instant::now() + AFTER_REFUSAL);
+                }
+                replies[n] = reply;
+            }
+            Ok(Some(_)) => {}
+            Ok(None) | Err(_) => return replies,
         }
     }
-    replies
 }
 
 fn silent(order: &SentOrder, timeout: Duration) -> Error {
     let (machine, seconds) = (&order.machine, timeout.as_secs_f64());
-    let what = format!("{machine} has not accepted the order within {seconds:.1} s");
+    let what = format!(
+        "{machine} has not accepted the order within {seconds:.1} s, or before another one refused"
+    );
     Error::new(what).help("see `ecaxis-fleet status`")
 }
 

@@ -16,6 +16,8 @@ use crate::clock::Nanos;
 pub const FRAMES_PER_PORT: usize = 32;
 /// A frame whose next fragment has not come for this time in ns is incomplete.
 const FRAGMENT_TIMEOUT: Nanos = 20_000_000;
+/// The difference between two readings of the time of the bus in ns.
+const MAX_INACCURACY: i32 = 1_000_000;
 
 /// The frames of a port. `from` and `to` are as seen from the switch.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
@@ -42,7 +44,7 @@ pub struct EthernetCounters {
     pub repeated: u64,
     /// From the port of the device to the switch, by its time stamps.
     pub from_delay: FrameDelay,
-    /// From the switch to the port of the device, by its time stamps.
+    /// From the queue of the switch to the port of the device, by its time stamps.
     pub to_delay: FrameDelay,
 }
 
@@ -60,8 +62,11 @@ pub struct FrameDelay {
 impl FrameDelay {
     /// Adds a frame. The instants are the lower halves of system times.
     fn add(&mut self, from: u32, to: u32) {
-        // Times differ by the accuracy of the measurement.
         let delay = to.wrapping_sub(from).cast_signed();
+        // Not that of this frame, or not the time of the bus.
+        if delay < -MAX_INACCURACY {
+            return;
+        }
         let delay = u64::try_from(delay).unwrap_or(0);
         self.frames += 1;
         self.total_ns = self.total_ns.saturating_add(delay);

@@ -217,8 +217,7 @@ fn the_program_of_the_file_runs_pauses_and_ends() {
 fn the_program_starts_at_an_instant_of_common_time() {
     let server = Server::in_virtual_time(demo());
     let mut client = server.owner("test");
-    client.advance(2.0);
-    let state = client.ok("state", json!({}));
+    let state = client.locked_state();
     let common = &state["bus"]["common_time"];
     assert_eq!(common["clock"], json!("CLOCK_REALTIME"));
     assert_eq!(

@@ -272,6 +272,18 @@ impl Client {
         self.ok("advance", json!({"seconds": seconds}));
     }
 
+    /// Returns the state once common time is known.
+    pub fn locked_state(&mut self) -> Value {
+        for _ in 0..100 {
+            let state = self.ok("state", json!({}));
+            if state["bus"]["common_time"]["locked"] == json!(true) {
+                return state;
+            }
+            self.advance(0.1);
+        }
+        panic!("common time is not locked");
+    }
+
     /// Returns the events so far of this kind.
     pub fn kept_events(&mut self, kind: &str) -> Vec<Value> {
         let events = self.ok("events", json!({}))["events"].clone();

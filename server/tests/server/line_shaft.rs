@@ -57,7 +57,7 @@ fn set_points_of_an_axis_name_their_instant_and_stream() {
     let keys = json!({"topics": ["setpoints"], "axis": "x", "interval_ms": 1});
     client.ok("subscribe", keys);
     // Common time is known, but the axis has no set-point.
-    client.advance(2.0);
+    client.locked_state();
     let early = client
         .events
         .iter()
@@ -97,17 +97,8 @@ fn one_connection_feeds_a_line_shaft_until_it_closes() {
         (&waits["state"], &waits["client"]),
         (&json!("waiting"), &Value::Null)
     );
-    let now = |client: &mut Client| {
-        for _ in 0..100 {
-            let state = client.ok("state", json!({}));
-            if state["bus"]["common_time"]["locked"] == json!(true) {
-                // Common time is virtual time here.
-                return state["time_ns"].as_u64().unwrap();
-            }
-            client.advance(0.1);
-        }
-        panic!("common time is not locked");
-    };
+    // Common time is virtual time here.
+    let now = |client: &mut Client| client.locked_state()["time_ns"].as_u64().unwrap();
     let point = |at: u64, velocity: f64| json!({"unix_ns": at, "position": 1.0, "velocity": velocity, "acceleration": 0.0});
     let feed =
         |stream: &str, points: Value| json!({"name": "shaft", "stream": stream, "points": points});

@@ -371,4 +371,25 @@ fn idns_and_settings_of_eoe_are_init_commands() {
             .all(|eoe| eoe.parameters.is_some())
     );
     assert_eq!(ethernet(&imported), ethernet(&web));
+    // Each request twice, as for two transitions.
+    let twice = exported
+        .text
+        .replace("<EoE>", "\u{1}")
+        .replace("</EoE>", "\u{2}");
+    let parts = twice
+        .split('\u{1}')
+        .map(|part| match part.split_once('\u{2}') {
+            Some((eoe, rest)) => {
+                let begin = eoe.find("<InitCmd>").expect("a request");
+                let end = eoe.rfind("</InitCmds>").expect("the last one");
+                let requests = &eoe[begin..end];
+                let head = &eoe[..begin];
+                format!("{head}{requests}{requests}{}</EoE>{rest}", &eoe[end..])
+            }
+            None => part.to_owned(),
+        });
+    let twice = parts.collect::<Vec<_>>().join("<EoE>");
+    assert!(twice.len() > exported.text.len() + 200);
+    let back = import_with(twice.as_bytes(), &bench.path().join("esi"));
+    assert_eq!(ethernet(&back.machine.expect("a machine")), ethernet(&web));
 }

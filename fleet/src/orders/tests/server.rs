@@ -119,6 +119,32 @@ fn a_stop_ends_a_start_that_runs_and_may_be_repeated() {
     assert!(served.lock().unwrap().stops >= 2);
 }
 
+/// A start that was sent before a stop does not begin after it; one of the same second may be newer.
+#[test]
+fn a_start_from_before_a_stop_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path());
+    let (signer, pair) = keys();
+    let executor = executor(folder.path(), &[key(&pair, &[Right::Start])]);
+    let now = unix_time();
+    let sent_at = |number: u8, at: u64, stops: bool| {
+        order(&signer, number, |order| {
+            (order.not_before, order.not_after) = (at - 10, at + 10);
+            if stops {
+                order.action = Action::Stop { start: None };
+            }
+        })
+    };
+    let reply = executor.receive(&sent_at(1, now, true));
+    assert_eq!(reply.status, Status::Done, "{}", reply.text);
+    let late = executor.receive(&sent_at(2, now - 2, false));
+    assert_eq!(late.status, Status::Refused, "{}", late.text);
+    assert!(late.text.contains("after this start"), "{}", late.text);
+    assert_eq!(served.lock().unwrap().starts, 0);
+    started(&executor, &sent_at(3, now, false));
+    executor.receive(&sent_at(4, now, true));
+}
+
 #[test]
 fn a_stop_of_one_start_leaves_the_others() {
     let folder = tempfile::tempdir().unwrap();

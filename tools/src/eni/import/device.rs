@@ -164,6 +164,9 @@ impl<'n> ImportedDevice<'n> {
         }
         for (position, protocol, data) in &self.network.others {
             if let ("EoE", Some(keys)) = (*protocol, eoe_keys(data)) {
+                // The last of several requests counts.
+                self.eoe
+                    .retain(|(key, _)| keys.iter().all(|(new, _)| new != key));
                 self.eoe.extend(keys);
                 continue;
             }
