@@ -221,6 +221,25 @@ fn config(text: &str) -> Result<ecaxis_master::config::Machine, String> {
     ecaxis_master::config::parse(&file, text).map_err(|error| error.to_string())
 }
 
+/// A line shaft may stop at any place of the cam: its deceleration is added to the acceleration.
+#[test]
+fn a_cam_of_a_line_shaft_leaves_acceleration_for_its_stop() {
+    let cam = "[[cam]]\nname = \"c\"\npoints = [[0.0, 0.0], [5.0, 0.0], [8.0, 8.0], [9.0, 8.0]]\n";
+    let gear = "[[step]]\ngear = { y = { to = \"s\", cam = \"c\" } }\n";
+    // 8 of 3: 5.7735 · 8/9 · 5² and the slope of 1.875 · 8/3 · 100, both with the margin of the clocks.
+    for (acceleration, refused) in [(50.0, false), (100.0, true)] {
+        let shaft = format!(
+            "[[line_shaft]]\nname = \"s\"\nvelocity = 5.0\nacceleration = {acceleration:.1}\n"
+        );
+        let parsed = config(&text(&format!("{cam}{shaft}"), gear));
+        assert_eq!(parsed.is_err(), refused, "{parsed:?}");
+        if let Err(error) = parsed {
+            let part = "its acceleration is 629";
+            assert_contains(&error, &["`y` cannot follow the cam `c`", part, "of `s`"]);
+        }
+    }
+}
+
 /// A mistake in a cam is the only one that is reported: its name is known to the steps.
 #[test]
 fn a_wrong_cam_is_reported_once() {

@@ -87,8 +87,7 @@ fn format_parameters(parameters: &IpParameters, f: &mut fmt::Formatter<'_>) -> f
 }
 
 /// Returns a MAC filter as `MAC filter 01:80:c2:00:00:0e, no broadcasts`.
-#[must_use]
-pub fn format_filter(filter: &MacFilter) -> String {
+fn format_filter(filter: &MacFilter) -> String {
     let list = |addresses: &[MacAddress]| {
         let each = addresses.iter().map(|mac| format_mac(*mac));
         each.collect::<Vec<_>>().join(" ")

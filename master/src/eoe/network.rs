@@ -373,6 +373,7 @@ impl EoePort {
         self.network.with_port(self.number, |port| {
             port.reassembler.reset();
             port.assembling = None;
+            port.given = [None; 16];
             port.counters.unsupported = false;
             port.clear();
         });

@@ -455,11 +455,18 @@ impl Supervisor {
         if let Some(gateway) = &mut self.mailbox_gateway {
             gateway.publish(&snapshot);
         }
-        let common = snapshot.phase.map(|_| &snapshot.common_time);
-        let common = common.filter(|common| common.locked);
-        let offset = common.map(|common| common.host_offset_ns.wrapping_sub(common.offset_ns));
-        let network = &self.ethernet.network;
-        network.set_system_offset(offset.map(i64::cast_unsigned));
+        if self
+            .machine
+            .devices
+            .iter()
+            .any(|device| device.eoe.is_some())
+        {
+            let common = snapshot.phase.map(|_| &snapshot.common_time);
+            let common = common.filter(|common| common.locked);
+            let offset = common.map(|common| common.host_offset_ns.wrapping_sub(common.offset_ns));
+            let network = &self.ethernet.network;
+            network.set_system_offset(offset.map(i64::cast_unsigned));
+        }
         if clock::now().saturating_sub(self.last_status) >= STATUS_PERIOD {
             self.last_status = clock::now();
             self.report(Progress::Status(Status::new(&self.machine, &snapshot)));
