@@ -9,7 +9,7 @@ use ecaxis_master::supervise::operator::{
 
 use super::operator::{Seen, by_hand, gone, here, request};
 use super::{LET_GO_S, VERSATILE, X, Y, once_enabled, within_limits};
-use ecaxis_test_support::{axes, machine, virtual_time};
+use ecaxis_test_support::{axes, faults, machine, virtual_time};
 
 /// Jogs for a quarter of a second, sends one other request, then sends no requests.
 fn replaced_by(file: &str, instead: Request, presence: Presence) -> (f64, Vec<Seen>) {
@@ -189,4 +189,40 @@ fn rejected_homing_counts_as_finished() {
     let news = seen.iter().flat_map(|s| &s.news);
     let refused = news.filter(|news| matches!(news, RequestEvent::Refused { .. }));
     assert_eq!(refused.count(), 2);
+}
+
+/// The axes of a stopped group stop already: a stop of them is no rejection, and none that would
+/// end the reset after it.
+#[test]
+fn a_stop_of_a_stopped_group_is_accepted() {
+    let script = "[[fault]]\nkind = \"drive-fault\"\ndevice = 1\nat = \"2s\"\ncode = 0x8611\n";
+    let mut next = [
+        Request::Stop { axis: X },
+        Request::Reset { axis: X },
+        Request::Enable { axis: X },
+    ]
+    .into_iter();
+    let mut faulty = false;
+    let (outcome, seen) = by_hand(
+        machine(&axes(2)),
+        faults(script),
+        both_enabled(move |view, since| {
+            let status = &view.snapshot.axes;
+            faulty |= status[Y].fault.is_some();
+            if !faulty {
+                let velocity = 2.0;
+                return Some(request(Request::Jog { axis: X, velocity }));
+            }
+            let enables = next.len() == 1 && !view.idle();
+            let turn = (!enables).then(|| next.next().map(request)).flatten();
+            (since < 8.0).then(|| turn.unwrap_or_else(here))
+        }),
+    );
+    outcome.result.expect("the fault was seen to");
+    let news = seen.iter().flat_map(|s| &s.news);
+    let refused: Vec<_> = news
+        .filter(|news| matches!(news, RequestEvent::Refused { .. }))
+        .collect();
+    assert!(refused.is_empty(), "{refused:?}");
+    assert!(seen.last().expect("seen").axes[0].ready, "enabled again");
 }

@@ -74,6 +74,12 @@ pub fn result_text(code: u16) -> &'static str {
 /// A MAC address.
 pub type MacAddress = [u8; 6];
 
+/// Returns a MAC address as `02:00:00:00:00:01`.
+#[must_use]
+pub fn format_mac(mac: MacAddress) -> String {
+    mac.map(|byte| format!("{byte:02x}")).join(":")
+}
+
 /// One EoE message, or another message in the mailbox of an EoE device.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Message<'a> {

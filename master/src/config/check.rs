@@ -116,7 +116,8 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         .collect();
     let cams = cam::check(&raw.cams, folder, p);
     let cycle_ns = bus.as_ref().map_or(0, |b| b.cycle_ns);
-    let line_shafts = line_shaft::check(&raw.line_shafts, (&devices, &axes), cycle_ns, p);
+    let (line_shafts, wrong_shafts) =
+        line_shaft::check(&raw.line_shafts, (&devices, &axes), cycle_ns, p);
     let mut tables = Vec::new();
     let cycle_s = bus.as_ref().map_or(1e-3, |b| b.cycle_ns as f64 * 1e-9);
     let paths = path::check(&raw.paths, &axes, folder, cycle_s, &mut tables, p);
@@ -130,6 +131,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         gantries: &gantries,
         cams: &cams,
         line_shafts: &line_shafts,
+        wrong_shafts: &wrong_shafts,
         paths: &paths,
         tables: &tables,
     };

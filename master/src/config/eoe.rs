@@ -4,7 +4,9 @@ use std::fmt;
 use std::net::Ipv4Addr;
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
-use ecaxis_ecat::mailbox::eoe::{IpParameters, MAX_FILTERS, MacAddress, MacFilter, Message, NAME};
+use ecaxis_ecat::mailbox::eoe::{
+    IpParameters, MAX_FILTERS, MacAddress, MacFilter, Message, NAME, format_mac,
+};
 use ecaxis_esi as esi;
 use sha2::{Digest as _, Sha256};
 
@@ -103,10 +105,6 @@ fn format_filter(filter: &MacFilter) -> String {
         text += ", no broadcasts";
     }
     text
-}
-
-fn format_mac(mac: MacAddress) -> String {
-    mac.map(|byte| format!("{byte:02x}")).join(":")
 }
 
 /// Returns the TAP interface; `None` if it is invalid and has been reported.

@@ -29,16 +29,16 @@ pub struct LineShaftSetup {
     pub shaft: LineShaft,
 }
 
-/// Checks the line shafts. Devices and axes have other names.
-pub(crate) fn check(
-    raw: &[RawLineShaft],
+/// Checks the line shafts. Devices and axes have other names. Also returns the names of wrong ones.
+pub(crate) fn check<'r>(
+    raw: &'r [RawLineShaft],
     (devices, axes): (
         &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
         &IndexVec<AxisIndex, ResolvedAxis<'_>>,
     ),
     cycle_ns: u64,
     p: &mut Problems<'_>,
-) -> IndexVec<LineShaftIndex, LineShaftSetup> {
+) -> (IndexVec<LineShaftIndex, LineShaftSetup>, Vec<&'r str>) {
     let is_taken = |name: &str| {
         let mut devices = devices.iter().map(|device| device.name);
         let mut axes = axes.iter().map(|axis| axis.name);
@@ -101,7 +101,12 @@ pub(crate) fn check(
             Err(error) => p.add(raw.span.clone(), error.to_string()),
         }
     }
-    shafts.into()
+    let names = raw.iter().filter_map(|raw| raw.name.as_ref());
+    let wrong = names
+        .map(|name| name.get_ref().as_str())
+        .filter(|name| shafts.iter().all(|shaft| shaft.name != *name))
+        .collect();
+    (shafts.into(), wrong)
 }
 
 fn above_zero(value: &Spanned<f64>, key: &str, p: &mut Problems<'_>) -> Option<f64> {

@@ -80,6 +80,8 @@ pub(crate) struct Resolved<'c> {
     pub gantries: &'c [CheckedGantry],
     pub cams: &'c [NamedCam],
     pub line_shafts: &'c IndexVec<LineShaftIndex, LineShaftSetup>,
+    /// The names of line shafts whose problems have been reported.
+    pub wrong_shafts: &'c [&'c str],
     /// The paths, with indices into `tables`.
     pub paths: &'c [NamedPath],
     pub tables: &'c [Table],
@@ -125,6 +127,7 @@ pub(crate) fn check(
         gantries: known.gantries.iter().map(|gantry| gantry.config).collect(),
         cams: known.cams,
         line_shafts: known.line_shafts,
+        wrong_shafts: known.wrong_shafts,
         paths: known.paths,
         tables: known.tables.to_vec(),
         inputs: Vec::new(),
@@ -185,6 +188,7 @@ struct ProgramChecker<'c> {
     gantries: Vec<GantryConfig>,
     cams: &'c [NamedCam],
     line_shafts: &'c IndexVec<LineShaftIndex, LineShaftSetup>,
+    wrong_shafts: &'c [&'c str],
     paths: &'c [NamedPath],
     tables: Vec<Table>,
     inputs: Vec<Signal>,

@@ -68,6 +68,11 @@ impl ProgramChecker<'_> {
                 }
                 GearMaster::LineShaft(shaft)
             }
+            None if self.axis_named(to).is_none()
+                && self.wrong_shafts.contains(&to.get_ref().as_str()) =>
+            {
+                return None;
+            }
             None if self.axis_named(to).is_none() && !self.line_shafts.is_empty() => {
                 let shafts = self.line_shafts.iter().map(|setup| setup.name.as_str());
                 let names = self.axes.iter().map(|axis| axis.name).chain(shafts);

@@ -104,6 +104,7 @@ fn config_reports_each_mistake_with_its_place() {
         ("[bus]", "[[line_shaft]]\nname = \"s\"\nvelocity = 100.0\nacceleration = 100.0\ntimeout = \"2ms\"\n[bus]", "the timeout of 2 ms ends within 4 cycles of 1 ms", "delay", "\"2ms\""),
         ("dwell = \"500ms\"", "gear = { x = { to = \"s\", ratio = 3.0 } }\n[[line_shaft]]\nname = \"s\"\nvelocity = 100.0\nacceleration = 100.0", "`x` cannot follow `s`: its velocity would be up to 300.3 mm/s", "`ratio`", "\"s\""),
         ("dwell = \"500ms\"", "gear = { x = { to = \"s\", actual = true } }\n[[line_shaft]]\nname = \"s\"\nvelocity = 100.0\nacceleration = 100.0", "no reported positions", "`actual`", "true"),
+        ("dwell = \"500ms\"", "gear = { x = { to = \"s\" } }\n[[line_shaft]]\nname = \"s\"\nvelocity = -1.0\nacceleration = 100.0", "`velocity` must be above 0", "", "-1.0"),
         ("dwell = \"500ms\"", "gear = { x = { to = \"t\" } }\n[[line_shaft]]\nname = \"s\"\nvelocity = 100.0\nacceleration = 100.0", "nothing to follow is named `t`", "`s`", "\"t\""),
         ("dwell = \"500ms\"", "gear = { v = { to = \"x\" } }", "`gear` is not possible for `v`", "position loop", "v"),
         ("dwell = \"500ms\"", "sine = { x = { amplitude = 40, frequency = 50, periods = 2 } }", "would be reached, above the limit", "smaller amplitude", "40"),

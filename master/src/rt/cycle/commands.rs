@@ -45,8 +45,9 @@ impl Engine {
                 });
                 if let Err(reason) = taken {
                     // A stopping machine rejects motion. The sender receives the stop event
-                    // instead.
-                    if self.stopping().is_some() {
+                    // instead. An axis of a stopped group stops already.
+                    let stops = command == Command::Stop && reason == CommandError::GroupStopped;
+                    if stops || self.stopping().is_some() {
                         return;
                     }
                     let cycle = self.stats.counters.cycles;

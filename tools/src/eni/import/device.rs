@@ -4,7 +4,9 @@ use std::net::Ipv4Addr;
 use std::path::Path;
 
 use ecaxis_ecat::data_type::{DataType, Kind};
-use ecaxis_ecat::mailbox::eoe::{IpParameters, MacAddress, MacFilter, Message, Service};
+use ecaxis_ecat::mailbox::eoe::{
+    IpParameters, MacAddress, MacFilter, Message, Service, format_mac,
+};
 use ecaxis_ecat::mailbox::soe::Idn;
 use ecaxis_ecat::registers;
 use ecaxis_ecat::sii::control;
@@ -437,14 +439,9 @@ fn eoe_keys(data: &[u8]) -> Option<Vec<(&'static str, String)>> {
     }
 }
 
-fn mac_text(mac: MacAddress) -> String {
-    let bytes = mac.map(|byte| format!("{byte:02x}"));
-    bytes.join(":")
-}
-
 fn filter_keys(filter: &MacFilter) -> Vec<(&'static str, String)> {
     let list = |addresses: &[MacAddress]| {
-        let each = addresses.iter().map(|mac| quoted(&mac_text(*mac)));
+        let each = addresses.iter().map(|mac| quoted(&format_mac(*mac)));
         format!("[{}]", each.collect::<Vec<_>>().join(", "))
     };
     let mut keys = vec![("filters", list(&filter.filters))];
@@ -473,7 +470,7 @@ fn ip_keys(parameters: &IpParameters) -> Vec<(&'static str, String)> {
         ("gateway", address(parameters.gateway)),
         ("dns", address(parameters.dns)),
         ("name", name.filter(|name| !name.is_empty())),
-        ("mac", parameters.mac.map(mac_text)),
+        ("mac", parameters.mac.map(format_mac)),
     ];
     let keys = keys.into_iter();
     keys.filter_map(|(key, value)| Some((key, quoted(&value?))))
