@@ -6,7 +6,7 @@ binaries of both workspaces:
     cargo build -p ecaxis && cargo build --manifest-path fleet/Cargo.toml
     tests/judges/fleet_orders.py target/debug/ecaxis fleet/target/debug/ecaxis-fleet [SECTION ...]
 
-The sections are bundles, start, rollout and logs; logs needs the others.
+The sections are bundles, start, rollout, parameters and logs; logs needs the others.
 """
 
 import json
@@ -333,6 +333,36 @@ def rollout(fleet):
     require(all(v == new for v in fleet.firmware().values()), "24 drives run the new firmware")
 
 
+def parameters(fleet):
+    def machine(name):
+        return fleet.folder / name / "orders/current/machine.toml"
+
+    dump, wrong = fleet.folder / "parameters.toml", fleet.folder / "wrong.toml"
+    fleet.must(fleet.ecaxis, "sdo", "dump", machine("m1"), "d1", dump)
+    text = dump.read_text()
+    line = next(line for line in text.splitlines() if line.startswith('"0x6085:00"'))
+    dump.write_text(text.replace(line, line.replace("value = 10000", "value = 12345")))
+    wrong.write_text(dump.read_text() + line.replace("0x6085", "0x2fff") + "\n")
+
+    def ramps():
+        """Returns the quick stop deceleration of each drive that a test uses."""
+        found = []
+        for name, drive in [("m1", "d1"), ("m1", "d2"), ("m1", "d3"), ("m2", "d1"), ("m2", "d2")]:
+            read = fleet.must(fleet.ecaxis, "sdo", "read", machine(name), drive, "0x6085", "--json")
+            found.append(int(json.loads(read)[0]["value"]))
+        return found
+
+    require(ramps() == [10000] * 5, "the drives have the value before")
+    done = fleet.ordered("update", "--parameters", dump, "hall/m1:d1,d2", "hall/m2:d1")
+    print(done, flush=True)
+    require(done.count("has the parameters, stored") == 3, "three drives have the parameters")
+    require(ramps() == [12345, 12345, 10000, 12345, 10000], "those three, and no other")
+    fleet.refused("0 done, 1 not touched", "update", "--parameters", wrong, "hall/m1:d3", "hall/m2:d2")
+    require(ramps()[-1] == 10000, "the drive after it is not touched")
+    fleet.ordered("update", "--parameters", dump, "hall/m1:d3")
+    require(ramps() == [12345] * 4 + [10000], "it goes on after the repair")
+
+
 def logs(fleet):
     lines = (fleet.folder / "m1/orders/orders.jsonl").read_text().splitlines()
     require(all(json.loads(line)["sender"] == "anna" for line in lines), f"{len(lines)} lines in the log of orders")
@@ -343,7 +373,7 @@ def logs(fleet):
         require(any(what in e["command"]["text"] for e in notes), f"the change log has: {what}")
 
 
-SECTIONS = {"bundles": bundles, "start": start, "rollout": rollout, "logs": logs}
+SECTIONS = {"bundles": bundles, "start": start, "rollout": rollout, "parameters": parameters, "logs": logs}
 
 
 def main():
