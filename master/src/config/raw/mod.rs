@@ -182,7 +182,7 @@ table! { "[bus]",
         // The watchdog registers count 100 µs in 16 bits.
         /// A SubDevice without outputs for this time leaves Op by itself (time, 1 ms to 6.5535 s;
         /// default `"100ms"`)
-        watchdog: Key<Ns> [MS..=6553 * S + 500 * MS],
+        watchdog: Key<Ns> [MS..=6553 * MS + MS / 2],
         /// A larger offset from the reference clock (0x092C) is a warning (time, 100 ns to 1 s;
         /// default `"10us"`)
         clock_window: Key<Ns> [100..=S],
