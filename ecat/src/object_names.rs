@@ -37,6 +37,7 @@ pub(crate) fn name(index: u16, sub: u8) -> Option<&'static str> {
         (0x6040, 0) => "Controlword",
         (0x6041, 0) => "Statusword",
         (0x603f, 0) => "Error code",
+        (0x6007, 0) => "Abort connection option code",
         (0x605a, 0) => "Quick stop option code",
         (0x605b, 0) => "Shutdown option code",
         (0x605c, 0) => "Disable operation option code",

@@ -188,6 +188,13 @@ fn against(text: &str) -> Result<Baseline, String> {
     }
 }
 
+impl Args {
+    /// True if the axes are enabled.
+    pub fn enables(&self) -> bool {
+        self.enable
+    }
+}
+
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let plan = plan(args)?;
     if let Some(online) = host::without(plan.cpu) {

@@ -88,12 +88,12 @@ impl Verb {
     /// True if the subcommand may change a machine.
     fn changes(&self) -> bool {
         match self {
-            Self::Run(_) | Self::Serve(_) | Self::Jog(_) => true,
+            Self::Run(_) | Self::Serve(_) | Self::Jog(_) | Self::Tune(_) => true,
             Self::Sdo(args) => args.changes(),
             Self::Soe(args) => args.changes(),
             Self::Eeprom(args) => args.changes(),
             Self::Firmware(args) => args.changes(),
-            Self::Tune(args) => args.changes(),
+            Self::Bench(args) => args.enables(),
             _ => false,
         }
     }
@@ -104,8 +104,11 @@ impl Verb {
         let Some(log) = log else {
             return self.run_unlogged();
         };
-        let long = matches!(self, Self::Run(_) | Self::Serve(_) | Self::Jog(_));
-        if long {
+        let moves = matches!(
+            self,
+            Self::Run(_) | Self::Serve(_) | Self::Jog(_) | Self::Tune(_) | Self::Bench(_)
+        );
+        if moves {
             change_log::append(&log, "begins");
         }
         let done = self.run_unlogged();

@@ -1,5 +1,6 @@
 //! The drive's own limits, read after its start-up SDOs and its units. A limit of the machine file
-//! beyond them causes a warning. Objects that would add to every target are set to zero.
+//! beyond them causes a warning, and so does a drive that ignores a lost connection. Objects that would
+//! add to every target are set to zero.
 
 use ecaxis_ecat::index::AxisIndex;
 use ecaxis_esi::{StartupSdo, axis};
@@ -9,6 +10,13 @@ use crate::config::drive_limits::{OFFSETS, speed_unit};
 use crate::config::{AxisSetup, DeviceConfig};
 use crate::mailbox::{MailboxTransport, NamedObject};
 use crate::report::{Cause, Error};
+
+/// The drive's reaction to a lost connection; 0 is none (CiA 402-2, 0x6007).
+const ABORT_CONNECTION: u16 = 0x6007;
+
+fn is_zero(data: &[u8]) -> bool {
+    data.iter().all(|byte| *byte == 0)
+}
 
 pub(super) async fn compare(
     wire: &impl MailboxTransport,
@@ -55,6 +63,18 @@ pub(super) async fn compare(
         progress(Step::Warning(format!("{}: {conflict}", device.at)));
         device.limits.push((axis_index, conflict));
     }
+    if exists(ABORT_CONNECTION, 0) {
+        let index = object(ABORT_CONNECTION);
+        let found = coe.upload_optional(wire, index, 0, false).await;
+        if found.map_err(failed)?.is_some_and(|data| is_zero(&data)) {
+            progress(Step::Warning(format!(
+                "{}: {} = 0: the drive does not stop if the connection is lost; for a fault \
+                 reaction (0x605e), write `sdo = [{{ index = {index:#06x}, value = 1 }}]`",
+                device.at,
+                NamedObject { index, sub: 0 }
+            )));
+        }
+    }
     for index in OFFSETS {
         // Objects in the process data are written every cycle.
         if !exists(index, 0) || selection.layout.rx_field(index, 0).is_some() {
@@ -63,7 +83,7 @@ pub(super) async fn compare(
         let index = object(index);
         let found = coe.upload_optional(wire, index, 0, false).await;
         let found = found.map_err(failed)?;
-        let Some(data) = found.filter(|data| data.iter().any(|byte| *byte != 0)) else {
+        let Some(data) = found.filter(|data| !is_zero(data)) else {
             continue;
         };
         let zero = StartupSdo {

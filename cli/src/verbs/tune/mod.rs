@@ -112,13 +112,6 @@ enum FormName {
 /// The most cycles of an excitation: their samples are kept in memory.
 const MAX_CYCLES: f64 = 4e6;
 
-impl Args {
-    /// True if the subcommand may change a device.
-    pub fn changes(&self) -> bool {
-        self.apply
-    }
-}
-
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let wrong = |text: String| Failure::new(hints::WRONG, text);
     for (option, value) in [
