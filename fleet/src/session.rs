@@ -27,6 +27,8 @@ const MAX_REPLIES: usize = 100_000;
 const MAX_BYTES: usize = 256 << 20;
 /// The queries that wait for an answer.
 const MAX_QUERIES: usize = 256;
+/// The error that Zenoh adds to the replies when the time is over.
+const TIMED_OUT: &str = "Timeout";
 
 /// What a subscription receives.
 pub type Samples = Subscriber<FifoChannelHandler<Sample>>;
@@ -106,11 +108,29 @@ impl Reply {
     }
 }
 
-/// Asks all that answer to a selector, and returns what came in time. Errors are left out.
+/// The replies of all that answer.
+#[derive(Debug, Clone, Default)]
+pub struct Replies {
+    /// The replies; errors are left out.
+    pub all: Vec<Reply>,
+    /// True if somebody had not answered at the end of the time.
+    pub incomplete: bool,
+}
+
+impl Replies {
+    /// Warns if replies are missing.
+    pub fn warn_if_incomplete(&self, what: &str, timeout: Duration) {
+        if self.incomplete {
+            tracing::warn!("{what}: not all have answered within {timeout:?}; some may be missing");
+        }
+    }
+}
+
+/// Asks all that answer to a selector, and returns what came in time.
 ///
 /// # Errors
 /// Fails if the session is closed or the selector is wrong.
-pub async fn query(session: &Session, selector: &str, timeout: Duration) -> Result<Vec<Reply>> {
+pub async fn query(session: &Session, selector: &str, timeout: Duration) -> Result<Replies> {
     let failed = |error: zenoh::Error| Error::new(format!("query {selector}: {error}"));
     let replies = session
         .get(selector)
@@ -121,10 +141,14 @@ pub async fn query(session: &Session, selector: &str, timeout: Duration) -> Resu
         .timeout(timeout)
         .await
         .map_err(failed)?;
-    let (mut taken, mut bytes) = (Vec::new(), 0);
+    let (mut taken, mut bytes, mut incomplete) = (Vec::new(), 0, false);
     while let Ok(reply) = replies.recv_async().await {
-        let Ok(sample) = reply.into_result() else {
-            continue;
+        let sample = match reply.into_result() {
+            Ok(sample) => sample,
+            Err(error) => {
+                incomplete |= error.payload().to_bytes() == TIMED_OUT.as_bytes();
+                continue;
+            }
         };
         let length = sample.payload().len();
         if length <= MAX_REPLY && taken.len() < MAX_REPLIES && bytes + length <= MAX_BYTES {
@@ -135,7 +159,10 @@ pub async fn query(session: &Session, selector: &str, timeout: Duration) -> Resu
             });
         }
     }
-    Ok(taken)
+    Ok(Replies {
+        all: taken,
+        incomplete,
+    })
 }
 
 /// Starts a thread that answers queries, because replies and the disk block. It ends with the

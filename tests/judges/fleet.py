@@ -377,7 +377,8 @@ class Fleet:
         self.report.equal("each once", len(listed), len({r["id"] for r in listed}))
         newest = listed[0]
         shown = self.command("right", "report", "show", newest["id"][:20])
-        self.report.equal("`report show`", shown["report"]["headline"][:200], newest["headline"])
+        headline = shown["report"]["headline"][:200] if isinstance(shown, dict) else shown
+        self.report.equal("`report show`", headline, newest["headline"])
 
     def archived(self, key):
         """The files of the archive, by number and time of the report."""

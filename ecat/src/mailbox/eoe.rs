@@ -18,6 +18,8 @@
 //! assert_eq!(complete.as_deref(), Some(&frame[..]));
 //! ```
 
+use alloc::format;
+use alloc::string::String;
 use alloc::vec::Vec;
 use core::net::Ipv4Addr;
 

@@ -309,7 +309,7 @@ impl Archive {
     async fn query_reports(&self, selector: &str) -> BTreeSet<(MachineId, ReportId)> {
         let replies = session::query(&self.session, selector, TIMEOUT).await;
         let mut lacking = BTreeSet::new();
-        for reply in replies.unwrap_or_default() {
+        for reply in replies.unwrap_or_default().all {
             let Some((id, "reports")) = MachineId::of_key(&reply.key) else {
                 continue;
             };
@@ -331,7 +331,7 @@ impl Archive {
         }
         let key = id.key(&format!("report/{}", report.as_str()));
         let replies = session::query(&self.session, &key, TIMEOUT).await;
-        let mut replies = replies.unwrap_or_default().into_iter();
+        let mut replies = replies.unwrap_or_default().all.into_iter();
         let Some(whole) = replies.find(|reply| ReportId::of(&reply.bytes) == *report) else {
             return;
         };
@@ -354,7 +354,7 @@ impl Archive {
         let replies = session::query(&self.session, &selector, TIMEOUT).await;
         let answer = replies
             .ok()
-            .and_then(|replies| replies.first()?.json::<Value>());
+            .and_then(|replies| replies.all.first()?.json::<Value>());
         if let Some(Value::Array(events)) = answer.map(|mut answer| answer["events"].take()) {
             let (archive, id) = (Arc::clone(self), id.clone());
             on_disk(move || {

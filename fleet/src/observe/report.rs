@@ -2,15 +2,19 @@
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use zenoh::Session;
 
-use super::{TIMEOUT, print};
+use super::print;
 use crate::error::{Error, Result};
 use crate::keys::{ALL_REPORTS, MachineId};
 use crate::options::{Network, ReportAction};
 use crate::reports::{ReportId, Summary};
 use crate::session;
+
+/// The time for the replies. The lists of a long history are long, and a network may be slow.
+const LIST_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// Lists or shows fault reports.
 ///
@@ -42,7 +46,9 @@ pub async fn run(network: &Network, action: ReportAction) -> Result<()> {
 /// Returns the reports of all that answer, each once, newest first.
 async fn list(session: &Session, selector: &str) -> Result<Vec<Summary>> {
     let mut reports = BTreeMap::new();
-    for reply in session::query(session, selector, TIMEOUT).await? {
+    let replies = session::query(session, selector, LIST_TIMEOUT).await?;
+    replies.warn_if_incomplete("reports", LIST_TIMEOUT);
+    for reply in replies.all {
         let machine = MachineId::of_key(&reply.key).map(|(id, _)| id);
         for summary in reply.json::<Vec<Summary>>().unwrap_or_default() {
             if Some(&summary.machine) == machine.as_ref() {
@@ -70,8 +76,9 @@ async fn show(session: &Session, prefix: &str) -> Result<()> {
     let key = report
         .machine
         .key(&format!("report/{}", report.id.as_str()));
-    let replies = session::query(session, &key, TIMEOUT).await?;
+    let replies = session::query(session, &key, LIST_TIMEOUT).await?;
     let whole = replies
+        .all
         .iter()
         .find(|reply| ReportId::of(&reply.bytes) == report.id);
     let Some(reply) = whole else {

@@ -22,7 +22,7 @@ pub async fn run(network: &Network, request: SamplesRequest) -> Result<()> {
         .key(&format!("samples?signals={signals};seconds={seconds}"));
     let timeout = TIMEOUT + Duration::from_secs_f64(seconds);
     let replies = session::query(&session, &selector, timeout).await?;
-    let Some(reply) = replies.first() else {
+    let Some(reply) = replies.all.first() else {
         return Err(
             Error::new(format!("samples of {}: no answer", request.machine))
                 .help("check the names of the signals, and `ecaxis-fleet status`"),

@@ -42,7 +42,9 @@ pub async fn look(session: &Session) -> Result<BTreeMap<MachineId, Seen>> {
             machines.entry(id).or_default().alive = true;
         }
     }
-    for reply in session::query(session, ALL_STATES, TIMEOUT).await? {
+    let replies = session::query(session, ALL_STATES, TIMEOUT).await?;
+    replies.warn_if_incomplete("status", TIMEOUT);
+    for reply in replies.all {
         if let Some(state) = state_of(&reply) {
             let seen = machines.entry(state.id.clone()).or_default();
             let newer = |old: &State| old.unix_time < state.unix_time;
