@@ -113,7 +113,7 @@ impl Reply {
 pub struct Replies {
     /// The replies; errors are left out.
     pub all: Vec<Reply>,
-    /// True if somebody had not answered at the end of the time.
+    /// True if a reply was missing at the end of the time.
     pub incomplete: bool,
 }
 

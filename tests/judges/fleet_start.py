@@ -140,6 +140,9 @@ def together(report, machines):
         report.check(attempt, done.returncode == 0 and done.stdout.count("decelerate and hold") == 2, done.stdout + done.stderr)
     machines.rest()
     report.check("the axes stand, and no program runs", True)
+    same = machines.order("start")
+    report.check("a start in the second of the stop is refused", "was sent after this start" in same.stderr, same.stderr)
+    time.sleep(1.2)
 
 
 def past(report, machines):

@@ -84,7 +84,7 @@ impl Reader {
         let description = machine.request("machine", json!({}))?;
         // From here on, no event is missed; those before it are in the lists of the server.
         let events = machine.events()?;
-        self.spool(&machine)?;
+        let mut spooled = self.spool(&machine)?;
         let earlier = machine.request("events", json!({"after": 0}))?;
         for event in earlier["events"].as_array().into_iter().flatten() {
             self.take_event(event);
@@ -97,12 +97,16 @@ impl Reader {
                 if absent.take().is_some() {
                     tracing::info!(machine = %self.id, "server present");
                 }
+                // A full disk may have space again.
+                if !spooled {
+                    spooled = self.spool(&machine)?;
+                }
                 self.publish_state(Some(Serve::read(&hello, &description, &state)));
                 due = (due + INTERVAL).max(Instant::now());
             } else if let Some(event) = events.next_within(rest)? {
                 // Reports behind a missed event are found, too.
                 if event["event"] == "fault_report" || event["event"] == "missed" {
-                    self.spool(&machine)?;
+                    spooled = self.spool(&machine)?;
                 }
                 self.take_event(&event);
             }
@@ -115,8 +119,10 @@ impl Reader {
         }
     }
 
-    /// Takes the reports of the server to the disk, then announces the new ones.
-    fn spool(&self, machine: &Machine) -> Result<(), ecaxis_client::Error> {
+    /// Takes the reports of the server to the disk, then announces the new ones. Returns false if the
+    /// disk did not take all.
+    fn spool(&self, machine: &Machine) -> Result<bool, ecaxis_client::Error> {
+        let mut spooled = true;
         let answer = machine.request("fault_reports", json!({}))?;
         for kept in answer["reports"].as_array().into_iter().flatten() {
             let Some(event) = kept["event"].as_u64() else {
@@ -129,10 +135,13 @@ impl Reader {
                     self.send(Update::Report(summary));
                 }
                 Ok(None) => {}
-                Err(error) => tracing::error!(machine = %self.id, event, "spool: {error}"),
+                Err(error) => {
+                    spooled = false;
+                    tracing::error!(machine = %self.id, event, "spool: {error}");
+                }
             }
         }
-        Ok(())
+        Ok(spooled)
     }
 
     fn publish_state(&self, serve: Option<Serve>) {

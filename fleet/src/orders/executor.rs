@@ -10,7 +10,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use serde::Deserialize;
 
 use super::digest::FileDigest;
-use super::journal::OrderJournal;
+use super::journal::{INTERRUPTED, OrderJournal};
 use super::order::{Action, Order, OrderReply, SignedOrder, Status};
 use super::server;
 use super::signing::{KeyTable, Keyring};
@@ -158,7 +158,22 @@ impl OrderExecutor {
     /// # Errors
     /// Fails if the file of the switch is damaged.
     pub fn resume(self: &Arc<Self>) -> Result<()> {
-        let Some(switch) = self.slots.pending()? else {
+        let interrupted = lock(&self.journal).take_interrupted();
+        let pending = self.slots.pending()?;
+        let executor = Arc::clone(self);
+        let switches = pending.is_some();
+        thread::spawn(move || {
+            for (sender, order) in interrupted {
+                // The outcome of a switch follows.
+                if !(switches && order.starts_with("push")) {
+                    let text = format!("order `{order}`: failed: {INTERRUPTED}");
+                    if !server::note(&executor.socket, &sender, &text) {
+                        tracing::warn!(sender, "no server answers: the change log has no entry");
+                    }
+                }
+            }
+        });
+        let Some(switch) = pending else {
             return Ok(());
         };
         let nonce = switch.nonce.clone().unwrap_or_default();
@@ -220,7 +235,7 @@ impl OrderExecutor {
         let permitted = order.check(&self.machine, now);
         let permitted = permitted.and_then(|()| key.require(order.action.right()));
         let permitted = permitted.and_then(|()| match order.action {
-            Action::Start { .. } if journal.stops_after(order.not_after) => {
+            Action::Start { .. } if journal.stops_after(&order) => {
                 let what = "an order `stop` was sent after this start";
                 Err(Error::new(what).help("send the start again"))
             }

@@ -10,10 +10,13 @@ use serde::{Deserialize, Serialize};
 use super::digest::FileDigest;
 use super::files::{self, at};
 use super::order::{Action, MAX_WINDOW, Order, OrderReply, Status};
+use super::sender::EARLY;
 use crate::error::{Error, Result};
 
 /// The size at which the log begins again.
 const MAX_LOG: u64 = 4 << 20;
+/// The outcome of an order that was running when the agent ended.
+pub(super) const INTERRUPTED: &str = "the agent ended during the order";
 /// The nonces that are remembered.
 const MAX_NONCES: usize = 20_000;
 
@@ -43,9 +46,16 @@ pub struct OrderJournal {
     /// The clock may be set back. It would make old orders valid again.
     latest: u64,
     known: BTreeMap<String, Entry>,
+    /// Sender and summary of each order that was running when the agent ended.
+    interrupted: Vec<(String, String)>,
 }
 
 impl OrderJournal {
+    /// Returns sender and summary of each order that was running when the agent ended, once.
+    pub fn take_interrupted(&mut self) -> Vec<(String, String)> {
+        std::mem::take(&mut self.interrupted)
+    }
+
     /// Opens the log. An order that was running when the agent ended has failed.
     ///
     /// # Errors
@@ -63,20 +73,27 @@ impl OrderJournal {
                 }
             }
         }
+        let mut interrupted = Vec::new();
         for entry in known.values_mut() {
             if matches!(entry.reply.status, Status::Running | Status::Started) {
-                entry.reply = OrderReply::new(Status::Failed, "the agent ended during the order");
+                entry.reply = OrderReply::new(Status::Failed, INTERRUPTED);
+                interrupted.push((entry.sender.clone(), entry.order.clone()));
             }
         }
         let file = open(path)?;
+        let length = whole_lines(path)?;
         let mut journal = Self {
             path: path.to_owned(),
             file,
-            length: 0,
+            length,
             latest,
             known,
+            interrupted,
         };
-        journal.rewrite()?;
+        // An agent on a full disk still stops its machine.
+        if let Err(error) = journal.rewrite() {
+            tracing::error!("the log of orders: {error}");
+        }
         Ok(journal)
     }
 
@@ -136,13 +153,14 @@ impl OrderJournal {
         })
     }
 
-    /// Returns true if an order `stop` was sent after an order with this end of its time window. All
-    /// windows have the same length, and count in seconds.
+    /// Returns true if an order `stop` was sent after this order, in the same second, or came after
+    /// it was sent. The computers of two senders may have different clocks.
     #[must_use]
-    pub fn stops_after(&self, not_after: u64) -> bool {
+    pub fn stops_after(&self, order: &Order) -> bool {
+        let sent = order.not_before.saturating_add(EARLY);
         let stop = Action::Stop { start: None }.summary();
         let mut stops = self.known.values().filter(|entry| entry.order == stop);
-        stops.any(|entry| entry.not_after > not_after)
+        stops.any(|entry| entry.not_after >= order.not_after || entry.unix_time >= sent)
     }
 
     /// Enters the nonce of a start that is not to begin. A known order stays as it is.
@@ -224,6 +242,13 @@ impl OrderJournal {
         self.length = lines.len() as u64;
         Ok(())
     }
+}
+
+/// Returns the length of the lines that have an end.
+fn whole_lines(path: &Path) -> Result<u64> {
+    let bytes = fs::read(path).map_err(at(path))?;
+    let end = bytes.iter().rposition(|byte| *byte == b'\n');
+    Ok(end.map_or(0, |end| end as u64 + 1))
 }
 
 fn open(path: &Path) -> Result<File> {

@@ -2,6 +2,7 @@
 
 use std::io::Read;
 use std::process::{Command, Stdio};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -10,7 +11,9 @@ use rustix::process::{Pid, Signal, kill_process};
 use crate::error::{Error, Result};
 
 /// The output that is kept of a program, in bytes.
-const MAX_OUTPUT: u64 = 4 << 20;
+const MAX_OUTPUT: usize = 4 << 20;
+/// The time for the output of a program that has ended.
+const LAST_OUTPUT: Duration = Duration::from_secs(1);
 const POLL: Duration = Duration::from_millis(50);
 /// The time for the end after SIGINT.
 const END: Duration = Duration::from_secs(10);
@@ -90,24 +93,42 @@ pub fn run(
         )));
     }
     ticked?;
-    let text = |reader: Option<thread::JoinHandle<String>>| {
-        reader
-            .and_then(|reader| reader.join().ok())
-            .unwrap_or_default()
-    };
     Ok(Output {
         ok: status.success(),
-        stdout: text(stdout),
-        stderr: text(stderr),
+        stdout: stdout.map(Reader::text).unwrap_or_default(),
+        stderr: stderr.map(Reader::text).unwrap_or_default(),
     })
 }
 
-fn reader(mut pipe: impl Read + Send + 'static) -> thread::JoinHandle<String> {
-    thread::spawn(move || {
-        let mut kept = Vec::new();
-        let _ = pipe.by_ref().take(MAX_OUTPUT).read_to_end(&mut kept);
-        // The program must not wait for a full pipe.
-        let _ = std::io::copy(&mut pipe, &mut std::io::sink());
+/// What a program has printed so far.
+struct Reader {
+    kept: Arc<Mutex<Vec<u8>>>,
+    thread: thread::JoinHandle<()>,
+}
+
+impl Reader {
+    /// Returns the output once the pipe is closed. A program in the background may keep it open.
+    fn text(self) -> String {
+        let end = Instant::now() + LAST_OUTPUT;
+        while !self.thread.is_finished() && Instant::now() < end {
+            thread::sleep(POLL / 5);
+        }
+        let kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         String::from_utf8_lossy(&kept).into_owned()
-    })
+    }
+}
+
+fn reader(mut pipe: impl Read + Send + 'static) -> Reader {
+    let kept = Arc::<Mutex<Vec<u8>>>::default();
+    let fills = Arc::clone(&kept);
+    let thread = thread::spawn(move || {
+        let mut bytes = [0; 4096];
+        // The program must not wait for a full pipe: what is too much is read, and lost.
+        while let Ok(length @ 1..) = pipe.read(&mut bytes) {
+            let mut kept = fills.lock().unwrap_or_else(PoisonError::into_inner);
+            let rest = MAX_OUTPUT.saturating_sub(kept.len());
+            kept.extend(bytes.iter().take(length.min(rest)));
+        }
+    });
+    Reader { kept, thread }
 }

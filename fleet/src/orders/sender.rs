@@ -18,7 +18,7 @@ use crate::error::{Error, Result};
 use crate::keys::MachineId;
 
 /// The time window of an order around the clock of the sender, in s.
-const EARLY: u64 = 30;
+pub(super) const EARLY: u64 = 30;
 const LATE: u64 = 60;
 /// The silence after which a machine is given up.
 const SILENCE: Duration = Duration::from_secs(30);

@@ -157,7 +157,7 @@ impl OrderExecutor {
         });
         progress("restart".to_owned());
         // The restart ends the connection, and with it the lease.
-        if let Err(error) = switched.and_then(|()| self.restart()) {
+        if let Err(error) = switched.and_then(|()| self.restart(machine.as_ref())) {
             drop(machine);
             return self.undo(&switch, error, progress);
         }
@@ -186,8 +186,12 @@ impl OrderExecutor {
         )))
     }
 
-    fn restart(&self) -> Result<()> {
-        let output = program::run(&self.table.restart, RESTART, &mut || Ok(()))?;
+    /// Runs the restart command. No other client gets the lease before the server ends.
+    fn restart(&self, machine: Option<&Machine>) -> Result<()> {
+        let output = program::run(&self.table.restart, RESTART, &mut || {
+            let _ = machine.map(Machine::keep);
+            Ok(())
+        })?;
         if output.ok {
             return Ok(());
         }
@@ -230,28 +234,24 @@ impl OrderExecutor {
         let what = error.to_string();
         let what = what.split("\nhelp:").next().unwrap_or_default().to_owned();
         let failed = |then: &str| Ended::Failed(Error::new(format!("{what}; {then}")));
-        let machine = loop {
-            match self.without_power(&switch.sender) {
-                Ok(machine) => break machine,
-                Err(error) => {
-                    let error = error.to_string();
-                    let why = error.lines().next().unwrap_or_default();
-                    tracing::warn!("the return waits: {why}");
-                    progress(format!("the return waits: {why}"));
-                }
-            }
-            thread::sleep(RETRY);
-        };
+        let mut machine = self.await_without_power(switch, progress);
         if let Err(error) = self.slots.undo(switch) {
             return Err(failed(&format!("the return failed as well: {error}")));
         }
-        let returned = self.restart().and_then(|()| match switch.current {
-            Some(current) => {
-                let sha256 = self.slots.unpacked(current)?.manifest.machine_sha256;
-                self.await_health(Some(sha256), &switch.sender)
-            }
-            None => Ok(()),
-        });
+        // The disk may have taken longer than the lease.
+        if let Some(lost) = machine.take_if(|machine| server::take_disabled(machine).is_err()) {
+            drop(lost);
+            machine = self.await_without_power(switch, progress);
+        }
+        let returned = self
+            .restart(machine.as_ref())
+            .and_then(|()| match switch.current {
+                Some(current) => {
+                    let sha256 = self.slots.unpacked(current)?.manifest.machine_sha256;
+                    self.await_health(Some(sha256), &switch.sender)
+                }
+                None => Ok(()),
+            });
         drop(machine);
         if let Err(error) = self.slots.confirm() {
             return Err(failed(&error.to_string()));
@@ -297,6 +297,26 @@ impl OrderExecutor {
     }
 
     /// Takes the lease and requires disabled axes; `None` if there is no server.
+    /// Waits until no axis has power. Returns the connection with the lease, if there is a server.
+    fn await_without_power(
+        &self,
+        switch: &Switch,
+        progress: &mut dyn FnMut(String),
+    ) -> Option<Machine> {
+        loop {
+            match self.without_power(&switch.sender) {
+                Ok(machine) => return machine,
+                Err(error) => {
+                    let error = error.to_string();
+                    let why = error.lines().next().unwrap_or_default();
+                    tracing::warn!("the return waits: {why}");
+                    progress(format!("the return waits: {why}"));
+                }
+            }
+            thread::sleep(RETRY);
+        }
+    }
+
     fn without_power(&self, sender: &str) -> Result<Option<Machine>> {
         match server::connect(&self.socket, sender) {
             Ok(machine) => server::take_disabled(&machine).map(|()| Some(machine)),

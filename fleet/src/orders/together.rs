@@ -1,7 +1,7 @@
 //! The commands `start` and `stop`: one order to each of several machines at the same time.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use clap::Args;
 use tokio::task::JoinSet;
@@ -38,6 +38,12 @@ pub struct StartArgs {
 
 /// The time in which the others answer after a machine that refuses.
 const AFTER_REFUSAL: Duration = Duration::from_secs(1);
+/// The time before the instant at which no machine is asked any more: the others are still to be
+/// stopped.
+const WATCH_END: Duration = Duration::from_secs(3);
+const WATCH_PERIOD: Duration = Duration::from_millis(200);
+/// The time for a machine to say that it still waits for the instant.
+const WATCH_TIMEOUT: Duration = Duration::from_secs(2);
 
 #[derive(Debug, Args)]
 pub struct StopArgs {
@@ -58,7 +64,17 @@ pub async fn start(args: StartArgs) -> Result<()> {
     let sender = connect(&args.key, &args.network).await?;
     let at_unix_ns = args.at;
     let orders = sign(&sender, &args.machines, |_| Action::Start { at_unix_ns })?;
-    let replies = send(&sender, &orders, acceptance(at_unix_ns, unix_time())).await;
+    let timeout = acceptance(at_unix_ns, unix_time());
+    let mut replies = send(&sender, &orders, timeout, Some(AFTER_REFUSAL)).await;
+    let runs = |reply: &Result<OrderReply>| {
+        let reply = reply.as_ref().ok();
+        reply.is_some_and(|reply| reply.status == Status::Started)
+    };
+    if let Some(at) = at_unix_ns
+        && replies.iter().all(runs)
+    {
+        replies = watch(&sender, &orders, replies, at).await;
+    }
     let (mut errors, mut started) = (Vec::new(), Vec::new());
     for (order, reply) in orders.iter().zip(replies) {
         // A machine without an answer may have accepted the order, or receive it later.
@@ -76,7 +92,7 @@ pub async fn start(args: StartArgs) -> Result<()> {
     let stops = sign(&sender, &machines, |n| Action::Stop {
         start: Some(started[n].nonce.clone()),
     })?;
-    let replies = send(&sender, &stops, CANCEL).await;
+    let replies = send(&sender, &stops, CANCEL, None).await;
     for (order, reply) in stops.iter().zip(replies) {
         let name = order.machine.to_string();
         let stopped = match reply {
@@ -98,7 +114,7 @@ pub async fn start(args: StartArgs) -> Result<()> {
 pub async fn stop(args: StopArgs) -> Result<()> {
     let sender = connect(&args.key, &args.network).await?;
     let orders = sign(&sender, &args.machines, |_| Action::Stop { start: None })?;
-    let replies = send(&sender, &orders, MAX_ACCEPTANCE).await;
+    let replies = send(&sender, &orders, MAX_ACCEPTANCE, None).await;
     let ended = orders.iter().zip(replies).map(|(order, reply)| {
         let name = order.machine.to_string();
         reply.and_then(|reply| succeed(&name, &reply))
@@ -124,12 +140,40 @@ fn sign(
         .collect()
 }
 
-/// Sends all orders at the same time. Returns a reply to each, in their order. After a machine that
-/// refuses, the others have [`AFTER_REFUSAL`].
+/// Asks all machines again and again until [`WATCH_END`] before the instant: axes may not be enabled,
+/// or common time may jump. Returns the last replies, or those with the first failure.
+async fn watch(
+    sender: &Arc<OrderSender>,
+    orders: &[SentOrder],
+    mut replies: Vec<Result<OrderReply>>,
+    at_unix_ns: u64,
+) -> Vec<Result<OrderReply>> {
+    let waits = |reply: &Result<OrderReply>| {
+        let failed = |reply: &OrderReply| reply.status != Status::Started;
+        !reply.as_ref().is_ok_and(failed)
+    };
+    while unix_duration() + WATCH_END < Duration::from_nanos(at_unix_ns) {
+        time::sleep(WATCH_PERIOD).await;
+        replies = send(sender, orders, WATCH_TIMEOUT, None).await;
+        if !replies.iter().all(waits) {
+            break;
+        }
+    }
+    replies
+}
+
+fn unix_duration() -> Duration {
+    let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    now.unwrap_or_default()
+}
+
+/// Sends all orders at the same time. Returns a reply to each, in their order. With
+/// `after_refusal`, the others have this time after a machine that refuses.
 async fn send(
     sender: &Arc<OrderSender>,
     orders: &[SentOrder],
     timeout: Duration,
+    after_refusal: Option<Duration>,
 ) -> Vec<Result<OrderReply>> {
     let mut replies: Vec<_> = orders
         .iter()
@@ -156,7 +200,7 @@ async fn send(
                 let runs =
                     |reply: &OrderReply| matches!(reply.status, Status::Started | Status::Done);
                 if !reply.as_ref().is_ok_and(runs) {
-                    end.get_or_insert(time::Instant::now() + AFTER_REFUSAL);
+                    end = end.or(after_refusal.map(|rest| time::Instant::now() + rest));
                 }
                 replies[n] = reply;
             }

@@ -94,11 +94,11 @@ impl OrderExecutor {
         let info = self
             .firmware_info(&machine, device)
             .map_err(|e| failed(device, &e.to_string()))?;
-        self.restore_bus(&machine, device, sender)?;
         let mut records = self.records().map_err(Ended::Failed)?;
         records.insert(device.to_owned(), record(&info));
         let text = serde_json::to_vec(&records).unwrap_or_default();
         files::write(&self.table.folder.join(RECORDS), &text).map_err(Ended::Failed)?;
+        self.restore_bus(&machine, device, sender)?;
         let report: Value = serde_json::from_str(&output.stdout).unwrap_or_default();
         let version = |key: &str| {
             let version = report[key]["software_version"].as_str();
@@ -146,7 +146,7 @@ impl OrderExecutor {
         Ok(format!("`{device}` has the parameters, stored"))
     }
 
-    /// Brings the bus up and waits until the machine is healthy.
+    /// Brings the bus up and waits until the machine is healthy. Otherwise the bus goes down again.
     fn restore_bus(
         &self,
         machine: &Machine,
@@ -157,7 +157,15 @@ impl OrderExecutor {
         let up = taken.and_then(|()| server::bus_up(machine));
         let timeout = self.health_timeout();
         let healthy = up.and_then(|()| server::await_health(&self.socket, sender, None, timeout));
-        healthy.map_err(|e| Ended::Failed(Error::new(format!("after `{device}`: {e}"))))
+        healthy.map_err(|error| {
+            let down = server::connect(&self.socket, sender).map_err(server::text);
+            let down = down.and_then(|machine| {
+                server::take_disabled(&machine)?;
+                server::bus_down(&machine)
+            });
+            let then = down.map_or_else(|e| format!("; the bus stays up: {e}"), |_| String::new());
+            Ended::Failed(Error::new(format!("after `{device}`: {error}{then}")))
+        })
     }
 
     /// Writes a received file where `ecaxis` reads it.

@@ -129,7 +129,7 @@ fn a_start_from_before_a_stop_is_refused() {
     let now = unix_time();
     let sent_at = |number: u8, at: u64, stops: bool| {
         order(&signer, number, |order| {
-            (order.not_before, order.not_after) = (at - 10, at + 10);
+            (order.not_before, order.not_after) = (at - 30, at + 60);
             if stops {
                 order.action = Action::Stop { start: None };
             }
@@ -137,11 +137,18 @@ fn a_start_from_before_a_stop_is_refused() {
     };
     let reply = executor.receive(&sent_at(1, now, true));
     assert_eq!(reply.status, Status::Done, "{}", reply.text);
-    let late = executor.receive(&sent_at(2, now - 2, false));
-    assert_eq!(late.status, Status::Refused, "{}", late.text);
-    assert!(late.text.contains("after this start"), "{}", late.text);
+    for (number, at) in [(2, now - 2), (5, now)] {
+        let late = executor.receive(&sent_at(number, at, false));
+        assert_eq!(late.status, Status::Refused, "{}", late.text);
+        assert!(late.text.contains("after this start"), "{}", late.text);
+    }
     assert_eq!(served.lock().unwrap().starts, 0);
-    started(&executor, &sent_at(3, now, false));
+    // The stop came from a computer whose clock is behind: it counts from its arrival.
+    let behind = executor.receive(&sent_at(6, now - 20, true));
+    assert_eq!(behind.status, Status::Done, "{}", behind.text);
+    let late = executor.receive(&sent_at(7, now - 5, false));
+    assert_eq!(late.status, Status::Refused, "{}", late.text);
+    started(&executor, &sent_at(3, now + 2, false));
     executor.receive(&sent_at(4, now, true));
 }
 
@@ -182,7 +189,10 @@ fn the_right_to_start_includes_the_stop_alone() {
         let executor = executor(folder.path(), &[key(&pair, &rights)]);
         let reply = executor.receive(&stop(&signer, 1, None));
         assert_eq!(reply.status == Status::Done, permitted, "{}", reply.text);
-        let start = executor.receive(&order(&signer, 2, |_| ()));
+        let later = order(&signer, 2, |order| {
+            order.not_after += 1;
+        });
+        let start = executor.receive(&later);
         assert_eq!(
             start.status == Status::Running,
             rights.contains(&Right::Start)
