@@ -191,8 +191,8 @@ fn rejected_homing_counts_as_finished() {
     assert_eq!(refused.count(), 2);
 }
 
-/// The axes of a stopped group stop already: a stop of them is no rejection, and none that would
-/// end the reset after it.
+/// The axes of a stopped group stop already. A stop of them is not rejected, so no rejection ends
+/// the reset that follows.
 #[test]
 fn a_stop_of_a_stopped_group_is_accepted() {
     let script = "[[fault]]\nkind = \"drive-fault\"\ndevice = 1\nat = \"2s\"\ncode = 0x8611\n";

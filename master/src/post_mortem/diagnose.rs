@@ -354,6 +354,16 @@ fn device_cause(error: &Error, evidence: &Evidence) -> Option<DiagnosedCause> {
         report::Cause::DriveFault {
             code: Some(code), ..
         } if FOLLOWING_ERROR.contains(code) => interpolation(device?, error, evidence),
+        // The fault may be in the process data before the AL status is read.
+        report::Cause::DriveFault {
+            code: Some(0x8100..=0x81ff | 0x8250),
+            ..
+        } => {
+            let device = device?;
+            let code = evidence.named(&device.name)?.look.al_code?;
+            let expired = code == SYNC_MANAGER_WATCHDOG;
+            expired.then(|| left_op(device, AlState::SafeOp, code, evidence))
+        }
         report::Cause::NotEnabled { .. } => {
             let device = device?;
             let watchdog = evidence.named(&device.name)?.look.watchdog?;

@@ -226,6 +226,17 @@ fn diagnose_names_device_and_cause() {
             with(overrun),
             "`a1` (position 1, station 0x1001): drive fault (Statusword 0x0218: Fault), error code (0x603F) 0x3220: DC link undervoltage",
         ),
+        // The drive notices its watchdog first.
+        (
+            report::Cause::DriveFault {
+                code: Some(0x8250),
+                statusword: 0x0218,
+                report: Box::default(),
+            }
+            .with_device(at(1)),
+            with(|e| e.devices[1].look.al_code = Some(0x001b)),
+            "`a1` (position 1) left Op by its process data watchdog, though every frame came back",
+        ),
         (
             left_op(1, 0x001b),
             with(|e| {

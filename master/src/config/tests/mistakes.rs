@@ -18,7 +18,7 @@ fn config_reports_each_mistake_with_its_place() {
         ("nic = \"sim\"", "lost_frames = 100", "are 100 ms, but the drives' `watchdog` stops them after 100 ms", "lost_frames = 99", "100"),
         ("nic = \"sim\"", "watchdog = \"2ms\"", "`lost_frames` = 3 cycles of 1 ms", "lost_frames = 1", "\"2ms\""),
         ("\"1ms\"", "\"40ms\"", "are 120 ms", "lost_frames = 2", "\"40ms\""),
-        ("nic = \"sim\"", "watchdog = \"6.6s\"", "from 1 ms to 6.5535 s", "", "\"6.6s\""),
+        ("nic = \"sim\"", "watchdog = \"6.6s\"", "`watchdog` of 6.6 s is not possible", "from 1 ms to 6.5535 s", "\"6.6s\""),
         ("nic = \"sim\"", "watchdog = \"1ms\"", "expires between two cycles", "", "\"1ms\""),
         ("nic = \"sim\"", "spin = \"2ms\"", "never sleeps", "", "\"2ms\""),
         ("nic = \"sim\"", "spin = \"later\"", "\"later\" is not a duration", "", "later"),
