@@ -104,11 +104,11 @@ impl AxisSetpoints {
         let stream = self.stream.filter(|_| !jumped);
         let stream = stream.unwrap_or_else(|| self.cell.stream().wrapping_add(1));
         (self.stream, self.last) = (Some(stream), axis.target_position);
-        let acceleration = axis.target_acceleration;
+        let (velocity, acceleration) =
+            end_of_cycle(axis.target_velocity, axis.target_acceleration, dt_s);
         let motion = Motion {
             position: axis.target_position,
-            // The velocity of a set-point is the mean one of its cycle.
-            velocity: axis.target_velocity + acceleration * dt_s / 2.0,
+            velocity,
             acceleration,
         };
         self.cell.write(Some(LineShaftPoint {
@@ -116,6 +116,17 @@ impl AxisSetpoints {
             at_ns,
             motion,
         }));
+    }
+}
+
+/// Returns velocity and acceleration at the end of a cycle from its mean velocity. In the cycle in
+/// which an axis comes to rest, both are 0: its deceleration does not go on.
+fn end_of_cycle(mean: f64, acceleration: f64, dt_s: f64) -> (f64, f64) {
+    let end = mean + acceleration * dt_s / 2.0;
+    let none = mean.abs() <= acceleration.abs() * dt_s * 1e-6;
+    match none || end * mean <= 0.0 {
+        true => (0.0, 0.0),
+        false => (end, acceleration),
     }
 }
 
@@ -147,6 +158,30 @@ mod tests {
     use super::*;
 
     const MS: u64 = 1_000_000;
+
+    /// Whatever cycle is the last one of a stop, its point is not predicted to move backwards.
+    #[test]
+    fn the_last_point_of_a_stop_does_not_reverse() {
+        let dt_s = 1e-3;
+        for acceleration in [100.0, 77.7] {
+            for start in [8.0, -8.0, 0.05] {
+                let mut velocity: f64 = start;
+                while velocity != 0.0 {
+                    // As an axis decelerates: the last step ends exactly at rest.
+                    let next = match velocity.abs() > acceleration * dt_s {
+                        true => velocity - acceleration.copysign(velocity) * dt_s,
+                        false => 0.0,
+                    };
+                    let (v, a) = end_of_cycle(next, (next - velocity) / dt_s, dt_s);
+                    assert!(v * start >= 0.0 && a * start <= 0.0, "{v} {a}");
+                    assert!(v != 0.0 || a == 0.0, "{v} {a}");
+                    velocity = next;
+                }
+            }
+        }
+        assert_eq!(end_of_cycle(8.0, -100.0, dt_s), (8.0 - 0.05, -100.0));
+        assert_eq!(end_of_cycle(0.05, 100.0, dt_s), (0.05 + 0.05, 100.0));
+    }
 
     /// A follower that takes a set-point in some of the cycles only sees the end of a stream, even
     /// if the next one is already there.

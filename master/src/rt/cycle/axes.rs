@@ -1,7 +1,7 @@
 //! Steps every axis once per cycle, from its inputs to its outputs.
 
-use ecaxis_axis::StopPhase;
 use ecaxis_axis::setpoint::Motion;
+use ecaxis_axis::{Mode, StopPhase};
 use ecaxis_ecat::index::AxisIndex;
 
 use super::{Engine, Nanos};
@@ -166,11 +166,14 @@ impl Engine {
     pub(super) fn publish_setpoints(&mut self) {
         let at = self.effect_at.filter(|_| self.guarding);
         for (setpoints, slot) in self.setpoints.iter_mut().zip(&self.axes) {
-            let velocity = slot.axis.config().limits.velocity;
+            let (config, status) = (slot.axis.config(), slot.axis.status());
+            let velocity = config.limits.velocity;
             let dt_s = slot.dt_s(self.config.cycle_ns);
             // The instant of a set-point behind a gateway is that of its CAN network.
             let at = at.filter(|_| slot.node.is_none());
-            setpoints.publish(at, &slot.axis.status(), velocity, dt_s);
+            // Without a position loop, the position in CSV is the reported one.
+            let at = at.filter(|_| status.mode != Mode::Csv || config.loops.csv.is_some());
+            setpoints.publish(at, &status, velocity, dt_s);
         }
     }
 

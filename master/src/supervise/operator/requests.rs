@@ -219,9 +219,7 @@ impl RequestController {
         match request {
             Request::StopAll => {
                 for (axis, hand) in self.hands.enumerate_mut() {
-                    // With a stopped group the axis stops anyway and refuses the command. The
-                    // refusal would count for the next request, such as the reset.
-                    if scene.enabled(axis) && !scene.stopped(axis) {
+                    if scene.enabled(axis) {
                         hand.stop(axis, scene.now, out);
                     }
                 }
