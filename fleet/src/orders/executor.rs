@@ -160,16 +160,15 @@ impl OrderExecutor {
     pub fn resume(self: &Arc<Self>) -> Result<()> {
         let interrupted = lock(&self.journal).take_interrupted();
         let pending = self.slots.pending()?;
+        let switch = pending.as_ref().and_then(|switch| switch.nonce.clone());
         let executor = Arc::clone(self);
-        let switches = pending.is_some();
+        // The log of the machine is that of its server, which may not answer.
         thread::spawn(move || {
-            for (sender, order) in interrupted {
+            for order in interrupted {
                 // The outcome of a switch follows.
-                if !(switches && order.starts_with("push")) {
-                    let text = format!("order `{order}`: failed: {INTERRUPTED}");
-                    if !server::note(&executor.socket, &sender, &text) {
-                        tracing::warn!(sender, "no server answers: the change log has no entry");
-                    }
+                if Some(&order.nonce) != switch.as_ref() {
+                    let text = format!("order `{}`: failed: {INTERRUPTED}", order.summary);
+                    executor.note(&order.sender, &text);
                 }
             }
         });
@@ -343,7 +342,11 @@ impl OrderExecutor {
         };
         let text = format!("order `{summary}`: {status}: {text}");
         tracing::info!(sender, "{text}");
-        if !server::note(&self.socket, sender, &text) {
+        self.note(sender, &text);
+    }
+
+    fn note(&self, sender: &str, text: &str) {
+        if !server::note(&self.socket, sender, text) {
             tracing::warn!(sender, "no server answers: the change log has no entry");
         }
     }

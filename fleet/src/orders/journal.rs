@@ -36,6 +36,14 @@ struct Entry {
     reply: OrderReply,
 }
 
+/// An order that was running when the agent ended.
+#[derive(Debug, PartialEq, Eq)]
+pub struct InterruptedOrder {
+    pub nonce: String,
+    pub sender: String,
+    pub summary: String,
+}
+
 /// The log `orders.jsonl`, newest entry last, and its nonces.
 #[derive(Debug)]
 pub struct OrderJournal {
@@ -46,20 +54,20 @@ pub struct OrderJournal {
     /// The clock may be set back. It would make old orders valid again.
     latest: u64,
     known: BTreeMap<String, Entry>,
-    /// Sender and summary of each order that was running when the agent ended.
-    interrupted: Vec<(String, String)>,
+    /// The orders that were running when the agent ended.
+    interrupted: Vec<InterruptedOrder>,
 }
 
 impl OrderJournal {
-    /// Returns sender and summary of each order that was running when the agent ended, once.
-    pub fn take_interrupted(&mut self) -> Vec<(String, String)> {
+    /// Returns the orders that were running when the agent ended, once.
+    pub fn take_interrupted(&mut self) -> Vec<InterruptedOrder> {
         std::mem::take(&mut self.interrupted)
     }
 
     /// Opens the log. An order that was running when the agent ended has failed.
     ///
     /// # Errors
-    /// Fails if the log cannot be read or written.
+    /// Fails if the log cannot be read, or not be opened for writing.
     pub fn open(path: &Path) -> Result<Self> {
         let (mut known, mut latest) = (BTreeMap::new(), 0);
         if path.exists() {
@@ -77,7 +85,11 @@ impl OrderJournal {
         for entry in known.values_mut() {
             if matches!(entry.reply.status, Status::Running | Status::Started) {
                 entry.reply = OrderReply::new(Status::Failed, INTERRUPTED);
-                interrupted.push((entry.sender.clone(), entry.order.clone()));
+                interrupted.push(InterruptedOrder {
+                    nonce: entry.nonce.clone(),
+                    sender: entry.sender.clone(),
+                    summary: entry.order.clone(),
+                });
             }
         }
         let file = open(path)?;

@@ -1,6 +1,6 @@
 //! Runs `ecaxis` and the command that restarts the server.
 
-use std::io::Read;
+use std::io::{ErrorKind, Read};
 use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
@@ -124,7 +124,12 @@ fn reader(mut pipe: impl Read + Send + 'static) -> Reader {
     let thread = thread::spawn(move || {
         let mut bytes = [0; 4096];
         // The program must not wait for a full pipe: what is too much is read, and lost.
-        while let Ok(length @ 1..) = pipe.read(&mut bytes) {
+        loop {
+            let length = match pipe.read(&mut bytes) {
+                Ok(length @ 1..) => length,
+                Err(error) if error.kind() == ErrorKind::Interrupted => continue,
+                Ok(_) | Err(_) => return,
+            };
             let mut kept = fills.lock().unwrap_or_else(PoisonError::into_inner);
             let rest = MAX_OUTPUT.saturating_sub(kept.len());
             kept.extend(bytes.iter().take(length.min(rest)));

@@ -296,7 +296,6 @@ impl OrderExecutor {
         ))
     }
 
-    /// Takes the lease and requires disabled axes; `None` if there is no server.
     /// Waits until no axis has power. Returns the connection with the lease, if there is a server.
     fn await_without_power(
         &self,
@@ -317,6 +316,7 @@ impl OrderExecutor {
         }
     }
 
+    /// Takes the lease and requires disabled axes; `None` if there is no server.
     fn without_power(&self, sender: &str) -> Result<Option<Machine>> {
         match server::connect(&self.socket, sender) {
             Ok(machine) => server::take_disabled(&machine).map(|()| Some(machine)),

@@ -1,16 +1,16 @@
 //! The commands `start` and `stop`: one order to each of several machines at the same time.
 
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use clap::Args;
 use tokio::task::JoinSet;
 use tokio::time;
 
 use super::commands::{KeyArgs, progress, succeed};
-use super::executor::unix_time;
 use super::order::{Action, OrderReply, Status};
 use super::sender::{OrderSender, SentOrder};
+use crate::agent::state::unix_time;
 use crate::error::{Error, Result};
 use crate::keys::MachineId;
 use crate::options::Network;
@@ -148,23 +148,24 @@ async fn watch(
     mut replies: Vec<Result<OrderReply>>,
     at_unix_ns: u64,
 ) -> Vec<Result<OrderReply>> {
-    let waits = |reply: &Result<OrderReply>| {
-        let failed = |reply: &OrderReply| reply.status != Status::Started;
-        !reply.as_ref().is_ok_and(failed)
+    let failed = |reply: &Result<OrderReply>| {
+        let reply = reply.as_ref();
+        reply.is_ok_and(|reply| reply.status != Status::Started)
     };
-    while unix_duration() + WATCH_END < Duration::from_nanos(at_unix_ns) {
+    let end = Duration::from_nanos(at_unix_ns).saturating_sub(WATCH_END);
+    if unix_time() < end.as_secs_f64() {
+        let seconds = WATCH_END.as_secs();
+        let text = format!("wait; they are asked again until {seconds} s before the instant");
+        progress("all machines".to_owned())(&text);
+    }
+    while unix_time() < end.as_secs_f64() {
         time::sleep(WATCH_PERIOD).await;
         replies = send(sender, orders, WATCH_TIMEOUT, None).await;
-        if !replies.iter().all(waits) {
+        if replies.iter().any(failed) {
             break;
         }
     }
     replies
-}
-
-fn unix_duration() -> Duration {
-    let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-    now.unwrap_or_default()
 }
 
 /// Sends all orders at the same time. Returns a reply to each, in their order. With
@@ -213,16 +214,16 @@ async fn send(
 fn silent(order: &SentOrder, timeout: Duration) -> Error {
     let (machine, seconds) = (&order.machine, timeout.as_secs_f64());
     let what = format!(
-        "{machine} has not accepted the order within {seconds:.1} s, or before another one refused"
+        "{machine} has not confirmed the order within {seconds:.1} s, or before another one refused"
     );
     Error::new(what).help("see `ecaxis-fleet status`")
 }
 
 /// Returns the time to accept a start: half of the time until the instant. The other half is for
 /// the stop of those that have accepted.
-fn acceptance(at_unix_ns: Option<u64>, now: u64) -> Duration {
+fn acceptance(at_unix_ns: Option<u64>, now: f64) -> Duration {
     at_unix_ns.map_or(MAX_ACCEPTANCE, |at| {
-        let rest = Duration::from_nanos(at).saturating_sub(Duration::from_secs(now));
+        let rest = Duration::from_nanos(at).saturating_sub(Duration::from_secs_f64(now));
         (rest / 2).clamp(MIN_ACCEPTANCE, MAX_ACCEPTANCE)
     })
 }
@@ -262,7 +263,7 @@ mod tests {
             (Some(5), s(1.0)),
             (Some(u64::MAX), s(30.0)),
         ] {
-            assert_eq!(acceptance(at, 1_000), time, "{at:?}");
+            assert_eq!(acceptance(at, 1_000.0), time, "{at:?}");
         }
     }
 

@@ -146,7 +146,8 @@ impl OrderExecutor {
         Ok(format!("`{device}` has the parameters, stored"))
     }
 
-    /// Brings the bus up and waits until the machine is healthy. Otherwise the bus goes down again.
+    /// Brings the bus up and waits until the machine is healthy. Otherwise, the bus goes down again
+    /// unless another client has enabled an axis.
     fn restore_bus(
         &self,
         machine: &Machine,
@@ -158,11 +159,8 @@ impl OrderExecutor {
         let timeout = self.health_timeout();
         let healthy = up.and_then(|()| server::await_health(&self.socket, sender, None, timeout));
         healthy.map_err(|error| {
-            let down = server::connect(&self.socket, sender).map_err(server::text);
-            let down = down.and_then(|machine| {
-                server::take_disabled(&machine)?;
-                server::bus_down(&machine)
-            });
+            let disabled = server::take_disabled(machine);
+            let down = disabled.and_then(|()| server::bus_down(machine));
             let then = down.map_or_else(|e| format!("; the bus stays up: {e}"), |_| String::new());
             Ended::Failed(Error::new(format!("after `{device}`: {error}{then}")))
         })
