@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 use std::fmt;
 use std::sync::{Arc, LazyLock, Mutex};
 
-use ecaxis_axis::setpoint::LineShaftPoint;
+use ecaxis_axis::setpoint::{LineShaftPoint, Motion};
 use ecaxis_master::rt::setpoint_cell::{SetpointCell, SetpointCells};
 use ecaxis_master::supervise::operator::{ProgramRequest, Request};
 use ecaxis_test_support::random::Random;
@@ -63,10 +63,18 @@ static LEADER: LazyLock<Vec<LineShaftPoint>> = LazyLock::new(|| {
                  [[step]]\nvelocity = { a0 = 8.0 }\n[[step]]\ndwell = \"600ms\"\n\
                  [[step]]\nvelocity = { a0 = -8.0 }\n[[step]]\ndwell = \"600ms\"\n[[step]]\nstop = [\"a0\"]\n";
     let limits = "velocity = 10.0, acceleration = 100.0, jerk = 5000.0";
-    let text = format!(
-        "[bus]\ncycle = \"1ms\"\n{ALIGN}\n{}{steps}",
-        device(0, "csp", -25.0, limits)
+    let points = lead(&device(0, "csp", -25.0, limits), steps);
+    assert!(
+        points
+            .windows(2)
+            .all(|p| p[1].at_ns > p[0].at_ns && p[0].stream == p[1].stream)
     );
+    points
+});
+
+/// Runs a leader, and returns what it publishes.
+fn lead(device: &str, steps: &str) -> Vec<LineShaftPoint> {
+    let text = format!("[bus]\ncycle = \"1ms\"\n{ALIGN}\n{device}{steps}");
     let cell = Arc::new(SetpointCell::new(41));
     let log = Arc::<Mutex<Vec<LineShaftPoint>>>::default();
     let (reads, kept) = (Arc::clone(&cell), Arc::clone(&log));
@@ -91,14 +99,52 @@ static LEADER: LazyLock<Vec<LineShaftPoint>> = LazyLock::new(|| {
         each_cycle: Some(EachCycle(Box::new(each))),
     });
     assert_eq!((leader.error, leader.kept.events.len()), (None, 1));
-    let points = std::mem::take(&mut *log.lock().expect("one thread"));
-    assert!(
-        points
-            .windows(2)
-            .all(|p| p[1].at_ns > p[0].at_ns && p[0].stream == p[1].stream)
-    );
-    points
-});
+    std::mem::take(&mut *log.lock().expect("one thread"))
+}
+
+/// A leader that stops without a jerk limit decelerates up to its last cycle. The point of that
+/// cycle has no motion: followers without a newer one would be predicted to move backwards.
+#[test]
+fn a_leader_that_stops_publishes_no_motion_at_its_end() {
+    let limits = "velocity = 10.0, acceleration = 100.0";
+    for end in [
+        "stop = [\"a0\"]",
+        "velocity = { a0 = 0.0 }",
+        "move_by = { a0 = 5.0 }",
+    ] {
+        let steps = format!(
+            "[[step]]\nvelocity = {{ a0 = 8.0 }}\n[[step]]\ndwell = \"200ms\"\n[[step]]\n{end}\n"
+        );
+        let points = lead(&device(0, "csp", 0.0, limits), &steps);
+        let fastest = points.iter().map(|p| p.motion.velocity).fold(0.0, f64::max);
+        assert!(fastest > 7.9, "{end}: {fastest}");
+        assert!(points.last().is_some_and(|p| p.motion.velocity == 0.0));
+        for point in &points {
+            let Motion {
+                velocity,
+                acceleration,
+                ..
+            } = point.motion;
+            assert!(velocity >= 0.0, "{end}: {velocity}");
+            assert!(
+                velocity > 0.0 || acceleration == 0.0,
+                "{end}: {acceleration}"
+            );
+        }
+    }
+}
+
+/// In CSV without a position loop, an axis has no commanded position.
+#[test]
+fn a_leader_without_positions_publishes_none() {
+    let limits = "velocity = 10.0, acceleration = 100.0";
+    let steps = "[[step]]\nvelocity = { a0 = 8.0 }\n[[step]]\ndwell = \"200ms\"\n[[step]]\nstop = [\"a0\"]\n";
+    let with_loop = device(0, "csv", 0.0, limits);
+    let without = with_loop.replace("csv = { kv = 30.0, feed_forward = 1.0 }\n", "");
+    assert_ne!(with_loop, without);
+    assert!(lead(&with_loop, steps).len() > 100);
+    assert_eq!(lead(&without, steps), []);
+}
 
 /// Returns the set-point of the leader at an instant.
 fn leader_at(at_ns: u64) -> LineShaftPoint {
