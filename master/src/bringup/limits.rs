@@ -1,6 +1,6 @@
 //! The drive's own limits, read after its start-up SDOs and its units. A limit of the machine file
-//! beyond them causes a warning, and so does a drive that ignores a lost connection. Objects that would
-//! add to every target are set to zero.
+//! beyond them causes a warning, and so does a drive that ignores a lost connection. Objects that
+//! would add to every target are set to zero.
 
 use ecaxis_ecat::index::AxisIndex;
 use ecaxis_esi::{StartupSdo, axis};

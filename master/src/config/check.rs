@@ -116,8 +116,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         .collect();
     let cams = cam::check(&raw.cams, folder, p);
     let cycle_ns = bus.as_ref().map_or(0, |b| b.cycle_ns);
-    let (line_shafts, wrong_shafts) =
-        line_shaft::check(&raw.line_shafts, (&devices, &axes), cycle_ns, p);
+    let line_shafts = line_shaft::check(&raw.line_shafts, (&devices, &axes), cycle_ns, p);
     let mut tables = Vec::new();
     let cycle_s = bus.as_ref().map_or(1e-3, |b| b.cycle_ns as f64 * 1e-9);
     let paths = path::check(&raw.paths, &axes, folder, cycle_s, &mut tables, p);
@@ -131,7 +130,6 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         gantries: &gantries,
         cams: &cams,
         line_shafts: &line_shafts,
-        wrong_shafts: &wrong_shafts,
         paths: &paths,
         tables: &tables,
     };
@@ -204,7 +202,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         axes: axes.into(),
         gantries: gantries.iter().map(|gantry| gantry.config).collect(),
         cams,
-        line_shafts,
+        line_shafts: line_shafts.iter().filter_map(|s| s.setup.clone()).collect(),
         steps: program.steps,
         inputs: program.inputs,
         outputs: program.outputs,

@@ -29,7 +29,14 @@ pub struct LineShaftSetup {
     pub shaft: LineShaft,
 }
 
-/// Checks the line shafts. Devices and axes have other names. Also returns the names of wrong ones.
+/// A name of the machine file, and its line shaft; `None` if that is invalid and has been reported.
+#[derive(Debug)]
+pub(crate) struct ResolvedLineShaft<'r> {
+    pub name: &'r str,
+    pub setup: Option<LineShaftSetup>,
+}
+
+/// Checks the line shafts. Devices and axes have other names.
 pub(crate) fn check<'r>(
     raw: &'r [RawLineShaft],
     (devices, axes): (
@@ -38,13 +45,13 @@ pub(crate) fn check<'r>(
     ),
     cycle_ns: u64,
     p: &mut Problems<'_>,
-) -> (IndexVec<LineShaftIndex, LineShaftSetup>, Vec<&'r str>) {
+) -> IndexVec<LineShaftIndex, ResolvedLineShaft<'r>> {
     let is_taken = |name: &str| {
         let mut devices = devices.iter().map(|device| device.name);
         let mut axes = axes.iter().map(|axis| axis.name);
         devices.any(|taken| taken == name) || axes.any(|taken| taken == name)
     };
-    let mut shafts: Vec<LineShaftSetup> = Vec::new();
+    let mut shafts: Vec<ResolvedLineShaft<'r>> = Vec::new();
     for raw in raw {
         let Some(name) = &raw.name else { continue };
         let word = name.get_ref().as_str();
@@ -53,60 +60,66 @@ pub(crate) fn check<'r>(
             p.add_hint(name.span(), message, "give the line shaft another name");
             continue;
         }
-        let unit = units::unit(raw.unit.as_ref(), p);
-        let timeout_ns = raw.timeout.value().unwrap_or(TIMEOUT_NS);
-        if timeout_ns < TIMEOUT_CYCLES * cycle_ns {
-            let message = format!(
-                "the timeout of {} ends within {TIMEOUT_CYCLES} cycles of {}",
-                show(timeout_ns),
-                show(cycle_ns)
-            );
-            let at = raw.timeout.place().unwrap_or_else(|| raw.span.clone());
-            let hint = "write a `timeout` longer than the delay and the time between set-points";
-            p.add_hint(at, message, hint);
-            continue;
-        }
-        let timeout_s = timeout_ns as f64 * 1e-9;
-        let mut positive = |value: &Key<f64>, key: &str| {
-            let value = value.as_ref()?;
-            above_zero(value, key, p)
-        };
-        let (velocity, acceleration) = (
-            positive(&raw.velocity, "velocity"),
-            positive(&raw.acceleration, "acceleration"),
+        shafts.push(ResolvedLineShaft {
+            name: word,
+            setup: setup(raw, word, cycle_ns, p),
+        });
+    }
+    shafts.into()
+}
+
+fn setup(
+    raw: &RawLineShaft,
+    name: &str,
+    cycle_ns: u64,
+    p: &mut Problems<'_>,
+) -> Option<LineShaftSetup> {
+    let unit = units::unit(raw.unit.as_ref(), p);
+    let timeout_ns = raw.timeout.value().unwrap_or(TIMEOUT_NS);
+    if timeout_ns < TIMEOUT_CYCLES * cycle_ns {
+        let message = format!(
+            "the timeout of {} ends within {TIMEOUT_CYCLES} cycles of {}",
+            show(timeout_ns),
+            show(cycle_ns)
         );
-        let max_error = match &raw.max_error {
-            Some(_) => positive(&raw.max_error, "max_error"),
-            None => acceleration.map(|a| LineShaftConfig::largest_error(a, timeout_s)),
-        };
-        let (Some(unit), Some(velocity), Some(acceleration), Some(max_error)) =
-            (unit, velocity, acceleration, max_error)
-        else {
-            continue;
-        };
-        let config = LineShaftConfig {
-            velocity,
-            acceleration,
-            timeout_s,
-            smoothing_s: raw.smoothing.value().unwrap_or(SMOOTHING_NS) as f64 * 1e-9,
-            max_error,
-        };
-        match LineShaft::new(config) {
-            Ok(shaft) => shafts.push(LineShaftSetup {
-                name: word.to_owned(),
-                unit,
-                config,
-                shaft,
-            }),
-            Err(error) => p.add(raw.span.clone(), error.to_string()),
+        let at = raw.timeout.place().unwrap_or_else(|| raw.span.clone());
+        let hint = "write a `timeout` longer than the delay and the time between set-points";
+        p.add_hint(at, message, hint);
+        return None;
+    }
+    let timeout_s = timeout_ns as f64 * 1e-9;
+    let mut positive = |value: &Key<f64>, key: &str| {
+        let value = value.as_ref()?;
+        above_zero(value, key, p)
+    };
+    let (velocity, acceleration) = (
+        positive(&raw.velocity, "velocity"),
+        positive(&raw.acceleration, "acceleration"),
+    );
+    let max_error = match &raw.max_error {
+        Some(_) => positive(&raw.max_error, "max_error"),
+        None => acceleration.map(|a| LineShaftConfig::largest_error(a, timeout_s)),
+    };
+    let (unit, velocity, acceleration, max_error) = (unit?, velocity?, acceleration?, max_error?);
+    let config = LineShaftConfig {
+        velocity,
+        acceleration,
+        timeout_s,
+        smoothing_s: raw.smoothing.value().unwrap_or(SMOOTHING_NS) as f64 * 1e-9,
+        max_error,
+    };
+    match LineShaft::new(config) {
+        Ok(shaft) => Some(LineShaftSetup {
+            name: name.to_owned(),
+            unit,
+            config,
+            shaft,
+        }),
+        Err(error) => {
+            p.add(raw.span.clone(), error.to_string());
+            None
         }
     }
-    let names = raw.iter().filter_map(|raw| raw.name.as_ref());
-    let wrong = names
-        .map(|name| name.get_ref().as_str())
-        .filter(|name| shafts.iter().all(|shaft| shaft.name != *name))
-        .collect();
-    (shafts.into(), wrong)
 }
 
 fn above_zero(value: &Spanned<f64>, key: &str, p: &mut Problems<'_>) -> Option<f64> {

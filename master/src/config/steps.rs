@@ -22,6 +22,7 @@ mod target;
 
 use super::fields::{Key, KeyExt};
 use super::gantry::CheckedGantry;
+use super::line_shaft::ResolvedLineShaft;
 use super::path::NamedPath;
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{
@@ -30,8 +31,8 @@ use super::raw::{
 };
 use super::subprograms::MOST_STEPS;
 use super::{
-    Action, AxisSetup, DeviceConfig, LineShaftSetup, NamedCam, NamedSignal, NumberPlace,
-    OverrideConfig, ProgramInputs, Signal, Step, StopSetup, SwitchedInput, Variable, VariableUse,
+    Action, AxisSetup, DeviceConfig, NamedCam, NamedSignal, NumberPlace, OverrideConfig,
+    ProgramInputs, Signal, Step, StopSetup, SwitchedInput, Variable, VariableUse,
 };
 use crate::rt::gantry::GantryConfig;
 use ecaxis_axis::Mode;
@@ -79,9 +80,7 @@ pub(crate) struct Resolved<'c> {
     pub cycle_s: f64,
     pub gantries: &'c [CheckedGantry],
     pub cams: &'c [NamedCam],
-    pub line_shafts: &'c IndexVec<LineShaftIndex, LineShaftSetup>,
-    /// The names of line shafts whose problems have been reported.
-    pub wrong_shafts: &'c [&'c str],
+    pub line_shafts: &'c IndexVec<LineShaftIndex, ResolvedLineShaft<'c>>,
     /// The paths, with indices into `tables`.
     pub paths: &'c [NamedPath],
     pub tables: &'c [Table],
@@ -127,7 +126,6 @@ pub(crate) fn check(
         gantries: known.gantries.iter().map(|gantry| gantry.config).collect(),
         cams: known.cams,
         line_shafts: known.line_shafts,
-        wrong_shafts: known.wrong_shafts,
         paths: known.paths,
         tables: known.tables.to_vec(),
         inputs: Vec::new(),
@@ -187,8 +185,7 @@ struct ProgramChecker<'c> {
     cycle_s: f64,
     gantries: Vec<GantryConfig>,
     cams: &'c [NamedCam],
-    line_shafts: &'c IndexVec<LineShaftIndex, LineShaftSetup>,
-    wrong_shafts: &'c [&'c str],
+    line_shafts: &'c IndexVec<LineShaftIndex, ResolvedLineShaft<'c>>,
     paths: &'c [NamedPath],
     tables: Vec<Table>,
     inputs: Vec<Signal>,

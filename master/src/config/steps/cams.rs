@@ -67,7 +67,8 @@ impl ProgramChecker<'_> {
                 (speed, 0.0, origin, &leader.name, &leader.unit)
             }
             GearMaster::LineShaft(shaft) => {
-                let Some(shaft) = self.line_shafts.get(shaft) else {
+                let shaft = self.line_shafts.get(shaft);
+                let Some(shaft) = shaft.and_then(|shaft| shaft.setup.as_ref()) else {
                     return;
                 };
                 // It decelerates at any place of the cam, and the followers stay in gear.

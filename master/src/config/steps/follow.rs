@@ -54,9 +54,10 @@ impl ProgramChecker<'_> {
         let to = raw.to.as_ref()?;
         let actual = raw.actual.value().unwrap_or(false);
         let mut shafts = self.line_shafts.enumerate();
-        let shaft = shafts.find(|(_, setup)| setup.name == *to.get_ref());
+        let shaft = shafts.find(|(_, shaft)| shaft.name == to.get_ref());
         let master = match shaft {
-            Some((shaft, setup)) => {
+            Some((index, shaft)) => {
+                let setup = shaft.setup.as_ref()?;
                 if let Some(at) = raw.actual.place().filter(|_| actual) {
                     let message = "a line shaft has set-points only, no reported positions";
                     p.add_hint(at, message, "take `actual` out");
@@ -66,15 +67,10 @@ impl ProgramChecker<'_> {
                     let ratio = raw.ratio.value().unwrap_or(1.0).abs();
                     self.check_line_shaft(axis, (to.span(), ratio), setup, p)?;
                 }
-                GearMaster::LineShaft(shaft)
-            }
-            None if self.axis_named(to).is_none()
-                && self.wrong_shafts.contains(&to.get_ref().as_str()) =>
-            {
-                return None;
+                GearMaster::LineShaft(index)
             }
             None if self.axis_named(to).is_none() && !self.line_shafts.is_empty() => {
-                let shafts = self.line_shafts.iter().map(|setup| setup.name.as_str());
+                let shafts = self.line_shafts.iter().map(|shaft| shaft.name);
                 let names = self.axes.iter().map(|axis| axis.name).chain(shafts);
                 let hint = suggestion(to.get_ref(), names, "axes and line shafts");
                 let message = format!("nothing to follow is named `{}`", to.get_ref());
