@@ -59,6 +59,8 @@ pub struct Engine {
     config: RtConfig,
     link: Box<dyn Link>,
     port: PduLoop,
+    /// Answers that ethercrab rejected before the cycle started: the bring-up has repeated them.
+    refused_before: u64,
     exchange: Exchange,
     axes: IndexVec<AxisIndex, RtAxis>,
     gateways: Box<[Gateway]>,
@@ -185,6 +187,7 @@ impl Engine {
             main_devices: parts.link.main_devices(),
             window: started + flight_recorder::COUNTER_WINDOW,
             link: parts.link,
+            refused_before: parts.port.refused,
             port: parts.port,
             axes: parts.axes,
             gateways: parts.gateways,

@@ -96,7 +96,7 @@ pub struct Counters {
     pub overruns: u64,
     /// Sends and receives that failed in the link.
     pub link_errors: u64,
-    /// Mailbox answers that came too late or damaged.
+    /// Acyclic answers that came too late or damaged, since the cycle started.
     pub refused_answers: u64,
 }
 

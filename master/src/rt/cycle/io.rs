@@ -103,7 +103,7 @@ impl Engine {
             }
             self.watch_clock();
         }
-        self.stats.counters.refused_answers = self.port.refused;
+        self.stats.counters.refused_answers = self.port.refused - self.refused_before;
     }
 
     /// Checks the difference of one clock. An offset outside the window is reported once. The
