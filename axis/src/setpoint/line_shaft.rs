@@ -30,7 +30,8 @@ pub struct LineShaftConfig {
     pub velocity: f64,
     /// The acceleration limit, units per second². Also that of its stop.
     pub acceleration: f64,
-    /// The age in seconds of the newest point at which the stream has ended.
+    /// The time in seconds after the newest point at which the stream has ended: after its instant,
+    /// and after the cycle that used it first.
     pub timeout_s: f64,
     /// The time in seconds within which a difference from the prediction decays.
     pub smoothing_s: f64,
@@ -117,6 +118,8 @@ pub struct LineShaft {
     config: LineShaftConfig,
     state: LineShaftState,
     newest: LineShaftPoint,
+    /// The instant of the first cycle with this point.
+    used_ns: u64,
     /// The instant of the motion.
     at_ns: u64,
     motion: Motion,
@@ -229,6 +232,7 @@ impl LineShaft {
             config,
             state: LineShaftState::Waiting,
             newest: LineShaftPoint::default(),
+            used_ns: 0,
             at_ns: 0,
             motion: Motion::default(),
             velocity: 0.0,
@@ -328,7 +332,7 @@ impl LineShaft {
         };
         if self.config.check(&point, now).is_ok() {
             self.state = LineShaftState::Running;
-            (self.newest, self.at_ns) = (point, now);
+            (self.newest, self.used_ns, self.at_ns) = (point, now, now);
             self.motion = self.config.predict(&point, now);
             (self.velocity, self.error) = (self.motion.velocity, 0.0);
         }
@@ -348,9 +352,11 @@ impl LineShaft {
             return Err(LineShaftEnd::StreamChanged);
         }
         if newer && config.check(&point, now).is_ok() {
-            self.newest = point;
+            (self.newest, self.used_ns) = (point, now);
         }
-        if seconds(now, self.newest.at_ns) > config.timeout_s {
+        // A point from the future does not prolong the time without points.
+        let age_s = seconds(now, self.newest.at_ns).max(seconds(now, self.used_ns));
+        if age_s > config.timeout_s {
             return Err(LineShaftEnd::Timeout);
         }
         let before = config.predict(&self.newest, self.at_ns);

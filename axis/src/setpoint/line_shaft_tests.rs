@@ -172,6 +172,21 @@ fn an_early_point_begins_within_the_limits() {
     assert_eq!(shaft.running().map(|motion| motion.velocity), Ok(20.0));
 }
 
+/// Wrong clocks do not prolong the time in which the end of a stream is not seen.
+#[test]
+fn a_point_from_the_future_ends_with_its_use() {
+    for ahead in 0..=50 {
+        let mut shaft = shaft();
+        let newest = point(1, BEGIN + ahead * MS, Motion::at(1.0));
+        let ran = (0..200).take_while(|cycle| {
+            shaft.advance(Some(BEGIN + cycle * MS), newest, DT);
+            shaft.running().is_ok()
+        });
+        assert_eq!(ran.count(), 51, "{ahead} ms ahead");
+        assert_eq!(shaft.end(), LineShaftEnd::Timeout);
+    }
+}
+
 #[test]
 fn points_outside_the_limits_are_rejected() {
     let now = BEGIN + 100 * MS;
