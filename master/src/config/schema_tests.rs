@@ -121,9 +121,11 @@ fn is_wrong_type(message: &str) -> bool {
 }
 
 /// Returns `true` if the check rejects a document as the schema must.
-fn is_rejected(path: &Path, document: &Json) -> bool {
+///
+/// The ESI files are absent: to read them for each change takes most of the time.
+fn is_rejected(document: &Json) -> bool {
     let text = toml::to_string(document).expect("TOML");
-    match parse(path, &text) {
+    match parse(Path::new("/absent/machine.toml"), &text) {
         Err(ConfigError::Problems(problems)) => problems
             .iter()
             .any(|problem| is_wrong_type(&problem.message)),
@@ -191,7 +193,7 @@ fn schema_rejects_what_the_check_rejects_by_type_or_key() {
                 let mut changed = document.clone();
                 *changed.pointer_mut(&place).expect("a place") = change.clone();
                 let accepts = validator.accepts(&validator.0, &changed);
-                if is_rejected(&path, &changed) {
+                if is_rejected(&changed) {
                     rejected += 1;
                     if accepts {
                         missed.push(format!("{} {place} = {change}", path.display()));
