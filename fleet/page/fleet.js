@@ -12,7 +12,9 @@ function bus(machine) {
   if (!state) return ["no state", "busy"];
   if (state.server !== "present") return ["server: absent", "bad"];
   const name = state.bus.state;
-  return [name, GOOD.includes(name) ? "good" : BUSY.includes(name) ? "busy" : "bad"];
+  const known = GOOD.includes(name) || BUSY.includes(name);
+  if (known && state.faults.length > 0) return ["fault", "bad"];
+  return [name, GOOD.includes(name) ? "good" : known ? "busy" : "bad"];
 }
 
 /** Only addresses of pages: a state could have any text. */
@@ -57,13 +59,16 @@ async function refresh() {
     const answer = await fetch("api/fleet", { signal: AbortSignal.timeout(10_000) });
     if (!answer.ok) throw new Error(`HTTP ${answer.status}`);
     const machines = await answer.json();
-    const bad = machines.filter((machine) => bus(machine)[1] === "bad").length;
+    const isBad = (machine) => bus(machine)[1] === "bad";
+    const bad = machines.filter(isBad);
     const count = document.getElementById("count");
-    count.textContent = `${machines.length} machines, ${bad} need attention`;
-    count.dataset.state = bad ? "bad" : "good";
+    const all = machines.length === 1 ? "1 machine" : `${machines.length} machines`;
+    count.textContent = `${all}, ${bad.length} with a problem`;
+    count.dataset.state = bad.length ? "bad" : "good";
+    const others = machines.filter((machine) => !isBad(machine));
     // A click or the keyboard focus would be lost with the tile.
     const focused = document.activeElement?.dataset?.machine;
-    document.getElementById("tiles").replaceChildren(...machines.map(tile));
+    document.getElementById("tiles").replaceChildren(...[...bad, ...others].map(tile));
     if (focused) document.querySelector(`[data-machine="${CSS.escape(focused)}"]`)?.focus();
     link.textContent = "live";
     link.dataset.state = "open";

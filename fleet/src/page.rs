@@ -1,5 +1,6 @@
 //! The fleet page: a tile per machine, which links to the machine's own page. It only reads.
 
+use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -15,12 +16,17 @@ use tokio::sync::Mutex;
 use zenoh::Session;
 
 use crate::error::{Error, Result};
+use crate::keys::MachineId;
+use crate::observe::status::Seen;
 use crate::observe::{print, status};
 use crate::options::{Network, PageOptions};
 use crate::session;
 
 /// The age at which the picture is queried again, however many browsers ask.
 const MAX_AGE: Duration = Duration::from_millis(900);
+
+/// The machines that the page keeps after they have vanished.
+const MAX_MACHINES: usize = 10_000;
 
 /// Path, kind and content of the files. Style, icon and helpers are those of the server's page.
 const FILES: [(&str, &str, &str); 6] = [
@@ -60,7 +66,33 @@ const FILES: [(&str, &str, &str); 6] = [
 struct Page {
     session: Session,
     allowed_hosts: Vec<String>,
-    picture: Mutex<Option<(Instant, Arc<str>)>>,
+    picture: Mutex<Picture>,
+}
+
+#[derive(Debug, Default)]
+struct Picture {
+    /// The instant of the last query.
+    at: Option<Instant>,
+    /// All machines since the start of the page.
+    machines: BTreeMap<MachineId, Seen>,
+    /// The same as JSON.
+    text: Arc<str>,
+}
+
+/// Adds the machines that have vanished to those of a query.
+fn with_vanished(
+    before: &BTreeMap<MachineId, Seen>,
+    mut now: BTreeMap<MachineId, Seen>,
+) -> BTreeMap<MachineId, Seen> {
+    for (id, seen) in before {
+        if now.len() < MAX_MACHINES && !now.contains_key(id) {
+            let mut gone = seen.clone();
+            gone.alive = false;
+            gone.set_age();
+            now.insert(id.clone(), gone);
+        }
+    }
+    now
 }
 
 /// Serves the page until SIGINT or SIGTERM.
@@ -134,22 +166,20 @@ fn is_allowed(host: &str, allowed: &[String]) -> bool {
 
 async fn fleet(State(page): State<Arc<Page>>) -> Response {
     let mut picture = page.picture.lock().await;
-    let text = match &*picture {
-        Some((at, text)) if at.elapsed() < MAX_AGE => Arc::clone(text),
-        _ => match status::look(&page.session).await {
-            Ok(machines) => {
-                let text: Arc<str> = status::to_json(&machines).to_string().into();
-                *picture = Some((Instant::now(), Arc::clone(&text)));
-                text
-            }
-            Err(error) => {
-                return (StatusCode::BAD_GATEWAY, error.to_string()).into_response();
-            }
-        },
-    };
+    if picture.at.is_none_or(|at| at.elapsed() >= MAX_AGE) {
+        let machines = match status::look(&page.session).await {
+            Ok(machines) => with_vanished(&picture.machines, machines),
+            Err(error) => return (StatusCode::BAD_GATEWAY, error.to_string()).into_response(),
+        };
+        *picture = Picture {
+            at: Some(Instant::now()),
+            text: status::to_json(&machines).to_string().into(),
+            machines,
+        };
+    }
     (
         [(header::CONTENT_TYPE, "application/json")],
-        text.to_string(),
+        picture.text.to_string(),
     )
         .into_response()
 }
@@ -157,6 +187,24 @@ async fn fleet(State(page): State<Arc<Page>>) -> Response {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn vanished_machines_stay_on_the_page() {
+        let id = |name: &str| {
+            let key = format!("ecaxis/hall/{name}/alive");
+            MachineId::of_key(&key).unwrap().0
+        };
+        let there = || Seen {
+            alive: true,
+            ..Seen::default()
+        };
+        let before = BTreeMap::from([(id("m1"), there()), (id("m2"), there())]);
+        let now = with_vanished(&before, BTreeMap::from([(id("m2"), there())]));
+        let alive: Vec<_> = now.iter().map(|(id, seen)| (id, seen.alive)).collect();
+        assert_eq!(alive, [(&id("m1"), false), (&id("m2"), true)]);
+        let now = with_vanished(&now, BTreeMap::from([(id("m1"), there())]));
+        assert!(now[&id("m1")].alive && !now[&id("m2")].alive);
+    }
 
     #[test]
     fn other_names_of_this_computer_are_refused() {

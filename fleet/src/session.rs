@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::mpsc;
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use serde::de::DeserializeOwned;
 use tokio::signal::unix::{SignalKind, signal};
@@ -29,6 +29,12 @@ const MAX_BYTES: usize = 256 << 20;
 const MAX_QUERIES: usize = 256;
 /// The error that Zenoh adds to the replies when the time is over.
 const TIMED_OUT: &str = "Timeout";
+
+/// The time without a further program after which multicast has found all. A lost datagram or
+/// connection request is repeated after 1 s.
+const NO_MORE: Duration = Duration::from_millis(1200);
+/// The longest time for multicast to find all.
+const SCOUTING: Duration = Duration::from_secs(5);
 
 /// What a subscription receives.
 pub type Samples = Subscriber<FifoChannelHandler<Sample>>;
@@ -88,7 +94,27 @@ pub async fn open_command(network: &Network) -> Result<Session> {
         }
     }
     let path = path.unwrap_or(Path::new("the command line"));
-    open(config::zenoh(&file.zenoh, path, Role::Command)?).await
+    let config = config::zenoh(&file.zenoh, path, Role::Command)?;
+    let scouts = config.get_json("scouting/multicast/enabled");
+    let session = open(config).await?;
+    if scouts.is_ok_and(|scouts| scouts == "true") {
+        find_programs(&session).await;
+    }
+    Ok(session)
+}
+
+/// Waits until multicast finds no further programs. Zenoh waits for the first ones only.
+async fn find_programs(session: &Session) {
+    let began = Instant::now();
+    let (mut found, mut last) = (0, began);
+    while last.elapsed() < NO_MORE && began.elapsed() < SCOUTING {
+        tokio::time::sleep(NO_MORE / 20).await;
+        let info = session.info();
+        let now = info.peers_zid().await.count() + info.routers_zid().await.count();
+        if now != found {
+            (found, last) = (now, Instant::now());
+        }
+    }
 }
 
 /// A reply: its key and its bytes.

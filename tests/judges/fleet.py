@@ -4,8 +4,8 @@
     python tests/judges/fleet.py [SECTION …]
 
 Two halves of a network with simulated machines, a router each, and an archive: machines that are killed, a network that is
-cut, agents, routers and archive killed at random, clients without rights, a line shaft, a common start. Needs root, the
-packages of requirements.txt, and minisign.
+cut, agents, routers and archive killed at random, machines without a router, clients without rights, a line shaft, a
+common start. Needs root, the packages of requirements.txt, and minisign.
 `ECAXIS` and `ECAXIS_FLEET_PROGRAM` name the programs. ECAXIS_FLEET_MACHINES (4), ECAXIS_FLEET_SECONDS of kills (20),
 ECAXIS_FLEET_CUT seconds (8) and ECAXIS_FLEET_SEED set the size; 12, 3600 and 30 are the whole test.
 """
@@ -36,7 +36,9 @@ MACHINES = int(os.environ.get("ECAXIS_FLEET_MACHINES", 4))
 SECONDS = float(os.environ.get("ECAXIS_FLEET_SECONDS", 20))
 CUT = float(os.environ.get("ECAXIS_FLEET_CUT", 8))
 SEED = int(os.environ.get("ECAXIS_FLEET_SEED", 1))
-SECTIONS = ["fleet", "access", "shaft", "start"]
+# Machines without a router.
+PEERS = 8
+SECTIONS = ["fleet", "peers", "access", "shaft", "start"]
 
 # Every device is silent for a while, again after each bring-up: a fault report every few seconds.
 FAULTS = '[[fault]]\nkind = "silent"\nat = "{at}s"\nfor = "500ms"\n'
@@ -413,6 +415,25 @@ def fleet(report):
             pass
 
 
+def peers(report):
+    """Without a router: a command waits until multicast has found all."""
+    report.section("peers")
+    with tempfile.TemporaryDirectory(prefix="ecaxis-judge-") as temporary, Hall(SEED) as hall:
+        hall.switches.loss = 0.0
+        folder = pathlib.Path(temporary)
+        names = [f"m{number}" for number in range(PEERS)]
+        for number, name in enumerate(names):
+            file = folder / f"{name}.toml"
+            file.write_text(f'site = "hall"\nmachine = "{name}"\nsocket = "absent.sock"\nspool = "{name}"\n')
+            half = ("left", "right")[number % 2]
+            hall.host(half).start([program(), "agent", file], folder / f"{name}.log")
+        time.sleep(5)
+        for _ in range(5):
+            done = hall.commands["left"].run([program(), "status", "--json"])
+            found = [state["machine"] for state in json.loads(done.stdout)] if done.returncode == 0 else done.stderr
+            report.check(f"status has all {PEERS}", found == names, found)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("sections", nargs="*", choices=[[], *SECTIONS], metavar="SECTION")
@@ -434,6 +455,8 @@ def main():
             match section:
                 case "fleet":
                     fleet(report)
+                case "peers":
+                    peers(report)
                 case "access":
                     fleet_access.access(report, program())
                 case "start":

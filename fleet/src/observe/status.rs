@@ -24,6 +24,14 @@ pub struct Seen {
     pub age_s: Option<f64>,
 }
 
+impl Seen {
+    /// Computes the age of the state.
+    pub fn set_age(&mut self) {
+        let age_s = |state: &State| (unix_time() - state.unix_time).max(0.0);
+        self.age_s = self.state.as_ref().map(age_s);
+    }
+}
+
 /// Returns all machines.
 ///
 /// # Errors
@@ -49,8 +57,8 @@ pub async fn look(session: &Session) -> Result<BTreeMap<MachineId, Seen>> {
             let seen = machines.entry(state.id.clone()).or_default();
             let newer = |old: &State| old.unix_time < state.unix_time;
             if seen.state.as_ref().is_none_or(newer) {
-                seen.age_s = Some((unix_time() - state.unix_time).max(0.0));
                 seen.state = Some(state);
+                seen.set_age();
             }
         }
     }
@@ -82,6 +90,9 @@ pub fn to_json(machines: &BTreeMap<MachineId, Seen>) -> Value {
 pub async fn run(network: &Network, as_json: bool) -> Result<()> {
     let session = session::open_command(network).await?;
     let machines = look(&session).await?;
+    if machines.is_empty() {
+        tracing::warn!("no machine answers: check that agents run, and `--connect`");
+    }
     if as_json {
         print(&to_json(&machines).to_string())?;
     } else {
