@@ -25,7 +25,7 @@ use crate::session;
 /// The age at which the picture is queried again, however many browsers ask.
 const MAX_AGE: Duration = Duration::from_millis(900);
 
-/// The machines that the page keeps after they have vanished.
+/// A vanished machine stays on the page only while there are fewer machines.
 const MAX_MACHINES: usize = 10_000;
 
 /// Path, kind and content of the files. Style, icon and helpers are those of the server's page.
@@ -69,6 +69,7 @@ struct Page {
     picture: Mutex<Picture>,
 }
 
+/// What the browsers are shown.
 #[derive(Debug, Default)]
 struct Picture {
     /// The instant of the last query.
@@ -76,7 +77,7 @@ struct Picture {
     /// All machines since the start of the page.
     machines: BTreeMap<MachineId, Seen>,
     /// The same as JSON.
-    text: Arc<str>,
+    text: String,
 }
 
 /// Adds the machines that have vanished to those of a query.
@@ -100,7 +101,7 @@ fn with_vanished(
 /// # Errors
 /// Fails if no router is reached or the address is not free.
 pub async fn run(network: &Network, options: PageOptions) -> Result<()> {
-    let session = session::open_command(network).await?;
+    let session = session::open_observer(network).await?;
     let page = Arc::new(Page {
         session,
         allowed_hosts: options.allow_host,
@@ -173,13 +174,13 @@ async fn fleet(State(page): State<Arc<Page>>) -> Response {
         };
         *picture = Picture {
             at: Some(Instant::now()),
-            text: status::to_json(&machines).to_string().into(),
+            text: status::to_json(&machines).to_string(),
             machines,
         };
     }
     (
         [(header::CONTENT_TYPE, "application/json")],
-        picture.text.to_string(),
+        picture.text.clone(),
     )
         .into_response()
 }

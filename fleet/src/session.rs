@@ -73,11 +73,8 @@ pub async fn subscribe_tokens(session: &Session) -> Result<Samples> {
     subscriber.map_err(|error| Error::new(format!("Zenoh: subscribe: {error}")))
 }
 
-/// Opens the session of a command.
-///
-/// # Errors
-/// Fails if the file is wrong or no router answers.
-pub async fn open_command(network: &Network) -> Result<Session> {
+/// Returns the configuration of a command.
+fn command_config(network: &Network) -> Result<zenoh::Config> {
     let path = network.config.as_deref();
     let mut file: ZenohFile = path.map_or(Ok(ZenohFile::default()), config::read)?;
     if !network.connect.is_empty() {
@@ -94,7 +91,25 @@ pub async fn open_command(network: &Network) -> Result<Session> {
         }
     }
     let path = path.unwrap_or(Path::new("the command line"));
-    let config = config::zenoh(&file.zenoh, path, Role::Command)?;
+    config::zenoh(&file.zenoh, path, Role::Command)
+}
+
+/// Opens the session of a command that sends orders. It repeats an order until its machine answers,
+/// so it does not wait for programs that multicast has not found yet.
+///
+/// # Errors
+/// Fails if the file is wrong or no router answers.
+pub async fn open_sender(network: &Network) -> Result<Session> {
+    open(command_config(network)?).await
+}
+
+/// Opens the session of a command that reads. Without a router, it waits until multicast has found
+/// all programs.
+///
+/// # Errors
+/// Fails if the file is wrong or no router answers.
+pub async fn open_observer(network: &Network) -> Result<Session> {
+    let config = command_config(network)?;
     let scouts = config.get_json("scouting/multicast/enabled");
     let session = open(config).await?;
     if scouts.is_ok_and(|scouts| scouts == "true") {

@@ -21,7 +21,7 @@ const LIST_TIMEOUT: Duration = Duration::from_secs(30);
 /// # Errors
 /// Fails if no router is reached, or the report is not there.
 pub async fn run(network: &Network, action: ReportAction) -> Result<()> {
-    let session = session::open_command(network).await?;
+    let session = session::open_observer(network).await?;
     match action {
         ReportAction::List { machine, json } => {
             let key = machine.map_or(ALL_REPORTS.to_owned(), |id| id.key("reports"));

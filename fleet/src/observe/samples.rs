@@ -14,7 +14,7 @@ use crate::session;
 /// # Errors
 /// Fails if the machine does not answer, or has no such signal.
 pub async fn run(network: &Network, request: SamplesRequest) -> Result<()> {
-    let session = session::open_command(network).await?;
+    let session = session::open_observer(network).await?;
     let seconds = request.seconds.clamp(0.0, 10.0);
     let signals = request.signals.join(",");
     let selector = request

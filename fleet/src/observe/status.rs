@@ -88,7 +88,7 @@ pub fn to_json(machines: &BTreeMap<MachineId, Seen>) -> Value {
 /// # Errors
 /// Fails if no router is reached.
 pub async fn run(network: &Network, as_json: bool) -> Result<()> {
-    let session = session::open_command(network).await?;
+    let session = session::open_observer(network).await?;
     let machines = look(&session).await?;
     if machines.is_empty() {
         tracing::warn!("no machine answers: check that agents run, and `--connect`");
