@@ -97,15 +97,6 @@ class Machine:
                 time.sleep(0.1)
 
 
-def wait(condition, seconds=30):
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.05)
-    return True
-
-
 class Shaft:
     def __init__(self, report, hall, folder, program):
         self.report, self.hall, self.folder = report, hall, folder
@@ -151,7 +142,7 @@ class Shaft:
             server.ask("take", name="judge", ttl_ms=60_000)
         # A computer that stalls fails a bus; the server brings it up again.
         locked = lambda server: (server.ask("state")["bus"].get("common_time") or {}).get("locked")  # noqa: E731
-        common = [wait(lambda s=server: locked(s), 60) for server in (self.lead, self.follow)]
+        common = [rig.wait(lambda s=server: locked(s), 60) for server in (self.lead, self.follow)]
         self.report.need("common time", all(common), "" if all(common) else (self.folder / "log").read_text()[-2000:])
         self.lead.ask("enable", axis="x", wait=True)
 
@@ -162,14 +153,14 @@ class Shaft:
         self.lead.ask("velocity", axis="x", velocity=0.0)
         if self.shaft()["state"] == "running" and self.program()["running"]:
             return
-        self.report.need("the line shaft runs", wait(lambda: self.shaft()["state"] == "running"), self.shaft()["why"])
+        self.report.need("the line shaft runs", rig.wait(lambda: self.shaft()["state"] == "running"), self.shaft()["why"])
         if self.program()["running"]:
             self.follow.ask("program", action="stop", wait=True)
-        self.report.need("the follower is reset", wait(self.reset))
+        self.report.need("the follower is reset", rig.wait(self.reset))
         self.follow.ask("enable", axis="*", wait=True)
         self.follow.ask("program", action="start")
         # The second step begins when the axis is in gear.
-        self.report.need("the follower is in gear", wait(lambda: "2" in str(self.program()["step"])), self.program())
+        self.report.need("the follower is in gear", rig.wait(lambda: "2" in str(self.program()["step"])), self.program())
 
     def measure(self):
         """A velocity and a reversal for each delay and loss. Prints the error of the follower."""
@@ -177,7 +168,7 @@ class Shaft:
         for delay, loss in NETWORKS:
             self.network(0, 0.0)
             self.engage()
-            self.report.need("both stand", wait(self.settled), self.shaft())
+            self.report.need("both stand", rig.wait(self.settled), self.shaft())
             self.network(delay, loss)
             leads, follows = (Samples(m.socket, "x.target_position") for m in (self.leader, self.follower))
             for velocity, seconds in ((SPEED, 0.9), (-SPEED, 0.9), (0.0, 0.4)):
@@ -206,11 +197,11 @@ class Shaft:
         self.engage()
         samples = Samples(self.follower.socket, "x.target_position")
         self.lead.ask("velocity", axis="x", velocity=-SPEED if self.lead.axis("x")["position"] > 0 else SPEED)
-        self.report.check(f"{what}: in motion", wait(lambda: abs(self.watcher.axis("x")["target_velocity"] or 0.0) > 0.9 * SPEED))
+        self.report.check(f"{what}: in motion", rig.wait(lambda: abs(self.watcher.axis("x")["target_velocity"] or 0.0) > 0.9 * SPEED))
         process.kill()
         process.wait()
         # The gear ends when the shaft stands. Then the group of the axis loses power.
-        rests = wait(lambda: self.shaft()["state"] == "waiting" and not self.watcher.axis("x")["enabled"])
+        rests = rig.wait(lambda: self.shaft()["state"] == "waiting" and not self.watcher.axis("x")["enabled"])
         axis, rows = self.watcher.axis("x"), samples.until_now()
         self.report.check(f"{what}: the follower comes to rest", rests, "" if rests else axis)
         self.within_limits(what, rows)

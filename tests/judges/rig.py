@@ -176,6 +176,16 @@ class Served:
         return self.child.returncode, self.output
 
 
+def wait(condition, seconds=30):
+    """Waits until the condition holds. False: it does not hold in this time."""
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.05)
+    return True
+
+
 @contextlib.contextmanager
 def served(program, machine, nic, faults=None, options=()):
     """Runs `ecaxis sim` with this machine on the interface, and waits until it answers."""
