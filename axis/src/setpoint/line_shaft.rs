@@ -118,8 +118,11 @@ pub struct LineShaft {
     config: LineShaftConfig,
     state: LineShaftState,
     newest: LineShaftPoint,
-    /// The instant of the first cycle with this point.
-    used_ns: u64,
+    /// The last point that came, and the instant of its first cycle.
+    arrived: LineShaftPoint,
+    arrived_ns: u64,
+    /// The instant of the first cycle with the newest point.
+    newest_ns: u64,
     /// The instant of the motion.
     at_ns: u64,
     motion: Motion,
@@ -232,7 +235,9 @@ impl LineShaft {
             config,
             state: LineShaftState::Waiting,
             newest: LineShaftPoint::default(),
-            used_ns: 0,
+            arrived: LineShaftPoint::default(),
+            arrived_ns: 0,
+            newest_ns: 0,
             at_ns: 0,
             motion: Motion::default(),
             velocity: 0.0,
@@ -310,6 +315,11 @@ impl LineShaft {
         if dt_s.is_nan() || dt_s <= 0.0 {
             return;
         }
+        if let (Some(now), Some(point)) = (now_ns, point)
+            && (point.stream, point.at_ns) != (self.arrived.stream, self.arrived.at_ns)
+        {
+            (self.arrived, self.arrived_ns) = (point, now);
+        }
         match self.state {
             LineShaftState::Waiting => {
                 self.cycle_s = dt_s;
@@ -330,9 +340,11 @@ impl LineShaft {
         let (Some(now), Some(point)) = (now_ns, point) else {
             return;
         };
-        if self.config.check(&point, now).is_ok() {
+        // The last point of a dead stream from the future may still be there.
+        let dead = seconds(now, self.arrived_ns) > self.config.timeout_s;
+        if !dead && self.config.check(&point, now).is_ok() {
             self.state = LineShaftState::Running;
-            (self.newest, self.used_ns, self.at_ns) = (point, now, now);
+            (self.newest, self.newest_ns, self.at_ns) = (point, self.arrived_ns, now);
             self.motion = self.config.predict(&point, now);
             (self.velocity, self.error) = (self.motion.velocity, 0.0);
         }
@@ -352,10 +364,10 @@ impl LineShaft {
             return Err(LineShaftEnd::StreamChanged);
         }
         if newer && config.check(&point, now).is_ok() {
-            (self.newest, self.used_ns) = (point, now);
+            (self.newest, self.newest_ns) = (point, self.arrived_ns);
         }
         // A point from the future does not prolong the time without points.
-        let age_s = seconds(now, self.newest.at_ns).max(seconds(now, self.used_ns));
+        let age_s = seconds(now, self.newest.at_ns).max(seconds(now, self.newest_ns));
         if age_s > config.timeout_s {
             return Err(LineShaftEnd::Timeout);
         }
