@@ -119,11 +119,13 @@ pub fn bus_up(machine: &Machine) -> Result<()> {
     up.map_err(text).map(drop)
 }
 
-/// Waits until the server runs this machine in Op, without a fault for [`SETTLE`].
+/// Waits until the server runs this machine in Op, without a fault for [`SETTLE`]. `leased` has the
+/// lease; without it, another connection takes it, and stays there.
 ///
 /// # Errors
 /// Fails with the last reason when the time is over.
 pub fn await_health(
+    leased: &mut Option<Machine>,
     socket: &Path,
     sender: &str,
     sha256: Option<FileDigest>,
@@ -131,18 +133,14 @@ pub fn await_health(
 ) -> Result<()> {
     let begin = Instant::now();
     let mut healthy: Option<Instant> = None;
-    let mut machine: Option<Machine> = None;
     loop {
-        let observed = match &machine {
+        let observed = match &*leased {
             Some(machine) => machine
                 .keep()
                 .map_err(text)
                 .and_then(|()| health(machine, sha256)),
-            None => leased(socket, sender).and_then(|connected| {
-                let observed = health(&connected, sha256);
-                machine = Some(connected);
-                observed
-            }),
+            None => connect_and_take(socket, sender)
+                .and_then(|machine| health(leased.insert(machine), sha256)),
         };
         match observed {
             Ok(()) if healthy.get_or_insert_with(Instant::now).elapsed() >= SETTLE => return Ok(()),
@@ -150,7 +148,7 @@ pub fn await_health(
             Err(error) => {
                 healthy = None;
                 // The lease stays while the server answers: no other client enables an axis.
-                machine = machine.filter(|machine| machine.keep().is_ok());
+                *leased = leased.take().filter(|machine| machine.keep().is_ok());
                 if begin.elapsed() > timeout {
                     let what = error.to_string();
                     let what = what.split("\nhelp:").next().unwrap_or_default();
@@ -164,7 +162,10 @@ pub fn await_health(
 }
 
 /// Connects and takes the lease.
-fn leased(socket: &Path, sender: &str) -> Result<Machine> {
+///
+/// # Errors
+/// Fails if the server is absent, or another client owns the motion.
+pub fn connect_and_take(socket: &Path, sender: &str) -> Result<Machine> {
     let machine = connect(socket, sender).map_err(text)?;
     machine.take(false).map_err(text)?;
     Ok(machine)

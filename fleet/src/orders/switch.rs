@@ -221,7 +221,7 @@ impl OrderExecutor {
 
     fn await_health(&self, sha256: Option<FileDigest>, sender: &str) -> Result<()> {
         let timeout = self.health_timeout();
-        server::await_health(&self.socket, sender, sha256, timeout)
+        server::await_health(&mut None, &self.socket, sender, sha256, timeout)
     }
 
     /// Waits until no axis has power, and goes back. The switch is pending until then.

@@ -73,7 +73,7 @@ impl OrderExecutor {
         }) {
             // A bus that was down waits for the repair of another device.
             if was_up {
-                self.restore_bus(&machine, device, sender)?;
+                self.restore_bus(machine, device, sender)?;
             }
             return Ok(format!("`{device}` has this firmware already"));
         }
@@ -98,7 +98,7 @@ impl OrderExecutor {
         records.insert(device.to_owned(), record(&info));
         let text = serde_json::to_vec(&records).unwrap_or_default();
         files::write(&self.table.folder.join(RECORDS), &text).map_err(Ended::Failed)?;
-        self.restore_bus(&machine, device, sender)?;
+        self.restore_bus(machine, device, sender)?;
         let report: Value = serde_json::from_str(&output.stdout).unwrap_or_default();
         let version = |key: &str| {
             let version = report[key]["software_version"].as_str();
@@ -142,7 +142,7 @@ impl OrderExecutor {
                 return Err(failed(device, &format!("{step}: {}", output.reason())));
             }
         }
-        self.restore_bus(&machine, device, sender)?;
+        self.restore_bus(machine, device, sender)?;
         Ok(format!("`{device}` has the parameters, stored"))
     }
 
@@ -150,17 +150,22 @@ impl OrderExecutor {
     /// unless another client has enabled an axis.
     fn restore_bus(
         &self,
-        machine: &Machine,
+        machine: Machine,
         device: &str,
         sender: &str,
     ) -> std::result::Result<(), Ended> {
         let taken = machine.take(false).map_err(server::text);
-        let up = taken.and_then(|()| server::bus_up(machine));
-        let timeout = self.health_timeout();
-        let healthy = up.and_then(|()| server::await_health(&self.socket, sender, None, timeout));
-        healthy.map_err(|error| {
-            let disabled = server::take_disabled(machine);
-            let down = disabled.and_then(|()| server::bus_down(machine));
+        let up = taken.and_then(|()| server::bus_up(&machine));
+        let mut leased = Some(machine);
+        let wait = |leased: &mut Option<Machine>| {
+            server::await_health(leased, &self.socket, sender, None, self.health_timeout())
+        };
+        up.and_then(|()| wait(&mut leased)).map_err(|error| {
+            let machine = leased.map_or_else(|| server::connect_and_take(&self.socket, sender), Ok);
+            let down = machine.and_then(|machine| {
+                server::take_disabled(&machine)?;
+                server::bus_down(&machine)
+            });
             let then = down.map_or_else(|e| format!("; the bus stays up: {e}"), |_| String::new());
             Ended::Failed(Error::new(format!("after `{device}`: {error}{then}")))
         })
