@@ -178,11 +178,13 @@ impl ReportStore {
         let after = newest.and_then(|newest| newest.checked_add(Duration::from_nanos(1)));
         let stored = after.map_or_else(SystemTime::now, |after| after.max(SystemTime::now()));
         let temporary = self.folder.join(format!(".new-{}", summary.id.as_str()));
-        let mut file = File::create(&temporary)?;
-        file.write_all(bytes)?;
-        file.set_modified(stored)?;
-        file.sync_all()?;
-        fs::rename(&temporary, self.path(&summary.id))?;
+        let written = File::create(&temporary).and_then(|mut file| {
+            file.write_all(bytes)?;
+            file.set_modified(stored)?;
+            file.sync_all()?;
+            fs::rename(&temporary, self.path(&summary.id))
+        });
+        written.inspect_err(|_| drop(fs::remove_file(&temporary)))?;
         File::open(&self.folder)?.sync_all()?;
         kept.insert(
             summary.id.clone(),
@@ -328,6 +330,18 @@ mod tests {
         assert_eq!(again.list(), []);
         assert!(again.add(&report(1)).unwrap().is_some());
         assert_eq!(again.get(&id), Some(report(1)));
+    }
+
+    #[test]
+    fn a_report_that_the_disk_refuses_leaves_no_file_and_may_come_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = ReportStore::open(folder.path(), 3).unwrap();
+        let obstacle = store.path(&ReportId::of(&report(1)));
+        fs::create_dir(&obstacle).unwrap();
+        store.add(&report(1)).unwrap_err();
+        fs::remove_dir(&obstacle).unwrap();
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+        assert!(store.add(&report(1)).unwrap().is_some());
     }
 
     #[test]

@@ -84,11 +84,8 @@ impl Reader {
         let description = machine.request("machine", json!({}))?;
         // From here on, no event is missed; those before it are in the lists of the server.
         let events = machine.events()?;
-        let mut spooled = self.spool(&machine)?;
-        let earlier = machine.request("events", json!({"after": 0}))?;
-        for event in earlier["events"].as_array().into_iter().flatten() {
-            self.take_event(event);
-        }
+        let mut refused = self.spool(&machine, None)?;
+        self.take_events(&machine)?;
         let mut due = Instant::now();
         loop {
             let rest = due.saturating_duration_since(Instant::now());
@@ -98,19 +95,31 @@ impl Reader {
                     tracing::info!(machine = %self.id, "server present");
                 }
                 // A full disk may have space again.
-                if !spooled {
-                    spooled = self.spool(&machine)?;
+                if refused.is_some() {
+                    refused = self.spool(&machine, refused)?;
                 }
                 self.publish_state(Some(Serve::read(&hello, &description, &state)));
                 due = (due + INTERVAL).max(Instant::now());
             } else if let Some(event) = events.next_within(rest)? {
-                // Reports behind a missed event are found, too.
-                if event["event"] == "fault_report" || event["event"] == "missed" {
-                    spooled = self.spool(&machine)?;
+                let missed = event["event"] == "missed";
+                if event["event"] == "fault_report" || missed {
+                    refused = self.spool(&machine, refused)?;
                 }
-                self.take_event(&event);
+                match missed {
+                    true => self.take_events(&machine)?,
+                    false => self.take_event(&event),
+                }
             }
         }
+    }
+
+    /// Takes the newest events of the server, of which some may be new.
+    fn take_events(&self, machine: &Machine) -> Result<(), ecaxis_client::Error> {
+        let answer = machine.request("events", json!({"after": 0}))?;
+        for event in answer["events"].as_array().into_iter().flatten() {
+            self.take_event(event);
+        }
+        Ok(())
     }
 
     fn take_event(&self, event: &Value) {
@@ -119,10 +128,14 @@ impl Reader {
         }
     }
 
-    /// Takes the reports of the server to the disk, then announces the new ones. Returns false if the
-    /// disk did not take all.
-    fn spool(&self, machine: &Machine) -> Result<bool, ecaxis_client::Error> {
-        let mut spooled = true;
+    /// Takes the reports of the server to the disk, then announces the new ones. Returns the first
+    /// refusal of the disk; the log has it unless it is the one before.
+    fn spool(
+        &self,
+        machine: &Machine,
+        before: Option<String>,
+    ) -> Result<Option<String>, ecaxis_client::Error> {
+        let mut refused = None;
         let answer = machine.request("fault_reports", json!({}))?;
         for kept in answer["reports"].as_array().into_iter().flatten() {
             let Some(event) = kept["event"].as_u64() else {
@@ -136,12 +149,14 @@ impl Reader {
                 }
                 Ok(None) => {}
                 Err(error) => {
-                    spooled = false;
-                    tracing::error!(machine = %self.id, event, "spool: {error}");
+                    refused.get_or_insert_with(|| format!("report of event {event}: {error}"));
                 }
             }
         }
-        Ok(spooled)
+        if let Some(text) = refused.as_ref().filter(|_| refused != before) {
+            tracing::error!(machine = %self.id, "spool: {text}");
+        }
+        Ok(refused)
     }
 
     fn publish_state(&self, serve: Option<Serve>) {
@@ -163,5 +178,72 @@ impl Reader {
     /// Without Zenoh, updates are dropped.
     fn send(&self, update: Update) {
         let _ = self.updates.try_send(update);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::{BufRead, BufReader, Write};
+    use std::os::unix::net::{UnixListener, UnixStream};
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use super::*;
+
+    /// Answers as a server does whose subscription to events misses two of three.
+    fn answer(stream: &UnixStream, lists: &AtomicUsize) {
+        let event = |n: u64| json!({"event": "fault", "number": n, "time_ns": n});
+        let mut stream = stream;
+        for line in BufReader::new(stream)
+            .lines()
+            .map_while(std::io::Result::ok)
+        {
+            let request: Value = serde_json::from_str(&line).unwrap();
+            let mut answer = json!({"id": request["id"], "ok": true, "axes": [], "bus": {}});
+            match request["op"].as_str().unwrap() {
+                "hello" => answer["protocol"] = json!(1),
+                "events" if lists.fetch_add(1, Ordering::SeqCst) > 0 => {
+                    answer["events"] = json!([event(1), event(2), event(3)]);
+                }
+                _ => {}
+            }
+            writeln!(stream, "{answer}").unwrap();
+            if request["op"] == "subscribe" {
+                for event in [json!({"event": "missed", "count": 2}), event(3)] {
+                    writeln!(stream, "{event}").unwrap();
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn missed_events_are_read_from_the_list() {
+        let folder = tempfile::tempdir().unwrap();
+        let socket = folder.path().join("m.sock");
+        let listener = UnixListener::bind(&socket).unwrap();
+        thread::spawn(move || {
+            let lists = Arc::new(AtomicUsize::new(0));
+            for stream in listener.incoming().flatten() {
+                let lists = Arc::clone(&lists);
+                thread::spawn(move || answer(&stream, &lists));
+            }
+        });
+        let (updates, mut published) = tokio::sync::mpsc::channel(64);
+        let reader = Reader {
+            id: "hall/m1".parse().unwrap(),
+            socket,
+            page: None,
+            store: Arc::new(ReportStore::open(&folder.path().join("spool"), 10).unwrap()),
+            events: Arc::default(),
+            updates,
+        };
+        thread::spawn(move || reader.run());
+        let (begin, mut numbers) = (Instant::now(), Vec::new());
+        while numbers.len() < 3 && begin.elapsed() < Duration::from_secs(20) {
+            // At least a state each second.
+            if let Update::Event(event) = published.blocking_recv().unwrap() {
+                numbers.push(event["number"].as_u64().unwrap());
+            }
+        }
+        assert_eq!(numbers, [1, 2, 3]);
     }
 }
