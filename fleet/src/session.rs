@@ -33,6 +33,8 @@ const TIMED_OUT: &str = "Timeout";
 /// The time without a further program after which multicast has found all. A lost datagram or
 /// connection request is repeated after 1 s.
 const NO_MORE: Duration = Duration::from_millis(1200);
+/// The looks in this time. They are counted: a computer that stalls has not looked.
+const LOOKS: u32 = 20;
 /// The longest time for multicast to find all.
 const SCOUTING: Duration = Duration::from_secs(5);
 
@@ -94,16 +96,16 @@ fn command_config(network: &Network) -> Result<zenoh::Config> {
     config::zenoh(&file.zenoh, path, Role::Command)
 }
 
-/// Opens the session of a command that sends orders. It repeats an order until its machine answers,
-/// so it does not wait for programs that multicast has not found yet.
+/// Opens the session of a command that need not wait for programs that multicast has not found yet:
+/// it repeats an order until its machine answers, or subscribes.
 ///
 /// # Errors
 /// Fails if the file is wrong or no router answers.
-pub async fn open_sender(network: &Network) -> Result<Session> {
+pub async fn open_at_once(network: &Network) -> Result<Session> {
     open(command_config(network)?).await
 }
 
-/// Opens the session of a command that reads. Without a router, it waits until multicast has found
+/// Opens the session of a command that queries. Without a router, it waits until multicast has found
 /// all programs.
 ///
 /// # Errors
@@ -121,14 +123,13 @@ pub async fn open_observer(network: &Network) -> Result<Session> {
 /// Waits until multicast finds no further programs. Zenoh waits for the first ones only.
 async fn find_programs(session: &Session) {
     let began = Instant::now();
-    let (mut found, mut last) = (0, began);
-    while last.elapsed() < NO_MORE && began.elapsed() < SCOUTING {
-        tokio::time::sleep(NO_MORE / 20).await;
+    let (mut found, mut same) = (0, 0);
+    while same < LOOKS && began.elapsed() < SCOUTING {
+        tokio::time::sleep(NO_MORE / LOOKS).await;
         let info = session.info();
         let now = info.peers_zid().await.count() + info.routers_zid().await.count();
-        if now != found {
-            (found, last) = (now, Instant::now());
-        }
+        same = if now == found { same + 1 } else { 0 };
+        found = now;
     }
 }
 

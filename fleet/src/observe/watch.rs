@@ -18,7 +18,7 @@ const MAX_LINE: usize = 300;
 /// # Errors
 /// Fails if no router is reached, or the session is closed.
 pub async fn run(network: &Network, as_json: bool) -> Result<()> {
-    let session = session::open_observer(network).await?;
+    let session = session::open_at_once(network).await?;
     let tokens = session::subscribe_tokens(&session).await?;
     let events = session::subscribe(&session, EACH_EVENT).await?;
     let reports = session::subscribe(&session, EACH_REPORT).await?;

@@ -135,7 +135,7 @@ pub async fn push(args: PushArgs) -> Result<()> {
     let signer = args.key.load()?;
     let bundle = args.bundle.as_deref().map(Bundle::open).transpose()?;
     let contents = bundle.as_ref().map_or(Ok(Vec::new()), Bundle::contents)?;
-    let session = session::open_sender(&args.network).await?;
+    let session = session::open_at_once(&args.network).await?;
     let sender = OrderSender::new(session, signer);
     let mut served = contents;
     let action = match bundle {
@@ -226,7 +226,7 @@ pub async fn update(args: UpdateArgs) -> Result<()> {
         false => None,
     };
     let file = FileRef::of(&bytes);
-    let session = session::open_sender(&args.network).await?;
+    let session = session::open_at_once(&args.network).await?;
     let sender = OrderSender::new(session, signer);
     let all: usize = args.targets.iter().map(|target| target.devices.len()).sum();
     let mut done = 0;

@@ -457,7 +457,7 @@ fn orders_without_right_time_or_place_are_refused() {
     );
     refused(
         &order(&signer, 2, |o| o.not_after = o.not_before + 1),
-        "expired 9 s ago",
+        "expired ",
     );
     refused(&order(&signer, 3, |o| o.not_before += 60), "begins in");
     refused(

@@ -124,7 +124,7 @@ pub async fn stop(args: StopArgs) -> Result<()> {
 
 async fn connect(key: &KeyArgs, network: &Network) -> Result<Arc<OrderSender>> {
     let signer = key.load()?;
-    let session = session::open_sender(network).await?;
+    let session = session::open_at_once(network).await?;
     Ok(Arc::new(OrderSender::new(session, signer)))
 }
 

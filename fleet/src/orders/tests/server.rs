@@ -119,6 +119,19 @@ fn a_stop_ends_a_start_that_runs_and_may_be_repeated() {
     assert!(served.lock().unwrap().stops >= 2);
 }
 
+fn start_at(signer: &Signer, number: u8, at: u64) -> Vec<u8> {
+    order(signer, number, |order| {
+        (order.not_before, order.not_after) = (at - 30, at + 60);
+    })
+}
+
+fn stop_at(signer: &Signer, number: u8, at: u64) -> Vec<u8> {
+    order(signer, number, |order| {
+        (order.not_before, order.not_after) = (at - 30, at + 60);
+        order.action = Action::Stop { start: None };
+    })
+}
+
 /// A start that was sent before a stop does not begin after it; one of the same second may be newer.
 #[test]
 fn a_start_from_before_a_stop_is_refused() {
@@ -127,29 +140,32 @@ fn a_start_from_before_a_stop_is_refused() {
     let (signer, pair) = keys();
     let executor = executor(folder.path(), &[key(&pair, &[Right::Start])]);
     let now = unix_time();
-    let sent_at = |number: u8, at: u64, stops: bool| {
-        order(&signer, number, |order| {
-            (order.not_before, order.not_after) = (at - 30, at + 60);
-            if stops {
-                order.action = Action::Stop { start: None };
-            }
-        })
-    };
-    let reply = executor.receive(&sent_at(1, now, true));
+    let reply = executor.receive(&stop_at(&signer, 1, now));
     assert_eq!(reply.status, Status::Done, "{}", reply.text);
     for (number, at) in [(2, now - 2), (5, now)] {
-        let late = executor.receive(&sent_at(number, at, false));
+        let late = executor.receive(&start_at(&signer, number, at));
         assert_eq!(late.status, Status::Refused, "{}", late.text);
         assert!(late.text.contains("after this start"), "{}", late.text);
     }
     assert_eq!(served.lock().unwrap().starts, 0);
-    // The stop came from a computer whose clock is behind: it counts from its arrival.
-    let behind = executor.receive(&sent_at(6, now - 20, true));
+    started(&executor, &start_at(&signer, 3, now + 20));
+    executor.receive(&stop_at(&signer, 4, now));
+}
+
+/// The clock of the computer that sent the stop is behind: the stop counts from its arrival.
+#[test]
+fn a_start_from_before_the_arrival_of_a_stop_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path());
+    let (signer, pair) = keys();
+    let executor = executor(folder.path(), &[key(&pair, &[Right::Start])]);
+    let now = unix_time();
+    let behind = executor.receive(&stop_at(&signer, 1, now - 20));
     assert_eq!(behind.status, Status::Done, "{}", behind.text);
-    let late = executor.receive(&sent_at(7, now - 5, false));
+    let late = executor.receive(&start_at(&signer, 2, now - 5));
     assert_eq!(late.status, Status::Refused, "{}", late.text);
-    started(&executor, &sent_at(3, now + 2, false));
-    executor.receive(&sent_at(4, now, true));
+    assert!(late.text.contains("after this start"), "{}", late.text);
+    assert_eq!(served.lock().unwrap().starts, 0);
 }
 
 #[test]
