@@ -5,7 +5,6 @@ those of a follower that only repeats what it receives.
 """
 
 import bisect
-import contextlib
 import os
 import pathlib
 import statistics
@@ -14,7 +13,6 @@ import time
 
 import rig
 from fleet_net import Hall
-from report import Stop
 from server import Samples, Server, limit_broken
 
 SEED = int(os.environ.get("ECAXIS_FLEET_SEED", 1))
@@ -235,11 +233,10 @@ def errors(leads, follows, delay):
 def shaft(report, program):
     report.section("line shaft")
     with tempfile.TemporaryDirectory(prefix="ecaxis-judge-") as temporary, Hall(SEED) as hall:
-        with contextlib.suppress(Stop):
-            shaft = Shaft(report, hall, pathlib.Path(temporary), program)
-            shaft.set_up()
-            shaft.engage()
-            shaft.measure()
-            shaft.killed("agent of the follower", shaft.follower.agent, shaft.follower.start_agent, "closed")
-            shaft.killed("agent of the leader", shaft.leader.agent, shaft.leader.start_agent, "timeout")
-            shaft.killed("server of the leader", shaft.leader.server, lambda: None, "timeout")
+        shaft = Shaft(report, hall, pathlib.Path(temporary), program)
+        shaft.set_up()
+        shaft.engage()
+        shaft.measure()
+        shaft.killed("agent of the follower", shaft.follower.agent, shaft.follower.start_agent, "closed")
+        shaft.killed("agent of the leader", shaft.leader.agent, shaft.leader.start_agent, "timeout")
+        shaft.killed("server of the leader", shaft.leader.server, lambda: None, "timeout")

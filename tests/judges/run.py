@@ -17,17 +17,12 @@ import pathlib
 import signal
 import sys
 import tempfile
-import traceback
 
 import rig
-from report import Report, Stop
-from watch import Watch
+from report import Report
+from watch import retry_if_host_stalled
 
 SECTIONS = ["bringup", "overlap", "mailbox", "parameters", "operation", "oddities", "faults", "chain", "ring", "kickcat", "gateway", "ethercrab", "eeproms", "recordings", "page", "reports", "monitoring", "service", "rights", "viewers"]
-
-TRIES = 3
-# The maximum stalled share of a section's time. If every try exceeds it, the section has no result.
-TOO_MUCH = 0.1
 
 
 def main():
@@ -63,34 +58,6 @@ def run(arguments, report):
         bench = sections.Bench(program, *nics, folder, report, arguments.all)
         for name in arguments.sections or SECTIONS:
             retry_if_host_stalled(name, lambda section=getattr(sections, name): section(bench), report)
-
-
-def retry_if_host_stalled(name, section, report):
-    """Repeats a section that fails while the computer stalls. Without a valid try, the section is skipped."""
-    fair = False
-    for left in reversed(range(TRIES)):
-        before = report.mark()
-        with Watch() as watch:
-            try:
-                section()
-            except Stop:
-                report.note("the rest of this section is left out")
-            except rig.Skip:
-                raise
-            except Exception as error:
-                traceback.print_exc()
-                report.check(f"{name} comes to its end", False, repr(error))
-        if report.well_since(before) or watch.longest == 0:
-            return
-        fair = fair or watch.share <= TOO_MUCH
-        report.note(f"a processor stood still for {watch.share:.1%} of the time, {watch.longest * 1e3:.0f} ms at once")
-        if left == 0 and fair:
-            return
-        report.forget(before)
-        if left:
-            report.note("once more")
-        else:
-            rig.count_skip(f"{name}: not one fair try of {TRIES}")
 
 
 if __name__ == "__main__":

@@ -50,6 +50,8 @@ class Samples:
         """Returns the rows: time in ns, then the values."""
         end = time.monotonic_ns()
         while not self.rows or self.rows[-1][0] < end:
+            if time.monotonic_ns() > end + 60e9:
+                raise RuntimeError("no samples come")
             time.sleep(0.01)
         return list(self.rows)
 

@@ -8,12 +8,20 @@ import os
 import signal
 import struct
 import time
+import traceback
+
+import rig
+from report import Stop
 
 EVERY = 0.001
 # A later wake-up counts as a stall.
 LATE = 0.002
 # Above every thread of the program, so that none of them delays the watch.
 PRIORITY = 95
+
+TRIES = 3
+# The maximum stalled share of a section's time. If every try exceeds it, the section has no result.
+TOO_MUCH = 0.1
 
 
 class Watch:
@@ -56,3 +64,31 @@ def watch(cpu, results):
         if late > LATE:
             longest, total = max(longest, late), total + late
             results[:] = struct.pack("dd", longest, total)
+
+
+def retry_if_host_stalled(name, section, report):
+    """Repeats a section that fails while the computer stalls. Without a valid try, the section is skipped."""
+    fair = False
+    for left in reversed(range(TRIES)):
+        before = report.mark()
+        with Watch() as watch:
+            try:
+                section()
+            except Stop:
+                report.note("the rest of this section is left out")
+            except rig.Skip:
+                raise
+            except Exception as error:
+                traceback.print_exc()
+                report.check(f"{name} comes to its end", False, repr(error))
+        if report.well_since(before) or watch.longest == 0:
+            return
+        fair = fair or watch.share <= TOO_MUCH
+        report.note(f"a processor stood still for {watch.share:.1%} of the time, {watch.longest * 1e3:.0f} ms at once")
+        if left == 0 and fair:
+            return
+        report.forget(before)
+        if left:
+            report.note("once more")
+        else:
+            rig.count_skip(f"{name}: not one fair try of {TRIES}")

@@ -159,9 +159,8 @@ mod tests {
         let mut tries = Vec::new();
         for _ in 0..100 {
             let used = use_memory();
-            assert!(used.voluntary_switches >= 1, "{used:?}");
             // One fault on a huge page covers 512 pages.
-            if used.minor_faults >= 8 || locked() {
+            if used.voluntary_switches >= 1 && (used.minor_faults >= 8 || locked()) {
                 return;
             }
             tries.push(used);
