@@ -16,22 +16,35 @@ struct Served {
     program: Option<(UnixStream, Value)>,
     stops: usize,
     starts: usize,
+    /// The state of the bus after it has come up, and now.
+    up: Option<&'static str>,
+    bus: Option<&'static str>,
+    /// The connection with the lease.
+    owner: Option<usize>,
 }
+
+/// The server notes the end of a connection later than the client.
+const NOTED: Duration = Duration::from_millis(500);
 
 fn serve(folder: &Path) -> Arc<Mutex<Served>> {
     let served = Arc::new(Mutex::new(Served::default()));
     let listener = UnixListener::bind(folder.join("m.sock")).unwrap();
     let shared = Arc::clone(&served);
     thread::spawn(move || {
-        for stream in listener.incoming().flatten() {
+        for (connection, stream) in listener.incoming().flatten().enumerate() {
             let served = Arc::clone(&shared);
-            thread::spawn(move || answer(&stream, &served));
+            thread::spawn(move || {
+                answer(connection, &stream, &served);
+                thread::sleep(NOTED);
+                let mut served = served.lock().unwrap();
+                served.owner = served.owner.filter(|owner| *owner != connection);
+            });
         }
     });
     served
 }
 
-fn answer(stream: &UnixStream, served: &Mutex<Served>) {
+fn answer(connection: usize, stream: &UnixStream, served: &Mutex<Served>) {
     for line in BufReader::new(stream)
         .lines()
         .map_while(std::io::Result::ok)
@@ -49,7 +62,18 @@ fn answer(stream: &UnixStream, served: &Mutex<Served>) {
             "state" => {
                 answers[0].1["axes"] = json!([]);
                 answers[0].1["program"] = json!({"running": served.program.is_some()});
-                answers[0].1["bus"] = json!({"state": "op"});
+                answers[0].1["bus"] = json!({"state": served.bus.unwrap_or("op")});
+            }
+            "take" => match *served.owner.get_or_insert(connection) == connection {
+                true => answers[0].1["lease_ms"] = json!(5000),
+                false => {
+                    answers[0].1["ok"] = json!(false);
+                    answers[0].1["error"] = json!({"code": "not_owner", "message": "another connection owns the motion"});
+                }
+            },
+            "bus" => {
+                let up = request["action"] == "up";
+                served.bus = if up { served.up } else { Some("down") };
             }
             "program" => {
                 served.starts += 1;
@@ -225,6 +249,41 @@ fn accepting(folder: &Path) -> String {
     fs::write(&path, text).unwrap();
     fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
     path.display().to_string()
+}
+
+/// Whether the device is well shows only when its bus is up.
+#[test]
+fn an_update_that_makes_the_bus_unhealthy_takes_it_down_again() {
+    for (up, status, why, after) in [
+        ("op", Status::Done, "has the parameters", "op"),
+        ("error", Status::Failed, "the bus is `error`", "down"),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let ecaxis = accepting(folder.path());
+        install(folder.path(), b"machine", None);
+        let served = serve(folder.path());
+        {
+            let mut served = served.lock().unwrap();
+            served.sha256 = FileDigest::of(b"machine").to_string();
+            served.up = Some(up);
+        }
+        let (signer, pair) = keys();
+        let rights = [key(&pair, &[Right::Update])];
+        let source = Memory::new(&[b"values"], 9);
+        let executor = executor_with(folder.path(), &rights, &ecaxis, source);
+        let update = order(&signer, 1, |order| {
+            order.action = Action::Parameters {
+                device: "x".to_owned(),
+                name: BundlePath::try_from("x.toml".to_owned()).unwrap(),
+                file: FileRef::of(b"values"),
+            };
+        });
+        let reply = outcome(&executor, &update);
+        assert_eq!(reply.status, status, "{}", reply.text);
+        assert!(reply.text.contains(why), "{}", reply.text);
+        assert!(!reply.text.contains("stays up"), "{}", reply.text);
+        assert_eq!(served.lock().unwrap().bus, Some(after));
+    }
 }
 
 /// Makes a bundle the current one.
