@@ -33,11 +33,11 @@ pub(crate) const BEGIN: u64 = 1_795_651_200 * SECOND;
 
 /// What the outside world sees of one bus, in common time.
 #[derive(Debug, Default)]
-struct Seen {
+pub(crate) struct Seen {
     /// The pulses of each device, in virtual time and in common time.
     pulses: Vec<Vec<(Nanos, u64)>>,
     /// The frames whose process data differs from that of the frame before.
-    changes: Vec<u64>,
+    pub(crate) changes: Vec<u64>,
     outputs: Vec<u8>,
 }
 
@@ -205,7 +205,7 @@ fn bounds(values: &[i64]) -> [i64; 2] {
 
 /// The run of one bus.
 pub(crate) struct Run {
-    seen: Seen,
+    pub(crate) seen: Seen,
     pub kept: Kept,
     pub warnings: Vec<String>,
     pub error: Option<String>,
@@ -377,7 +377,7 @@ fn two_buses_fire_and_start_together() {
 }
 
 /// Returns a plan of a bus of two drives, with what happens after the begin of the run.
-fn plan(bus: &str, acts: &[(u64, Act)], seconds: u64) -> Plan {
+pub(crate) fn plan(bus: &str, acts: &[(u64, Act)], seconds: u64) -> Plan {
     let acts = acts.iter().map(|(after, act)| (BEGIN + after, *act));
     Plan {
         machine: machine(&drives("1ms", bus, &[40.0, -60.0])),

@@ -37,6 +37,7 @@ mod position_outputs;
 mod probe;
 mod profile_modes;
 mod program;
+mod program_requests;
 mod repeats;
 mod samples;
 mod several_axes;

@@ -136,14 +136,7 @@ impl Supervisor {
             self.command(stops).await;
         }
         if let Some(attendance) = &mut self.attendance {
-            attendance.program = ProgramStatus::default();
-            attendance.step = false;
-            let request = std::mem::take(&mut attendance.program_request);
-            let result = match (result, std::mem::take(&mut attendance.end)) {
-                (_, true) => Err("stopped".to_owned()),
-                (result, false) => result.map_err(|error| error.to_string()),
-            };
-            attendance.report(RequestEvent::Program { request, result });
+            attendance.program_ended(result.map_err(|error| error.to_string()));
         }
         Ok(())
     }
@@ -155,7 +148,13 @@ impl Supervisor {
         };
         let mut commands = Vec::new();
         self.take_requests(&mut attendance, snapshot, &mut commands);
-        let ends = attendance.program.running && (attendance.end || attendance.gone);
+        let mut ends = attendance.program.running && (attendance.end || attendance.gone);
+        if ends && std::mem::take(&mut attendance.start) {
+            // It has not begun.
+            (attendance.start_at, attendance.end) = (None, true);
+            attendance.program_ended(Ok(()));
+            ends = false;
+        }
         self.attendance = Some(attendance);
         if ends && self.start.is_some() {
             // A stop must not be followed by the start of the program.
@@ -281,6 +280,18 @@ impl Attendance {
 
     fn report(&mut self, event: RequestEvent) {
         self.controller.news.push_back(event);
+    }
+
+    /// Reports the end of the program. One that the operator has ended has no other result.
+    fn program_ended(&mut self, result: Result<(), String>) {
+        self.program = ProgramStatus::default();
+        self.step = false;
+        let request = std::mem::take(&mut self.program_request);
+        let result = match std::mem::take(&mut self.end) {
+            true => Err("stopped".to_owned()),
+            false => result,
+        };
+        self.report(RequestEvent::Program { request, result });
     }
 
     fn refuse(&mut self, request: Request, why: &str) {
