@@ -66,6 +66,8 @@ pub enum RtCommand {
         group: GroupIndex,
         held: bool,
     },
+    /// SYNC0 moves slowly from now on: drives go to Op.
+    EnterOp,
     /// Starts the bus monitor: from now on too many bad cycles stop the machine.
     StartBusMonitor,
     /// Stops a group that waits for an optional device.

@@ -45,7 +45,7 @@ struct Limits {
     slew: f64,
     /// The time constant of the approach in s.
     approach_s: f64,
-    /// The largest change of the rate per s.
+    /// The largest change of the correction of the drift per s.
     ramp: f64,
 }
 
@@ -165,6 +165,8 @@ struct Correction {
     /// The rate of the corrections, and the clock that needs it.
     rate: f64,
     rate_of: Option<DeviceIndex>,
+    /// The rate that compensates the drift alone, once it is known.
+    drift: Option<f64>,
 }
 
 /// The cycle's view of its clocks.
@@ -177,7 +179,6 @@ pub struct Observed {
     pub offset_taken: bool,
     /// The session clock's time at which the frame was sent.
     pub sent_at: Nanos,
-    pub in_op: bool,
 }
 
 /// A jump of common time, while it was locked.
@@ -207,12 +208,13 @@ impl CommonTime {
         }
     }
 
+    /// From now on, drives use SYNC0.
+    pub fn enter_op(&mut self) {
+        self.limits = Limits::IN_OP;
+    }
+
     /// Processes one cycle. Returns a jump of a locked common time. RT: O(1), reads clocks.
     pub fn update(&mut self, observed: &Observed) -> Option<Jump> {
-        // Drives are in Op until they have left it: the way back is as slow.
-        if observed.in_op {
-            self.limits = Limits::IN_OP;
-        }
         if observed.offset_taken {
             self.correction.sum += self.correction.rate * self.cycle;
         }
@@ -299,17 +301,28 @@ impl CommonTime {
             correction.of = None;
             return;
         }
-        if !self.line.rate_is_known(self.cycle) || observed.in_op && !self.is_steady() {
-            return;
-        }
         let limits = self.limits;
-        let wanted = self.sync0(&plan) * 1e-9 / limits.approach_s;
-        let wanted = wanted.clamp(-limits.slew, limits.slew);
-        let ramp = limits.ramp * self.cycle * 1e-9;
+        let in_op = limits == Limits::IN_OP;
+        // After a jump, the drift is known well enough to wait for a better one.
+        let waits = in_op && self.correction.drift.is_some() && !self.locked();
+        let known = self.line.rate_is_known(self.cycle) && !waits && (!in_op || self.is_steady());
+        let mut wanted = 0.0;
+        if known {
+            wanted = self.sync0(&plan) * 1e-9 / limits.approach_s;
+            wanted = wanted.clamp(-limits.slew, limits.slew);
+            // The line's rate is that of common time against the corrected clock.
+            let measured = self.correction.rate + self.line.rate;
+            let change = limits.ramp * self.cycle * 1e-9;
+            self.correction.drift = Some(match self.correction.drift {
+                Some(drift) => drift + (measured - drift).clamp(-change, change),
+                None => measured,
+            });
+        }
         let correction = &mut self.correction;
-        // The line's rate is that of common time against the corrected clock.
-        let change = (self.line.rate + wanted).clamp(-ramp, ramp);
-        let rate = (correction.rate + change).clamp(-MAX_RATE, MAX_RATE);
+        let Some(drift) = correction.drift else {
+            return;
+        };
+        let rate = (drift + wanted).clamp(-MAX_RATE, MAX_RATE);
         self.line.rate -= rate - correction.rate;
         correction.rate = rate;
     }
@@ -323,7 +336,8 @@ impl CommonTime {
             return;
         }
         if correction.rate_of != Some(of) {
-            (correction.rate, correction.rate_of) = (0.0, Some(of));
+            (correction.rate, correction.drift) = (0.0, None);
+            correction.rate_of = Some(of);
             self.line = Line::default();
         }
         (correction.of, correction.sum) = (Some((of, offset)), 0.0);
@@ -443,12 +457,14 @@ mod tests {
                 let offset = time.offset(REFERENCE).unwrap_or(0);
                 let local = passed as f64 * (1.0 + ppm * 1e-6);
                 let system_time = (local as u64).wrapping_add(offset) & bits;
+                if cycle == 6_000 {
+                    time.enter_op();
+                }
                 time.update(&Observed {
                     reference: REFERENCE,
                     system_time: Some(system_time),
                     offset_taken: align,
                     sent_at: at,
-                    in_op: cycle > 6_000,
                 });
                 if cycle % 1_000 == 999 {
                     seen.push(time.status());

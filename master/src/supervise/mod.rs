@@ -228,6 +228,7 @@ impl Supervisor {
         let waited = clock::now();
         self.await_phase().await?;
         self.bus.times.add("phase lock", None, waited, clock::now());
+        self.send(RtCommand::EnterOp).await;
         let requested = clock::now();
         for device in self.bus.devices.iter().filter(|device| device.present) {
             enable_op_only(&self.wire, device, true).await?;

@@ -72,6 +72,7 @@ impl Engine {
             RtCommand::Couple { gantry, coupled } => self.couple(gantry, coupled),
             RtCommand::Override { group, factor } => self.overrides.set_factor(group, factor),
             RtCommand::Hold { group, held } => self.overrides.set_hold(group, held),
+            RtCommand::EnterOp => self.common.enter_op(),
             RtCommand::StartBusMonitor => {
                 self.guarding = true;
                 self.exchange.expect_op(true);

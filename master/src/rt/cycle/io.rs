@@ -181,7 +181,6 @@ impl Engine {
             system_time: self.answer.system_time,
             offset_taken: self.answer.offset_taken,
             sent_at: self.answer.sent_at,
-            in_op: self.guarding,
         });
         if let Some(Jump { by_ns }) = jump {
             let cycle = self.stats.counters.cycles;
