@@ -18,7 +18,7 @@ use crate::session::MAX_REPLY;
 /// The longest headline of a summary, in characters.
 const MAX_HEADLINE: usize = 200;
 /// The reports of a list.
-const MAX_LIST: usize = 1000;
+pub(crate) const MAX_LIST: usize = 1000;
 
 /// The SHA-256 of a report, in hexadecimal digits.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]

@@ -22,7 +22,7 @@ use zenoh::sample::{Sample, SampleKind};
 use crate::config::{self, ArchiveFile, Role};
 use crate::error::{Error, Result};
 use crate::keys::{ALL_REPORTS, ALL_STATES, EACH_EVENT, EACH_REPORT, MachineId, Name};
-use crate::reports::{ReportId, Summary};
+use crate::reports::{MAX_LIST, ReportId, Summary};
 use crate::session::{self, Reply};
 use events::MAX_EVENT;
 use machine::ArchivedMachine;
@@ -158,7 +158,7 @@ impl Archive {
         let waiting = Arc::new(tokio::sync::Mutex::new(waiting));
         let mut tasks = JoinSet::new();
         for _ in 0..WORKERS {
-            tasks.spawn(Arc::clone(&self).work(Arc::clone(&waiting)));
+            tasks.spawn(Arc::clone(&self).work(Arc::clone(&waiting), work.clone()));
         }
         tasks.spawn(Arc::clone(&self).query_all(interval, work.clone()));
         let offer = |item| {
@@ -185,20 +185,29 @@ impl Archive {
                         offer(Work::Machine(id));
                     }
                 },
+                Some(ended) = tasks.join_next() => {
+                    let why = ended.err().map_or_else(String::new, |error| error.to_string());
+                    return Err(Error::new(format!("a task of the archive has ended: {why}")));
+                }
             }
         }
     }
 
     /// Does what waits, until the archive ends.
-    async fn work(self: Arc<Self>, waiting: Arc<tokio::sync::Mutex<Receiver<Work>>>) {
+    async fn work(
+        self: Arc<Self>,
+        waiting: Arc<tokio::sync::Mutex<Receiver<Work>>>,
+        more: Sender<Work>,
+    ) {
         loop {
             let next = waiting.lock().await.recv().await;
             match next {
                 Some(Work::Machine(id)) => {
-                    for (id, report) in self.query_reports(&id.key("reports")).await {
-                        self.fetch(&id, &report).await;
-                    }
                     self.query_events(&id).await;
+                    for (id, report) in self.query_reports(&id.key("reports")).await {
+                        // What is dropped is found by the next query of all machines.
+                        let _ = more.try_send(Work::Report(id, report));
+                    }
                 }
                 Some(Work::Report(id, report)) => self.fetch(&id, &report).await,
                 Some(Work::Events(id)) => self.query_events(&id).await,
@@ -294,10 +303,11 @@ impl Archive {
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             ticks.tick().await;
+            let events = self.all().into_iter().filter(|(_, m)| m.lacks_events());
+            let events: Vec<_> = events.map(|(id, _)| Work::Events(id)).collect();
             let reports = self.query_reports(ALL_REPORTS).await;
             let reports = reports.into_iter().map(|(id, r)| Work::Report(id, r));
-            let events = self.all().into_iter().filter(|(_, m)| m.lacks_events());
-            for item in reports.chain(events.map(|(id, _)| Work::Events(id))) {
+            for item in events.into_iter().chain(reports) {
                 if work.send(item).await.is_err() {
                     return;
                 }
@@ -305,10 +315,11 @@ impl Archive {
         }
     }
 
-    /// Returns the reports that others have and this archive lacks.
+    /// Returns the reports that others have and this archive lacks, of each machine not more than a
+    /// list has.
     async fn query_reports(&self, selector: &str) -> BTreeSet<(MachineId, ReportId)> {
         let replies = session::query(&self.session, selector, TIMEOUT).await;
-        let mut lacking = BTreeSet::new();
+        let (mut lacking, mut counts) = (BTreeSet::new(), BTreeMap::<_, usize>::new());
         for reply in replies.unwrap_or_default().all {
             let Some((id, "reports")) = MachineId::of_key(&reply.key) else {
                 continue;
@@ -316,8 +327,12 @@ impl Archive {
             let machine = self.known(&id);
             for summary in reply.json::<Vec<Summary>>().unwrap_or_default() {
                 let known = machine.as_ref();
-                if !known.is_some_and(|machine| machine.reports.contains(&summary.id)) {
-                    lacking.insert((id.clone(), summary.id));
+                let count = counts.entry(id.clone()).or_default();
+                if *count < MAX_LIST
+                    && !known.is_some_and(|machine| machine.reports.contains(&summary.id))
+                    && lacking.insert((id.clone(), summary.id))
+                {
+                    *count += 1;
                 }
             }
         }
@@ -355,7 +370,8 @@ impl Archive {
         let answer = replies
             .ok()
             .and_then(|replies| replies.all.first()?.json::<Value>());
-        if let Some(Value::Array(events)) = answer.map(|mut answer| answer["events"].take()) {
+        let events = answer.and_then(|mut answer| Some(answer.get_mut("events")?.take()));
+        if let Some(Value::Array(events)) = events {
             let (archive, id) = (Arc::clone(self), id.clone());
             on_disk(move || {
                 if let Some(machine) = archive.machine(&id) {
