@@ -2,11 +2,11 @@
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use zenoh::Session;
 
-use super::print;
+use super::{TIMEOUT, print};
 use crate::error::{Error, Result};
 use crate::keys::{ALL_REPORTS, MachineId};
 use crate::options::{Network, ReportAction};
@@ -15,6 +15,8 @@ use crate::session;
 
 /// The time for the replies. The lists of a long history are long, and a network may be slow.
 const LIST_TIMEOUT: Duration = Duration::from_secs(30);
+/// The time until a report is asked for again.
+const REPEAT: Duration = Duration::from_millis(500);
 
 /// Lists or shows fault reports.
 ///
@@ -76,14 +78,18 @@ async fn show(session: &Session, prefix: &str) -> Result<()> {
     let key = report
         .machine
         .key(&format!("report/{}", report.id.as_str()));
-    let replies = session::query(session, &key, LIST_TIMEOUT).await?;
-    let whole = replies
-        .all
-        .iter()
-        .find(|reply| ReportId::of(&reply.bytes) == report.id);
-    let Some(reply) = whole else {
-        let what = format!("report {prefix}: {} does not answer", report.machine);
-        return Err(Error::new(what).help("run an archive to keep the reports of machines"));
-    };
-    print(&String::from_utf8_lossy(&reply.bytes))
+    let began = Instant::now();
+    loop {
+        let replies = session::query(session, &key, LIST_TIMEOUT).await?;
+        let mut replies = replies.all.iter();
+        if let Some(reply) = replies.find(|reply| ReportId::of(&reply.bytes) == report.id) {
+            return print(&String::from_utf8_lossy(&reply.bytes));
+        }
+        // A connection that is lost meanwhile comes again after 1 to 4 s.
+        if began.elapsed() > 2 * TIMEOUT {
+            let what = format!("report {prefix}: {} does not answer", report.machine);
+            return Err(Error::new(what).help("run an archive to keep the reports of machines"));
+        }
+        tokio::time::sleep(REPEAT).await;
+    }
 }
