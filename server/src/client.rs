@@ -227,7 +227,12 @@ impl Client {
         entry.insert("sha256".to_owned(), json!(sha256));
         let client = json!({"id": self.id, "name": self.name(), "peer": self.peer});
         entry.insert("client".to_owned(), client);
-        entry.insert("command".to_owned(), json!(op));
+        let mut command = json!(op);
+        if let Op::Note { text } = op {
+            // A longer one is refused, and shall not fill the log.
+            command["text"] = json!(text.chars().take(NOTE_LENGTH).collect::<String>());
+        }
+        entry.insert("command".to_owned(), command);
         let outcome = "the client was gone before the outcome".to_owned();
         Some(Change {
             changes,

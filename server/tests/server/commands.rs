@@ -341,6 +341,8 @@ fn commands_are_in_the_change_log_with_their_client() {
         .map(|entry| &entry["command"]["op"])
         .collect();
     assert_eq!(commands, expected);
+    let text = changes[7]["command"]["text"].as_str();
+    assert_eq!(text.map(str::len), Some(2000), "a part of a refused note");
     for entry in &changes[1..5] {
         assert_eq!(entry["client"]["name"], json!("cell"));
         assert_eq!(entry["client"]["peer"]["pid"], json!(std::process::id()));
