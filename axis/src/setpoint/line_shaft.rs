@@ -31,7 +31,7 @@ pub struct LineShaftConfig {
     /// The acceleration limit, units per second². Also that of its stop.
     pub acceleration: f64,
     /// The time in seconds without a newer point at which the stream has ended. It counts from the
-    /// point's instant or from the cycle that used it first, whichever is earlier.
+    /// point's instant or from the cycle in which it came, whichever is earlier.
     pub timeout_s: f64,
     /// The time in seconds within which a difference from the prediction decays.
     pub smoothing_s: f64,

@@ -302,10 +302,13 @@ impl CommonTime {
             return;
         }
         let limits = self.limits;
-        let in_op = limits == Limits::IN_OP;
-        // After a jump, the drift is known well enough to wait for a better one.
-        let waits = in_op && self.correction.drift.is_some() && !self.locked();
-        let known = self.line.rate_is_known(self.cycle) && !waits && (!in_op || self.is_steady());
+        let usable = match (limits == Limits::IN_OP, self.correction.drift) {
+            (false, _) => true,
+            (true, None) => self.is_steady(),
+            // After a jump, the drift is known well enough to wait for a better one.
+            (true, Some(_)) => self.locked(),
+        };
+        let known = usable && self.line.rate_is_known(self.cycle);
         let mut wanted = 0.0;
         if known {
             wanted = self.sync0(&plan) * 1e-9 / limits.approach_s;
@@ -517,5 +520,19 @@ mod tests {
         let place = |second: usize| seen[second].alignment.expect("aligns").sync0_ns;
         assert!((25_000.0..31_000.0).contains(&place(14)), "{}", place(14));
         assert!(place(29) < place(14) - 12_000.0, "{}", place(29));
+    }
+
+    /// A small step of the clock of the host looks like drift for a while.
+    #[test]
+    fn a_step_below_a_jump_moves_sync0_slowly() {
+        let set = |cycle| (cycle == 12_500).then_some(1_700_000_000_000_009_000);
+        let seen = follow(true, (40.0, 500, u64::MAX), 40, set);
+        let rates = seen[12..]
+            .iter()
+            .map(|s| s.alignment.expect("aligns").correction_ppm + 40.0);
+        let most = rates.fold(0.0, |most: f64, rate| most.max(rate.abs()));
+        assert!(most < 3.5, "{most} ppm");
+        assert!(seen.iter().all(|status| status.jumps == 0));
+        assert!(seen[39].alignment.expect("aligns").aligned);
     }
 }
