@@ -109,6 +109,14 @@ fn report_of(key: &KeyExpr<'_>) -> Option<(MachineId, ReportId)> {
     Some((id, ReportId::try_from(report).ok()?))
 }
 
+/// Returns the list of an answer to `…/events`; `None` if it has none.
+fn events_of(mut answer: Value) -> Option<Vec<Value>> {
+    match answer.get_mut("events")?.take() {
+        Value::Array(events) => Some(events),
+        _ => None,
+    }
+}
+
 /// Opens what an earlier process has kept.
 fn load(folder: &Path, max_reports: usize) -> std::io::Result<Machines> {
     fs::create_dir_all(folder)?;
@@ -370,8 +378,7 @@ impl Archive {
         let answer = replies
             .ok()
             .and_then(|replies| replies.all.first()?.json::<Value>());
-        let events = answer.and_then(|mut answer| Some(answer.get_mut("events")?.take()));
-        if let Some(Value::Array(events)) = events {
+        if let Some(events) = answer.and_then(events_of) {
             let (archive, id) = (Arc::clone(self), id.clone());
             on_disk(move || {
                 if let Some(machine) = archive.machine(&id) {
@@ -409,5 +416,19 @@ impl Archive {
                 session::reply(query, &key, list.into_bytes());
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn any_answer_has_events_or_none() {
+        for answer in [json!([]), json!(1), json!("x"), json!(null), json!({})] {
+            assert_eq!(events_of(answer), None);
+        }
+        assert_eq!(events_of(json!({"events": 1})), None);
+        assert_eq!(events_of(json!({"events": [1]})), Some(vec![json!(1)]));
     }
 }

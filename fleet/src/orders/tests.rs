@@ -455,9 +455,16 @@ fn orders_without_right_time_or_place_are_refused() {
         &order(&signer, 1, |o| o.machine = "hall/m2".parse().unwrap()),
         "is for hall/m2",
     );
-    refused(
-        &order(&signer, 2, |o| o.not_after = o.not_before + 1),
-        "expired ",
+    let begin = unix_time();
+    let end = begin - 9;
+    let expired = executor.receive(&order(&signer, 2, |o| {
+        (o.not_before, o.not_after) = (end - 1, end);
+    }));
+    let mut texts = (begin..=unix_time()).map(|now| format!("expired {} s ago", now - end));
+    assert!(
+        texts.any(|text| expired.text.contains(&text)),
+        "{}",
+        expired.text
     );
     refused(&order(&signer, 3, |o| o.not_before += 60), "begins in");
     refused(
