@@ -58,7 +58,7 @@ fn run_with_load(file: &Path, nic: &str, tap: &str) -> Value {
 }
 
 fn open_pages() {
-    let ends = Instant::now() + Duration::from_secs(60);
+    let ends = Instant::now() + Duration::from_secs(20);
     let mut opened = 0;
     while opened < PAGES {
         assert!(Instant::now() < ends, "only {opened} pages");

@@ -115,7 +115,7 @@ def together(report, machines):
         sockets = [machines.folder / f"{name}.sock" for name in NAMES]
         recorded = [Samples(path, "x.target_position") for path in sockets]
         # The server counts in CLOCK_MONOTONIC.
-        at = time.time() + 8
+        at = time.time() + 5
         instant = time.monotonic_ns() + (at - time.time()) * 1e9
         done = machines.order("start", "--at", f"{at:.6f}")
         if done.returncode == 0:
@@ -142,11 +142,12 @@ def together(report, machines):
     report.check("the axes stand, and no program runs", True)
     for _ in range(10):
         time.sleep(-time.time() % 1)
+        second = int(time.time())
         machines.order("stop")
         same = machines.order("start")
-        if "was sent after this start" in same.stderr:
+        if int(time.time()) == second or "was sent after this start" in same.stderr:
             break
-        # Both were not within a second.
+        # Perhaps they were not within a second.
         machines.order("stop")
         machines.rest()
     report.check("a start in the second of the stop is refused", "was sent after this start" in same.stderr, same.stderr)
@@ -154,11 +155,7 @@ def together(report, machines):
 
 
 def past(report, machines):
-    for _ in range(3):
-        done = machines.order("start", "--at", f"{time.time() - 5:.3f}")
-        # The time for an answer is short.
-        if "has not confirmed" not in done.stderr:
-            break
+    done = machines.order("start", "--at", f"{time.time() - 5:.3f}")
     report.check("an instant in the past is refused", done.returncode != 0 and done.stderr.count("past") >= 2, done.stderr)
 
 
@@ -169,7 +166,7 @@ def one_refuses(report, machines):
     owner.ask("enable", axis="x", wait=True)
     owner.ask("velocity", axis="x", velocity=0.5)
     watched = Samples(machines.folder / "m1.sock", "x.target_position")
-    at = time.time() + 10
+    at = time.time() + 6
     done = machines.order("start", "--at", f"{at:.3f}")
     said = done.stderr
     report.check("one refuses", done.returncode != 0 and "hall/m2: refused" in said and "`cell` owns the motion" in said, said)
@@ -182,7 +179,7 @@ def one_refuses(report, machines):
     report.equal("and its program does not run", machines.server("m1").ask("state")["program"]["running"], False)
     owner.ask("stop")
     owner.ask("release")
-    silent = machines.command("start", "hall/m1", "hall/absent", "--at", f"{time.time() + 8:.3f}", "--key", machines.folder / "anna.key")
+    silent = machines.command("start", "hall/m1", "hall/absent", "--at", f"{time.time() + 4:.3f}", "--key", machines.folder / "anna.key")
     cancelled = "hall/m1: the start is cancelled" in silent.stdout and "hall/absent: the stop of the start is not confirmed" in silent.stderr
     report.check("a machine without an answer counts as refused", silent.returncode != 0 and cancelled, silent.stdout + silent.stderr)
     machines.rest()

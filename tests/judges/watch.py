@@ -66,8 +66,9 @@ def watch(cpu, results):
             results[:] = struct.pack("dd", longest, total)
 
 
-def retry_if_host_stalled(name, section, report):
-    """Repeats a section that fails while the computer stalls. Without a valid try, the section is skipped."""
+def retry_if_host_stalled(name, section, report, short=0.0):
+    """Repeats a section that fails while the computer stalls, for more than `short` s at once. Without a valid try, the section is
+    skipped."""
     fair = False
     for left in reversed(range(TRIES)):
         before = report.mark()
@@ -81,7 +82,7 @@ def retry_if_host_stalled(name, section, report):
             except Exception as error:
                 traceback.print_exc()
                 report.check(f"{name} comes to its end", False, repr(error))
-        if report.well_since(before) or watch.longest == 0:
+        if report.well_since(before) or watch.longest <= short:
             return
         fair = fair or watch.share <= TOO_MUCH
         report.note(f"a processor stood still for {watch.share:.1%} of the time, {watch.longest * 1e3:.0f} ms at once")
