@@ -5,7 +5,7 @@ use std::hint::black_box;
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use ecaxis_axis::group::{Line, LineAxis};
 use ecaxis_axis::setpoint::{
-    Goal, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint, Trapezoid,
+    Goal, JerkLimited, Motion, MotionLimits, MoveRequest, Rate, Setpoint, Trapezoid,
 };
 
 const DT: f64 = 0.001;
@@ -31,7 +31,7 @@ fn cycles(c: &mut Criterion) {
     group.bench_function("jerk_limited", |b| {
         b.iter(|| {
             for (source, motion) in &mut axes {
-                *motion = source.advance(*motion, DT);
+                *motion = source.advance(*motion, Rate::WHOLE, DT);
                 if source.finished(*motion) {
                     *source = far(50.0);
                     *motion = Motion::at(0.0);
@@ -51,7 +51,7 @@ fn cycles(c: &mut Criterion) {
     group.bench_function("trapezoid", |b| {
         b.iter(|| {
             for (source, motion) in &mut axes {
-                *motion = source.advance(*motion, DT);
+                *motion = source.advance(*motion, Rate::WHOLE, DT);
                 if source.finished(*motion) {
                     *motion = Motion::at(0.0);
                 }
@@ -74,7 +74,7 @@ fn cycles(c: &mut Criterion) {
     group.bench_function("line", |b| {
         b.iter(|| {
             for (source, motion) in &mut axes {
-                *motion = source.advance(*motion, DT);
+                *motion = source.advance(*motion, Rate::WHOLE, DT);
             }
             if axes[0].0.finished(axes[0].1) {
                 axes = start;
@@ -91,7 +91,7 @@ fn plans(c: &mut Criterion) {
     let mut moving = far(50.0);
     let mut motion = Motion::at(0.0);
     for _ in 0..180 {
-        motion = moving.advance(motion, DT);
+        motion = moving.advance(motion, Rate::WHOLE, DT);
     }
     for (name, target) in [("long", 100.0), ("short", 1.0)] {
         group.bench_function(format!("{name}_from_rest"), |b| {

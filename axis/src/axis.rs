@@ -16,12 +16,14 @@
 //! | `plan` | advances the set-point |
 //! | `control_law` | converts the set-point to the drive's targets |
 //! | `mode_switch` | switches between modes |
+//! | `mode_cycle` | mode switches of drives that need them without power |
 //! | `home` | homing |
 //! | `lead` | the second half of a gantry |
 //! | `stop` | power, stops, brake, automatic fault reset |
 //! | `correction` | backlash and pitch error between drive and load |
 //! | `feedback` | values reported by the drive |
 //! | `supervision` | supervision of these values; final limits of the set-point |
+//! | `rest` | rest that is demanded while the axis keeps its power |
 //! | `lost_frames` | lost frames and skipped cycles |
 //! | `second_encoder` | a second encoder at the load, supervised |
 //! | `report` | status |
@@ -32,7 +34,7 @@ use crate::cia402::{
 use crate::compensation::Compensation;
 use crate::profile_mode::Profile;
 use crate::setpoint::Motion;
-use crate::status::{CommandError, DriveFault, Trip};
+use crate::status::{CommandError, DriveFault, PowerLossCause, Trip};
 use crate::touch_probe::Probes;
 use crate::units::Counts;
 
@@ -45,15 +47,17 @@ mod home;
 mod io;
 mod lead;
 mod lost_frames;
+mod mode_cycle;
 mod mode_switch;
 mod plan;
 mod report;
+mod rest;
 mod second_encoder;
 mod stop;
 mod supervision;
 
 pub use command::Command;
-pub use config::{AxisConfig, ConfigError};
+pub use config::{AxisConfig, ConfigError, HomeReference};
 pub use io::{Inputs, Outputs};
 pub use lead::Losses;
 pub use second_encoder::SecondEncoder;
@@ -89,6 +93,7 @@ pub struct Axis {
     mode: Mode,
     switch: Option<Switch>,
     switch_failed: Option<Mode>,
+    mode_cycle: Option<mode_cycle::ModeCycle>,
     memory: PowerState,
     statusword: Statusword,
     state: State,
@@ -98,9 +103,12 @@ pub struct Axis {
     reset: bool,
     reset_failed: bool,
     actual: Actual,
-    /// True while set-points come from `plan`. Otherwise they follow `actual`.
-    active: bool,
+    control: Control,
     plan: Plan,
+    /// The target of the last accepted move, until another command or a stop replaces it. It is
+    /// independent of the set-point, which a stop or a loss of power moves elsewhere.
+    commanded_target: Option<f64>,
+    rest: rest::Rest,
     /// Override of all velocities, from 0 to [`MAX_RATE`].
     rate: f64,
     motion: Motion,
@@ -140,8 +148,26 @@ pub struct Axis {
     led: bool,
     /// Torque feed-forward of this cycle from outside, percent of rated torque.
     torque_feedforward: f64,
+    /// Consecutive fresh cycles with a Statusword that is not believed.
+    unlisted_cycles: u8,
+    /// Time in seconds for which such a Statusword has delayed enabling.
+    unlisted_s: f64,
+    /// The cause of the last stop, or of the last loss of power, since the axis was enabled.
+    power_loss_cause: Option<PowerLossCause>,
     fault: Option<DriveFault>,
     trip: Option<Trip>,
+}
+
+/// Whether the drive has power by our command, and follows set-points.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Control {
+    /// No power by our command. Targets follow actual values.
+    Unpowered,
+    /// Operation enabled by our command; mode, position or Statusword bit 12 are still missing.
+    /// Targets follow actual values.
+    Powered,
+    /// The drive follows the set-points of the plan.
+    Following,
 }
 
 impl Axis {
@@ -170,11 +196,14 @@ impl Axis {
                 config.supervision.acceleration.is_some()
                     || config.modes.with(config.mode).contains(Mode::Cst),
             ),
-            active: false,
+            control: Control::Unpowered,
             mode: config.mode,
             switch: None,
             switch_failed: None,
+            mode_cycle: None,
             plan: Plan::braking(&config, config.mode),
+            commanded_target: None,
+            rest: rest::Rest::default(),
             rate: 1.0,
             motion: Motion::default(),
             loop_state: LoopState::default(),
@@ -199,6 +228,9 @@ impl Axis {
             undelivered_cycles: 0,
             unfollowed_cycles: 0,
             interrupted: false,
+            unlisted_cycles: 0,
+            unlisted_s: 0.0,
+            power_loss_cause: None,
             external_setpoint: None,
             led: false,
             torque_feedforward: 0.0,
@@ -283,7 +315,15 @@ impl Axis {
         self.dt_s = dt_s;
         self.fresh = inputs.fresh && self.stale_answers == 0;
         self.stale_answers = self.stale_answers.saturating_sub(1);
-        if self.fresh {
+        if self.fresh && self.is_unlisted(inputs.statusword) {
+            // The frame has arrived, and its values are not believed.
+            self.stale_cycles = 0;
+            self.undelivered_cycles = 0;
+            self.fresh = false;
+            self.count_unlisted(inputs.statusword);
+        } else if self.fresh {
+            self.unlisted_cycles = 0;
+            self.unlisted_s = 0.0;
             self.read(inputs);
             self.supervise();
         } else {
@@ -305,13 +345,14 @@ impl Axis {
         self.settle_stop(fresh, dt_s);
         self.settle_reset(dt_s);
         self.settle_mode(fresh, dt_s);
+        self.settle_mode_cycle(fresh, dt_s);
         self.settle_homing(fresh, dt_s);
         self.switch_power(fresh, dt_s);
         if fresh {
-            self.update_active();
+            self.update_control();
         }
         let (sent, play) = (self.sent, self.play_state());
-        if !self.active {
+        if !self.follows() {
             self.track_actual();
         } else if self.setpoint_frozen() {
             self.freeze();
@@ -321,6 +362,7 @@ impl Axis {
             self.advance(fresh, dt_s);
             self.close_loops(fresh, dt_s);
         }
+        self.settle_rest(fresh, dt_s);
         self.settle_brake();
         self.external_setpoint = None;
         self.led = false;
@@ -376,7 +418,7 @@ impl Axis {
         let request = Request {
             power,
             reset_fault: self.reset,
-            hold: !self.mode_confirmed(),
+            hold: !self.mode_confirmed() && !self.config.mode_display_enabled,
             quick_stop_ends: self.config.quick_stop_ends,
             without_transition_16: self.config.quick_stop.is_some_and(|option| !option.stays()),
         };
@@ -398,22 +440,80 @@ impl Axis {
             && self.actual.counts().is_none()
     }
 
-    fn update_active(&mut self) {
-        let possible = self.state == State::OperationEnabled
+    /// Returns true if the drive is in Operation enabled by our command.
+    pub(crate) const fn has_control(&self) -> bool {
+        !matches!(self.control, Control::Unpowered)
+    }
+
+    /// Returns true if the drive follows the set-points of the plan.
+    const fn follows(&self) -> bool {
+        matches!(self.control, Control::Following)
+    }
+
+    /// Updates power and following after fresh inputs. A loss of power or of bit 12 that was not
+    /// commanded has already stopped the axis ([`Axis::supervise`]).
+    fn update_control(&mut self) {
+        let on = self.goal == PowerGoal::On;
+        let operates = self.state == State::OperationEnabled;
+        let ready = operates
             && self.mode_confirmed()
             && self.reported_to_follow()
             && !self.lacks_position();
-        if !possible {
-            self.active = false;
-            self.end_switch();
-        } else if !self.active && self.goal == PowerGoal::On {
-            self.active = true;
-            self.track_actual();
-            self.supervision = supervision::SupervisionState::starting_at(
-                self.actual.position(),
-                &self.config.limits,
-            );
+        if !operates || !self.has_control() && !on {
+            self.release();
+            return;
         }
+        match self.control {
+            Control::Unpowered => {
+                self.control = Control::Powered;
+                self.start_supervision();
+                if ready {
+                    self.begin_following();
+                }
+            }
+            Control::Powered if ready && on => self.begin_following(),
+            Control::Following if !ready && self.switch.is_none() => {
+                self.control = Control::Powered;
+                self.forget_target();
+            }
+            Control::Powered | Control::Following => {}
+        }
+    }
+
+    /// Starts the set-point from the present motion. An axis that has begun to move since the enable
+    /// command decelerates within its limits.
+    fn begin_following(&mut self) {
+        self.track_actual();
+        self.start_supervision();
+        self.control = Control::Following;
+        let velocity = self.held_velocity();
+        let commands = matches!(
+            self.controlled_quantity(),
+            ControlledQuantity::Position | ControlledQuantity::Velocity
+        );
+        if velocity != 0.0 && commands {
+            self.motion = self.motion_at_actual(velocity);
+            self.track_play();
+        }
+        self.demand_rest();
+    }
+
+    /// Gives the set-point back to the drive's report, without power.
+    fn release(&mut self) {
+        self.control = Control::Unpowered;
+        self.forget_target();
+        self.permit_motion();
+        self.end_switch();
+    }
+
+    fn start_supervision(&mut self) {
+        self.supervision =
+            supervision::SupervisionState::starting_at(self.actual.position(), &self.config.limits);
+    }
+
+    /// Forgets the commanded target: nothing is "done" at it any more.
+    const fn forget_target(&mut self) {
+        self.commanded_target = None;
     }
 
     /// Sets the targets to the reported values, so that enabling causes no step.

@@ -40,8 +40,8 @@ mod touch_probe;
 pub mod units;
 
 pub use axis::{
-    Axis, AxisConfig, Command, ConfigError, Inputs, Losses, MAX_RATE, MIN_RATE, Outputs,
-    SecondEncoder,
+    Axis, AxisConfig, Command, ConfigError, HomeReference, Inputs, Losses, MAX_RATE, MIN_RATE,
+    Outputs, SecondEncoder,
 };
 pub use cia402::{Controlword, HaltOption, Mode, Modes, QuickStopOption, State, Statusword};
 pub use compensation::Compensation;
@@ -51,7 +51,8 @@ pub use position_loop::{FeedForward, Loops, PositionPid, VelocityLoop};
 pub use scale::{AccelerationUnit, Scale, ScaleError, VelocityBase, VelocityUnit};
 pub use sercos::{ControlOutput, DriveWords, SercosWords};
 pub use status::{
-    AxisStatus, CommandError, DriveFault, EnableBlocker, HomingStatus, StopPhase, StopStatus, Trip,
+    AxisStatus, CommandError, DriveFault, EnableBlocker, HomingStatus, PositionValidity,
+    PowerLossCause, StopPhase, StopStatus, Trip,
 };
 pub use supervision::{Brake, FaultReset, StopMethod, Supervision, TorqueWatch};
 pub use touch_probe::{Edge, Probe, ProbeStatus, Source};

@@ -166,6 +166,12 @@ impl Profile {
         self.goal.as_ref()
     }
 
+    /// Returns true while the drive is commanded to halt (Controlword bit 8).
+    #[must_use]
+    pub fn is_halted(&self) -> bool {
+        self.halt || self.rate == 0.0
+    }
+
     /// PP: returns true while a target is pending.
     #[must_use]
     pub const fn pending(&self) -> bool {

@@ -19,7 +19,9 @@ mod drive_units;
 mod modulo;
 mod torque;
 
-pub use drive_unit::{AccelerationBase, AccelerationUnit, INCREMENTS, VelocityBase, VelocityUnit};
+pub use drive_unit::{
+    AccelerationBase, AccelerationUnit, INCREMENTS, UnknownVelocityUnit, VelocityBase, VelocityUnit,
+};
 pub use drive_units::{DriveUnits, UnitMismatch, same_motor};
 pub use modulo::ModuloDirection;
 pub use torque::TorqueScale;

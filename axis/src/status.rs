@@ -21,7 +21,8 @@ use crate::touch_probe::ProbeStatus;
 pub struct AxisStatus {
     /// The active mode; its targets apply.
     pub mode: Mode,
-    /// The mode of a pending switch: 0x6060 is written, 0x6061 does not show it yet.
+    /// The mode of a pending switch: 0x6061 does not show it yet, or power has not returned yet
+    /// ([`crate::AxisConfig::mode_change_unpowered`]).
     pub switching: Option<Mode>,
     /// The last commanded mode, if 0x6061 did not show it in time. The axis has stayed in `mode`.
     pub switch_failed: Option<Mode>,
@@ -33,8 +34,10 @@ pub struct AxisStatus {
     pub statusword: u16,
     /// The Controlword of the last outputs.
     pub controlword: u16,
-    /// True in Operation enabled with confirmed mode: the axis generates the set-points. Before
-    /// that, targets follow actual values.
+    /// True in Operation enabled by our command. The limits are supervised.
+    pub powered: bool,
+    /// True while the drive follows set-points: powered, the mode shown, Statusword bit 12 set.
+    /// Before that, targets follow actual values.
     pub enabled: bool,
     /// True while motion commands are accepted: `enabled`, not stopping and not being disabled,
     /// brake open.
@@ -54,6 +57,9 @@ pub struct AxisStatus {
     pub velocity: f64,
     /// Reported torque in percent of rated torque.
     pub torque: f64,
+    /// The target of the last position move, until another command, a stop or a loss of power
+    /// replaces it. A move is done only where this is still its target.
+    pub commanded_target: Option<f64>,
     /// Commanded position of this cycle.
     pub target_position: f64,
     /// Commanded velocity of this cycle.
@@ -89,12 +95,14 @@ pub struct AxisStatus {
     pub resets_tried: u8,
     /// The state of the last homing.
     pub homing: HomingStatus,
-    /// True if home was found and no homing has started since.
-    pub homed: bool,
+    /// What the reported position refers to.
+    pub validity: PositionValidity,
     /// The first fault of the drive since the last reset.
     pub fault: Option<DriveFault>,
     /// The first trip since the last reset.
     pub trip: Option<Trip>,
+    /// The cause of the present stop, or of the last loss of power, since the axis was enabled.
+    pub power_loss_cause: Option<PowerLossCause>,
     /// The active stop that ends without power or in Quick stop active.
     pub stop: Option<StopStatus>,
     /// Statusword bit 11: the drive limits the commanded value.
@@ -110,6 +118,87 @@ impl AxisStatus {
     #[must_use]
     pub const fn word(&self) -> Statusword {
         Statusword::from_bits_retain(self.statusword)
+    }
+
+    /// Returns true if home is known: by an absolute encoder, or found and not lost since.
+    #[must_use]
+    pub const fn homed(&self) -> bool {
+        self.validity.is_homed()
+    }
+}
+
+/// What reported positions refer to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum PositionValidity {
+    /// The axis has no homing: positions count from where the drive has set its origin.
+    #[default]
+    Unreferenced,
+    /// The axis has a homing that has not succeeded yet, or home was lost.
+    Unknown,
+    /// Homing runs: the origin may shift at any moment.
+    Homing,
+    /// Home was found.
+    Homed,
+    /// An absolute encoder keeps home.
+    Absolute,
+}
+
+impl fmt::Display for PositionValidity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Unreferenced => "unreferenced",
+            Self::Unknown => "unknown",
+            Self::Homing => "homing",
+            Self::Homed => "homed",
+            Self::Absolute => "absolute",
+        })
+    }
+}
+
+impl PositionValidity {
+    /// Returns true if home is known.
+    #[must_use]
+    pub const fn is_homed(self) -> bool {
+        matches!(self, Self::Homed | Self::Absolute)
+    }
+
+    /// Returns true if an action may depend on the position: it refers to home, or the axis has no
+    /// other reference than the drive's origin.
+    #[must_use]
+    pub const fn is_defined(self) -> bool {
+        !matches!(self, Self::Unknown | Self::Homing)
+    }
+}
+
+/// The reason why an axis loses its power, or has lost it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum PowerLossCause {
+    /// [`crate::Command::Disable`], [`crate::Command::QuickStop`] or
+    /// [`crate::Command::DisableVoltage`].
+    Command,
+    /// The axis has tripped ([`AxisStatus::trip`]).
+    Trip,
+    /// The drive has a fault ([`AxisStatus::fault`]).
+    Fault,
+    /// A stop of the machine, of a group or of a gantry ([`crate::Axis::stop_by`]).
+    Outside,
+    /// The drive had power without a command.
+    Unrequested,
+    /// A stop or a hold has ended the torque, and the axis did not come to rest.
+    Coasting,
+}
+
+impl fmt::Display for PowerLossCause {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Command => "a command",
+            Self::Trip => "the trip of the axis",
+            Self::Fault => "the fault of the drive",
+            Self::Outside => "a stop of the machine, the group or the gantry",
+            Self::Unrequested => "the drive had power without a command",
+            Self::Coasting => "the axis did not come to rest without torque",
+        })
     }
 }
 
@@ -157,7 +246,7 @@ pub enum EnableBlocker {
     #[error("the power stage has no voltage: Statusword bit 4 is not set")]
     Voltage,
     /// 0x6061 shows another mode.
-    #[error("the drive shows mode {display} instead of {expected}")]
+    #[error("0x6061 shows mode {display} instead of {expected}")]
     Mode {
         /// The requested mode.
         expected: Mode,
@@ -173,6 +262,9 @@ pub enum EnableBlocker {
     /// The brake is opening.
     #[error("the brake is opening")]
     Brake,
+    /// A gantry is squared once a hold ends.
+    #[error("the axis is held, so its gantry is not squared yet")]
+    Held,
     /// The drive gives no reason.
     #[error("the drive stays in {state}")]
     Drive {
@@ -313,6 +405,42 @@ pub enum Trip {
     /// PP: the drive did not acknowledge a set-point.
     #[error("the drive did not acknowledge a set-point")]
     SetPointNotTaken,
+    /// PP, PV, homing: the drive does not obey the halt.
+    #[error(
+        "the drive ignores the halt (Controlword bit 8): it moves at {velocity:.4} after {time_s:.2} s"
+    )]
+    HaltIgnored {
+        /// The velocity.
+        velocity: f64,
+        /// Time since the halt in seconds.
+        time_s: f64,
+    },
+    /// The Statusword is none of those that CiA 402 lists for a drive with power.
+    #[error("the Statusword {word:#06x} is none of a drive with power")]
+    UnlistedStatusword {
+        /// The Statusword.
+        word: u16,
+    },
+    /// The reported position moved further than the axis can.
+    #[error(
+        "the reported position (0x6064) has jumped by {step:.4}: the velocity limit allows {most:.4}"
+    )]
+    PositionJump {
+        /// The change of position.
+        step: f64,
+        /// The largest plausible change.
+        most: f64,
+    },
+    /// The reported velocity contradicts the reported positions.
+    #[error(
+        "the drive reports a velocity (0x606C) of {reported:.4}, its positions (0x6064) change by {derived:.4} per second"
+    )]
+    VelocityContradiction {
+        /// The reported velocity.
+        reported: f64,
+        /// The velocity of the reported positions.
+        derived: f64,
+    },
     /// Statusword bit 12 was cleared during motion.
     #[error(
         "the drive no longer follows the command value: Statusword bit 12 is not set in {mode}"
@@ -332,6 +460,17 @@ pub enum Trip {
         time_s: f64,
         /// The present method of the stop.
         method: StopMethod,
+    },
+    /// 0x6061 does not show the mode in Operation enabled
+    /// ([`crate::AxisConfig::mode_display_enabled`]).
+    #[error("0x6061 shows mode {display} instead of {expected} {time_s} s after Operation enabled")]
+    ModeNotShown {
+        /// The requested mode.
+        expected: Mode,
+        /// The mode in 0x6061.
+        display: Mode,
+        /// The time in seconds.
+        time_s: f64,
     },
     /// 0x6061 changed without a command.
     #[error("the drive changed its mode of operation from {expected} to {display}")]
@@ -359,6 +498,9 @@ pub enum CommandError {
     /// A coupled gantry does not support the command.
     #[error("the axis is part of a coupled gantry, which stays in CSP; decouple it first")]
     Coupled,
+    /// The axis is held, and the command cannot wait.
+    #[error("the axis is held: let its motions continue first")]
+    Held,
     /// The axis follows no other axis.
     #[error("the axis follows no other axis")]
     NotFollowing,
@@ -527,6 +669,9 @@ pub enum CommandError {
     /// The reaction group of the axis is stopped.
     #[error("the group of axes that it belongs to is stopped; reset it first")]
     GroupStopped,
+    /// The axis has power, and the command needs it without.
+    #[error("the axis has power; disable it first")]
+    HasPower,
     /// The axis moves.
     #[error("the axis still moves at {velocity}")]
     StillMoving {

@@ -470,7 +470,7 @@ fn an_axis_that_has_slipped_can_be_enabled_again() {
         matches!(tripped.trip, Some(Trip::EncoderDifference { .. })),
         "{tripped:?}"
     );
-    assert!(!tripped.homed);
+    assert!(!tripped.homed());
     rig.until(|status| !status.enabled);
     rig.axis.command(Command::ResetFault).unwrap();
     rig.until(|status| status.trip.is_none() && status.stop.is_none());

@@ -1,9 +1,10 @@
 //! Switching power on and off: no step when the axis is enabled, and no power without a request.
 
 use crate::common;
-use crate::common::{Drive, LIMITS, Rig, axis, scale};
+use crate::common::{DEAD_TIME_S, Drive, LIMITS, Rig, axis, scale};
 use ecaxis_axis::{
-    Axis, AxisConfig, Command, CommandError, ConfigError, Inputs, Limits, Mode, State, Trip,
+    Axis, AxisConfig, Command, CommandError, ConfigError, Inputs, Limits, Mode, PowerLossCause,
+    State, Trip,
 };
 
 #[test]
@@ -20,25 +21,57 @@ fn nothing_happens_without_a_command() {
 
 #[test]
 fn targets_follow_actual_values_until_enabled() {
+    let free = Limits {
+        position: None,
+        ..LIMITS
+    };
     for start in [0, 123_456, i32::MAX - 3, i32::MIN] {
-        let mut rig = Rig::new(axis(Mode::Csp), Drive::at(start));
+        let config = AxisConfig {
+            dead_time_s: DEAD_TIME_S,
+            ..AxisConfig::new(Mode::Csp, scale(), free)
+        };
+        let mut rig = Rig::new(Axis::new(config).unwrap(), Drive::at(start));
+        rig.axis.command(Command::Enable).unwrap();
         // An external force turns the shaft.
         rig.drive.velocity = 40_000.0;
-        rig.axis.command(Command::Enable).unwrap();
         loop {
             let reported = rig.drive.raw_position();
-            let status = rig.cycle();
-            assert_eq!(
-                rig.out.target_position, reported,
-                "same inputs, same position"
-            );
-            if status.enabled {
+            if rig.cycle().enabled {
                 break;
             }
+            assert_eq!(rig.out.target_position, reported);
         }
-        let held = rig.out.target_position;
+        // The set-point takes the speed over and decelerates it within the limit of 0.8 counts per
+        // cycle.
+        let (mut sent, mut step) = (rig.out.target_position, None);
+        for _ in 0..400 {
+            rig.cycle();
+            let next = rig.out.target_position.wrapping_sub(sent);
+            let most = step.unwrap_or(next.abs());
+            assert!(
+                (most - 2..=most.max(1)).contains(&next.abs()),
+                "{most} {next}"
+            );
+            (sent, step) = (rig.out.target_position, Some(next.abs()));
+        }
+        assert_eq!(step, Some(0));
+    }
+}
+
+/// Its drive would brake it with a step of the target.
+#[test]
+fn an_axis_that_coasts_is_not_enabled() {
+    for mode in [Mode::Csp, Mode::Csv, Mode::Cst, Mode::Pp, Mode::Pv] {
+        let mut rig = Rig::of(mode);
+        rig.drive.velocity = 40_000.0;
+        rig.cycle();
+        assert!(matches!(
+            rig.axis.command(Command::Enable),
+            Err(CommandError::StillMoving { velocity }) if velocity > 90.0
+        ));
         rig.run(100);
-        assert_eq!(rig.out.target_position, held);
+        rig.axis.command(Command::Enable).unwrap();
+        rig.until(|s| s.ready, 100);
     }
 }
 
@@ -195,12 +228,13 @@ fn power_loss_without_request_trips() {
     for state in [
         State::SwitchOnDisabled,
         State::SwitchedOn,
-        State::Unknown(0x8001),
+        State::ReadyToSwitchOn,
     ] {
         let mut rig = Rig::enabled(Mode::Csp);
         rig.drive.state = state;
         let status = rig.cycle();
         assert_eq!(status.trip, Some(Trip::PowerLost { state }));
+        assert_eq!(status.power_loss_cause, Some(PowerLossCause::Trip));
         rig.drive.state = State::SwitchOnDisabled;
         rig.run(200);
         assert_eq!(

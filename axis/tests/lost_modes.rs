@@ -137,6 +137,29 @@ fn csp_request_with_lost_answers_does_not_jump() {
     }
 }
 
+/// After a withdrawn request, the drive keeps its mode while further frames are lost soon: each change
+/// of mode in motion is a disturbance.
+#[test]
+fn two_bursts_of_lost_frames_withdraw_csp_once() {
+    for what in [Lost::Frame, Lost::Answer] {
+        for (lost, gap) in (3..7).flat_map(|lost| (1..5).map(move |gap| (lost, gap))) {
+            let mut line = Line::under_way(all(Mode::Pv, ENDLESS), 0);
+            line.rig.axis.command(Command::SetMode(Mode::Csp)).unwrap();
+            let (mut before, mut withdrawn) = (None, 0);
+            for n in 0..2 * lost + gap + 800 {
+                let is_lost = n < lost || (lost + gap..2 * lost + gap).contains(&n);
+                let (status, _) = line.cycle(if is_lost { what } else { Lost::Nothing });
+                let asked = line.rig.out.mode;
+                assert_eq!(status.trip, None);
+                withdrawn += u32::from(before == Some(Mode::Csp.code()) && before != Some(asked));
+                before = Some(asked);
+            }
+            assert!(withdrawn <= 1, "{what:?}, {lost}, {gap}: {withdrawn}");
+            assert_eq!(line.rig.axis.status().mode, Mode::Csp);
+        }
+    }
+}
+
 /// A slow drive receives both modes in turn; its first displays do not count.
 #[test]
 fn csp_of_a_slow_drive_does_not_jump() {

@@ -264,7 +264,10 @@ impl Checker {
         }
         self.step_before = if steady(Mode::Csp) && !frozen {
             step
-        } else if status.enabled && status.mode == Mode::Csp && was.mode != Mode::Csp {
+        } else if status.enabled
+            && status.mode == Mode::Csp
+            && (was.mode != Mode::Csp || !was.enabled)
+        {
             // Taken over at its velocity.
             status.target_velocity * DT * COUNTS_PER_UNIT
         } else {
@@ -324,19 +327,29 @@ impl Checker {
         )?;
 
         if !status.enabled {
-            let nothing = (out.target_velocity, out.target_torque) == (0, 0);
-            ensure(nothing, "targets without power")?;
+            ensure(out.target_torque == 0, "a torque without power")?;
+            ensure(out.target_velocity == 0, "a velocity without power")?;
             ensure(
                 out.controlword & 0x0170 == 0,
                 "bits of a mode without power",
             )?;
         }
-        // While following, and in the cycle of enabling: exactly the reported position.
-        if !held && inputs.fresh && (status.mode == Mode::Csp || !status.enabled) {
-            ensure(
-                Some(out.target_position) == inputs.position,
-                "enabled with a step",
-            )?;
+        // While following, and in the cycle of enabling: the reported position. An axis that has begun
+        // to move meanwhile is taken over.
+        // The values of an unlisted Statusword are not believed.
+        let believed = status.statusword == inputs.statusword;
+        if !held && inputs.fresh && believed && (status.mode == Mode::Csp || !status.enabled) {
+            let speed = status.velocity.abs();
+            let moves = speed > limits.velocity * 0.01;
+            let lead = if moves && status.enabled {
+                speed * self.config.dead_time_s * COUNTS_PER_UNIT + 2.0
+            } else {
+                0.0
+            };
+            let step = inputs
+                .position
+                .map_or(0, |at| at.wrapping_sub(out.target_position));
+            ensure(f64::from(step.abs()) <= lead, "enabled with a step")?;
         }
         ensure(
             out.controlword & 0x0F == 0x0F || out.controlword & 0x0170 == 0,
@@ -480,7 +493,7 @@ fn run(seed: u64, sum: &mut Sum) -> Result<(), String> {
         sum.cycles += 1;
         sum.ready += u64::from(status.ready);
         sum.switches += u64::from(status.mode != was.mode);
-        sum.homed += u64::from(status.homed && !was.homed);
+        sum.homed += u64::from(status.homed() && !was.homed());
         sum.trips += u64::from(status.trip.is_some() && was.trip.is_none());
         sum.faults += u64::from(status.fault.is_some() && was.fault.is_none());
     }

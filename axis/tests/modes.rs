@@ -308,6 +308,8 @@ fn fault_during_a_switch_ends_the_switch() {
     assert_eq!((status.switching, status.enabled), (None, false));
     assert_eq!((rig.out.target_velocity, rig.out.target_torque), (0, 0));
     rig.axis.command(Command::ResetFault).unwrap();
+    // It still coasts.
+    rig.run(50);
     rig.axis.command(Command::Enable).unwrap();
     let status = rig.until(|s| s.ready, 400);
     assert_eq!(status.mode, Mode::Cst);
@@ -324,6 +326,9 @@ fn disable_voltage_acts_at_once() {
     assert_eq!(rig.out.controlword, 0);
     let status = rig.until(|s| s.state == State::SwitchOnDisabled, 5);
     assert_eq!(status.trip, None);
+    let coasts = rig.axis.command(Command::Enable);
+    assert!(matches!(coasts, Err(CommandError::StillMoving { .. })));
+    rig.run(50);
     rig.axis.command(Command::Enable).unwrap();
     rig.until(|s| s.ready, 20);
 }

@@ -4,8 +4,9 @@
 use crate::counting::allocations;
 use ecaxis_axis::group::{Line, LineAxis};
 use ecaxis_axis::setpoint::{
-    Gear, GearConfig, GearInMode, Goal, Interpolation, JerkLimited, Knot, Motion, MotionLimits,
-    MoveRequest, Playback, PositionWave, Setpoint, Shape, Stream, StreamConfig, Table, Wave,
+    Gear, GearConfig, GearInMode, Goal, Interpolation, JerkLimited, Knot, Master, Motion,
+    MotionLimits, MoveRequest, Playback, PositionWave, Rate, Setpoint, Shape, Stream, StreamConfig,
+    Table, Wave,
 };
 
 const DT: f64 = 0.001;
@@ -55,7 +56,7 @@ fn moves_do_not_allocate() {
                         Err(_) => refused += 1,
                     }
                 }
-                source.advance(motion, DT)
+                source.advance(motion, Rate::WHOLE, DT)
             },
             Motion::at(0.0),
         );
@@ -80,14 +81,14 @@ fn lines_do_not_allocate() {
         let mut along = axes.map(|axis| line.along(&axis));
         run(
             |cycle, motion| {
-                let all = along.iter_mut().map(|source| {
-                    match cycle {
-                        50 => source.set_rate(0.0, DT),
-                        150 => source.set_rate(0.5, DT),
-                        _ => {}
-                    }
-                    source.advance(motion, DT)
-                });
+                let rate = match cycle {
+                    0..50 => Rate::WHOLE,
+                    50..150 => Rate::HELD,
+                    _ => Rate::new(0.5),
+                };
+                let all = along
+                    .iter_mut()
+                    .map(|source| source.advance(motion, rate, DT));
                 all.last().unwrap()
             },
             Motion::at(0.0),
@@ -104,8 +105,14 @@ fn waves_streams_and_gears_do_not_allocate() {
             PositionWave::new(wave, Motion::at(1.0), LIMITS, None, DT).unwrap()
         };
         let (mut sine, mut square) = (new(Shape::Sine), new(Shape::Square));
-        run(|_, motion| sine.advance(motion, DT), Motion::at(1.0));
-        run(|_, motion| square.advance(motion, DT), Motion::at(1.0))
+        run(
+            |_, motion| sine.advance(motion, Rate::WHOLE, DT),
+            Motion::at(1.0),
+        );
+        run(
+            |_, motion| square.advance(motion, Rate::WHOLE, DT),
+            Motion::at(1.0),
+        )
     });
     assert_eq!(made, 0);
     let made = counted(|| {
@@ -134,7 +141,7 @@ fn waves_streams_and_gears_do_not_allocate() {
                     velocity: 0.0,
                 });
                 assert!(far.is_err());
-                stream.advance(motion, DT)
+                stream.advance(motion, Rate::WHOLE, DT)
             },
             Motion::at(0.0),
         )
@@ -150,7 +157,14 @@ fn waves_streams_and_gears_do_not_allocate() {
         };
         let mut gear = Gear::new(config, Motion::at(0.0), Motion::at(0.0)).unwrap();
         run(
-            |cycle, motion| gear.advance(Motion::at(f64::from(cycle) * 0.05), motion, DT),
+            |cycle, motion| {
+                let master = Master {
+                    motion: Motion::at(f64::from(cycle) * 0.05),
+                    comes_to_rest: false,
+                };
+                let mut following = gear.with_master(master);
+                following.advance(motion, Rate::WHOLE, DT)
+            },
             Motion::at(0.0),
         )
     });
@@ -164,7 +178,10 @@ fn tables_do_not_allocate() {
     let made = counted(|| {
         let mut playback = Playback::new(&table, Motion::at(0.0), LIMITS, 0.0).unwrap();
         run(
-            |_, motion| playback.advance(&table, motion, DT, 1.0),
+            |_, motion| {
+                let mut playing = playback.with_table(&table);
+                playing.advance(motion, Rate::WHOLE, DT)
+            },
             Motion::at(0.0),
         )
     });

@@ -2,7 +2,8 @@
 
 use crate::common::{DT, Drive, LIMITS, Rig, all, scale};
 use ecaxis_axis::{
-    Axis, AxisConfig, Command, CommandError, HomingError, HomingStatus, Limits, Mode, State, Trip,
+    Axis, AxisConfig, Command, CommandError, HomeReference, HomingError, HomingStatus, Limits,
+    Mode, PositionValidity, State, Trip,
 };
 
 const COUNTS_PER_UNIT: f64 = 400.0;
@@ -264,7 +265,7 @@ fn homing_returns_to_the_cyclic_mode() {
             }
             let status = rig.axis.status();
             assert!((300..1000).contains(&done.unwrap()), "{done:?}");
-            assert_eq!((status.mode, status.homed), (mode, true));
+            assert_eq!((status.mode, status.homed()), (mode, true));
             assert!((status.position - home_is / COUNTS_PER_UNIT).abs() < 0.02);
             // Positions are absolute from now on.
             let target = home_is / COUNTS_PER_UNIT + 1.0;
@@ -305,7 +306,7 @@ fn homing_without_a_switch_times_out() {
     };
     assert_eq!(error, HomingError::Timeout { timeout_s: 0.5 });
     assert_eq!(
-        (status.mode, status.homed, status.trip),
+        (status.mode, status.homed(), status.trip),
         (Mode::Csp, false, None)
     );
     assert!(status.at_rest && rig.run(50).ready);
@@ -392,4 +393,103 @@ fn homing_and_moves_survive_lost_frames() {
         assert!(status.in_target && status.trip.is_none());
         assert_eq!(rig.drive.raw_position(), 8000);
     }
+}
+
+/// A drive that ignores bit 8 is stopped by its quick stop, in each mode with a halt.
+#[test]
+fn an_ignored_halt_ends_in_a_quick_stop() {
+    for mode in [Mode::Pp, Mode::Pv] {
+        for hold in [false, true] {
+            let mut rig = enabled(mode);
+            rig.drive.ignores_halt = true;
+            let command = match mode {
+                Mode::Pp => go(90_000.0, 0.5, 1.0),
+                _ => run_at(100.0),
+            };
+            rig.axis.command(command).unwrap();
+            rig.run(1000);
+            if hold {
+                rig.axis.set_rate(0.0);
+            } else {
+                rig.axis.command(Command::Stop).unwrap();
+            }
+            // v / a is 0.05 s. In PV the velocity is 0 as well, which this drive obeys.
+            let mut words = Vec::new();
+            for _ in 0..1300 {
+                rig.cycle();
+                words.push(rig.out.controlword & 0x000F);
+            }
+            let status = rig.axis.status();
+            if mode == Mode::Pv {
+                assert_eq!((status.trip, status.velocity), (None, 0.0));
+                continue;
+            }
+            assert!(
+                matches!(status.trip, Some(Trip::HaltIgnored { velocity, .. }) if velocity > 99.0),
+                "{mode} {hold}: {:?}",
+                status.trip
+            );
+            words.dedup();
+            assert_eq!(words.get(..2), Some(&[0x000F, 0x0002][..]), "{mode} {hold}");
+        }
+    }
+    let mut rig = enabled(Mode::Csp);
+    rig.drive.ignores_halt = true;
+    rig.drive.home_at = None;
+    rig.axis.command(HOME).unwrap();
+    rig.run(200);
+    rig.axis.command(Command::Stop).unwrap();
+    let status = rig.run(1300);
+    assert!(matches!(status.trip, Some(Trip::HaltIgnored { .. })));
+    assert!(matches!(status.homing, HomingStatus::Failed(_)));
+}
+
+/// "Attained" of an earlier homing, and a drive that does not keep its home offset.
+#[test]
+fn home_needs_evidence() {
+    let home = |position, moves| AxisConfig {
+        home: Some(HomeReference {
+            position,
+            window: 0.1,
+            moves,
+        }),
+        ..all(Mode::Csp, ENDLESS)
+    };
+    let enabled = |config| {
+        let mut rig = Rig::new(Axis::new(config).unwrap(), Drive::at(1000));
+        rig.axis.command(Command::Enable).unwrap();
+        rig.until(|s| s.ready, 100);
+        rig
+    };
+    // The drive clears bit 12 150 ms late, and finds home later.
+    let mut rig = enabled(home(Some(0.0), true));
+    rig.drive.stale_attained = 150;
+    rig.axis.command(HOME).unwrap();
+    let status = rig.until(|s| s.homing != HomingStatus::Running, 6000);
+    assert_eq!(status.homing, HomingStatus::Attained);
+    assert!(rig.drive.homing_searched, "before it was homed");
+    assert_eq!(status.validity, PositionValidity::Homed);
+    // It never clears bit 12.
+    let mut rig = enabled(home(None, true));
+    rig.drive.stale_attained = u32::MAX;
+    rig.drive.home_at = None;
+    rig.axis.command(HOME).unwrap();
+    let status = rig.until(|s| s.homing != HomingStatus::Running, 6000);
+    assert_eq!(
+        status.homing,
+        HomingStatus::Failed(HomingError::NeverCleared)
+    );
+    assert_eq!(status.validity, PositionValidity::Unknown);
+    // 0x607C says 3 mm; the drive counts from 0.
+    let mut rig = enabled(home(Some(3.0), true));
+    rig.axis.command(HOME).unwrap();
+    let status = rig.until(|s| s.homing != HomingStatus::Running, 6000);
+    assert_eq!(
+        status.homing,
+        HomingStatus::Failed(HomingError::Elsewhere {
+            reported: 0.0,
+            expected: 3.0
+        })
+    );
+    assert!(!status.homed());
 }

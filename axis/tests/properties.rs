@@ -166,11 +166,22 @@ impl Checker {
         if !status.enabled {
             prop_assert_eq!((out.target_velocity, out.target_torque), (0, 0));
         }
-        // While following, and in the cycle of enabling: exactly the reported position.
-        if !held && inputs.fresh && (!status.enabled || !self.enabled_before) {
+        // While following, and in the cycle of enabling: the reported position. An axis that has begun
+        // to move meanwhile is taken over.
+        let moves = status.velocity.abs() > LIMITS.velocity * 0.01;
+        // The values of an unlisted Statusword are not believed.
+        if !held
+            && inputs.fresh
+            && status.statusword == inputs.statusword
+            && !(status.enabled && (self.enabled_before || moves && self.mode != Mode::Cst))
+        {
             prop_assert_eq!(Some(out.target_position), inputs.position);
         }
-        self.velocity_before = if held { velocity } else { 0.0 };
+        self.velocity_before = match (held, status.enabled) {
+            (true, _) => velocity,
+            (false, true) => status.target_velocity,
+            (false, false) => 0.0,
+        };
         if !held {
             self.range = status.position.abs().max(50.0);
         }

@@ -311,7 +311,7 @@ fn enable_blockers_are_reported() {
         (
             Inputs {
                 mode_display: Some(3),
-                ..with(0x0237)
+                ..with(0x0233)
             },
             Some(EnableBlocker::Mode {
                 expected: Mode::Csp,

@@ -87,3 +87,71 @@ proptest! {
         }
     }
 }
+
+#[derive(Debug, Clone, Copy)]
+enum Next {
+    To(f64),
+    At(f64),
+}
+
+fn next() -> impl Strategy<Value = Next> {
+    prop_oneof![
+        (-END..END).prop_map(Next::To),
+        (-200.0..200.0f64).prop_map(Next::At),
+    ]
+}
+
+proptest! {
+    /// Moves and velocities, each replaced after some cycles, then a stop: the set-point only slows
+    /// down, and never turns. A velocity that the end of the range holds does not lead back.
+    #[test]
+    fn a_stop_never_gains_speed_and_a_held_velocity_never_turns(
+        acceleration in 100.0..4000.0f64,
+        jerk_time in 0.002..0.2f64,
+        orders in prop::collection::vec((next(), 0.05..=1.0f64, 1..400u32), 1..5),
+    ) {
+        let velocity = 200.0;
+        let config = config(velocity, acceleration, jerk_time);
+        let mut rig = Rig::new(Axis::new(config).unwrap(), Drive::at(0));
+        rig.axis.command(Command::Enable).unwrap();
+        rig.until(|s| s.ready, 100);
+        let tolerance = 1e-6 / DT;
+        let (mut before, mut speed) = (rig.axis.status().target_position, 0.0);
+        for (order, ramp, cycles) in orders {
+            let command = match order {
+                Next::To(position) => Command::MoveTo { position, speed: 1.0, ramp },
+                Next::At(velocity) => Command::Velocity { velocity, ramp },
+            };
+            // Refused where the present motion cannot stop inside the range.
+            if rig.axis.command(command).is_err() {
+                continue;
+            }
+            let mut towards = false;
+            for _ in 0..cycles {
+                let status = rig.cycle();
+                let now = (status.target_position - before) / DT;
+                let gained = (now - speed) * now.signum();
+                (before, speed) = (status.target_position, now);
+                if let Next::At(velocity) = order {
+                    // An earlier move may still decelerate through rest.
+                    towards |= speed * velocity > 0.0 && gained > 0.0;
+                    let back = -speed * velocity.signum();
+                    prop_assert!(!towards || back <= tolerance, "turned back at {back}: {order:?}");
+                }
+            }
+        }
+        rig.axis.command(Command::Stop).unwrap();
+        for _ in 0..20_000 {
+            let status = rig.cycle();
+            let now = (status.target_position - before) / DT;
+            before = status.target_position;
+            prop_assert!(now.abs() <= speed.abs() + tolerance, "{speed} to {now}");
+            prop_assert!(now * speed >= -tolerance * speed.abs(), "{speed} turns to {now}");
+            speed = now;
+            if status.at_rest {
+                break;
+            }
+        }
+        prop_assert!(rig.axis.status().at_rest);
+    }
+}

@@ -24,6 +24,14 @@ fn inputs(word: u16, position: i32, display: i8) -> Inputs {
     }
 }
 
+/// A drive without 0x606C that follows.
+fn following(word: u16, position: i32) -> Inputs {
+    Inputs {
+        velocity: None,
+        ..inputs(word, position, 8)
+    }
+}
+
 fn moving(word: u16, display: i8, mrpm: i32) -> Inputs {
     Inputs {
         velocity: Some(mrpm),
@@ -82,7 +90,12 @@ fn targets_stay_at_actual_values_until_bit_12() {
         }
         // The drive moves by itself, for example for commutation.
         for n in 0..200 {
-            let out = axis.step(&inputs(0x0237, n * 5, display), DT);
+            // 5 counts in 1 ms are 150 rpm.
+            let reported = Inputs {
+                velocity: Some(150_000),
+                ..inputs(0x0237, n * 5, display)
+            };
+            let out = axis.step(&reported, DT);
             let targets = (out.target_position, out.target_velocity, out.target_torque);
             assert_eq!(targets, (n * 5, 0, 0), "{mode}");
             assert_eq!(out.controlword, 0x000F);
@@ -113,38 +126,85 @@ fn targets_stay_at_actual_values_until_bit_12() {
 }
 
 #[test]
-fn bit_12_that_is_lost_in_motion_is_a_trip() {
+fn bit_12_that_is_lost_is_a_trip() {
     let mut axis = enabled(config(Mode::Csp));
     axis.command(to(40.0)).unwrap();
     let mut position = 0;
     for _ in 0..100 {
-        position = axis.step(&inputs(0x1237, position, 8), DT).target_position;
+        position = axis.step(&following(0x1237, position), DT).target_position;
     }
     // A drive that limits a step clears the bit for one or two cycles.
     for _ in 0..9 {
-        position = axis.step(&inputs(0x0237, position, 8), DT).target_position;
+        position = axis.step(&following(0x0237, position), DT).target_position;
     }
-    position = axis.step(&inputs(0x1237, position, 8), DT).target_position;
+    position = axis.step(&following(0x1237, position), DT).target_position;
     for _ in 0..9 {
-        let out = axis.step(&inputs(0x0237, position, 8), DT);
+        let out = axis.step(&following(0x0237, position), DT);
         assert_eq!(out.controlword, 0x000F);
     }
-    let out = axis.step(&inputs(0x0237, position, 8), DT);
+    let out = axis.step(&following(0x0237, position), DT);
     assert_eq!(out.controlword, 0x0002);
     let trip = Some(Trip::NotFollowing { mode: Mode::Csp });
     assert_eq!(axis.status().trip, trip);
-    // At rest the targets follow actual values until the bit is set again.
+    // Also at rest: the drive holds no load. The axis is not enabled again by itself.
     let mut axis = enabled(config(Mode::Csp));
-    for _ in 0..10 {
-        axis.step(&inputs(0x0237, 0, 8), DT);
+    for _ in 0..9 {
+        let out = axis.step(&inputs(0x0237, 0, 8), DT);
+        assert_eq!(out.controlword, 0x000F);
     }
-    for position in [10, 20] {
-        let out = axis.step(&inputs(0x0237, position, 8), DT);
-        assert_eq!((out.controlword, out.target_position), (0x000F, position));
+    let out = axis.step(&inputs(0x0237, 0, 8), DT);
+    assert_eq!((out.controlword, axis.status().trip), (0x0002, trip));
+    for word in [0x0240; 10]
+        .into_iter()
+        .chain([0x0231, 0x0233, 0x1237, 0x1237])
+    {
+        let out = axis.step(&inputs(word, 0, 8), DT);
+        assert_eq!(out.controlword & 0x000F & !0x0006, 0, "{word:#06x}");
     }
-    assert_eq!((axis.status().trip, axis.status().ready), (None, false));
-    axis.step(&inputs(0x1237, 20, 8), DT);
-    assert!(axis.status().ready);
+    assert_eq!(axis.status().trip, trip);
+}
+
+/// A word that a drive with power cannot show holds the last command for five cycles.
+#[test]
+fn unlisted_statusword_is_no_loss_of_power() {
+    for word in [0x0000, 0x0056, 0x8001] {
+        for cycles in [1, 5] {
+            let mut axis = enabled(config(Mode::Csp));
+            axis.command(to(40.0)).unwrap();
+            let mut position = 0;
+            for _ in 0..100 {
+                position = axis.step(&following(0x1237, position), DT).target_position;
+            }
+            // All inputs of such a cycle are zero on many drives.
+            let before = position;
+            for _ in 0..cycles {
+                let out = axis.step(&inputs(word, 0, 8), DT);
+                assert_eq!(out.controlword, 0x000F, "{word:#06x}");
+                position = out.target_position;
+            }
+            assert!(position > before, "the set-point goes on");
+            for _ in 0..100 {
+                let out = axis.step(&following(0x1237, position), DT);
+                assert_eq!(out.controlword, 0x000F, "{word:#06x}");
+                position = out.target_position;
+            }
+            assert_eq!(axis.status().trip, None);
+        }
+        let mut axis = enabled(config(Mode::Csp));
+        let mut words = Vec::new();
+        for _ in 0..3000 {
+            words.push(axis.step(&inputs(word, 0, 8), DT).controlword);
+        }
+        assert_eq!(axis.status().trip, Some(Trip::UnlistedStatusword { word }));
+        assert!(words[..5].iter().all(|word| *word == 0x000F));
+        // A quick stop, and no voltage only after its time-out.
+        assert!(
+            words[5..1000].iter().all(|word| *word == 0x0002),
+            "{words:?}"
+        );
+        assert_eq!(words.last(), Some(&0x0000));
+        assert!(!axis.stop_ended(), "it may still have power");
+    }
 }
 
 /// The drive stays in Switched on until 0x6061 shows the mode.

@@ -1,7 +1,7 @@
 //! Trips of an axis and their reported causes.
 
 use crate::common::{DT, Drive, LIMITS, Rig, axis, scale};
-use ecaxis_axis::{Axis, AxisConfig, Command, CommandError, Limits, Mode, State, Trip};
+use ecaxis_axis::{Axis, AxisConfig, Command, CommandError, Inputs, Limits, Mode, State, Trip};
 
 const fn to(position: f64) -> Command {
     Command::MoveTo {
@@ -69,7 +69,9 @@ fn a_drive_that_ignores_quick_stop_loses_its_power() {
 
 #[test]
 fn axis_pushed_out_of_its_range_trips() {
-    let mut rig = Rig::enabled(Mode::Csv);
+    let mut rig = Rig::new(axis(Mode::Csv), Drive::at(20_000));
+    rig.axis.command(Command::Enable).unwrap();
+    rig.until(|s| s.ready, 100);
     rig.drive.position = 20_300.0;
     assert_eq!(rig.cycle().trip, None, "inside the margin");
     rig.drive.position = 20_500.0;
@@ -159,4 +161,102 @@ fn fault_while_stopping_for_a_trip_keeps_both_causes() {
     rig.axis.command(Command::ResetFault).unwrap();
     let status = rig.until(|s| s.state == State::SwitchOnDisabled, 200);
     assert_eq!((status.trip, status.fault), (None, None));
+}
+
+/// The drive counts velocities in another unit: it runs a hundred times as fast as it reports.
+#[test]
+fn positions_contradict_a_velocity_of_another_unit() {
+    for (mode, command) in [
+        (
+            Mode::Csv,
+            Command::Velocity {
+                velocity: 20.0,
+                ramp: 1.0,
+            },
+        ),
+        (
+            Mode::Pv,
+            Command::Velocity {
+                velocity: 20.0,
+                ramp: 1.0,
+            },
+        ),
+    ] {
+        for (factor, far) in [(100.0, true), (4.0, false), (-1.0, false)] {
+            let mut axis = Axis::new(AxisConfig::new(
+                mode,
+                scale(),
+                Limits {
+                    following_error: None,
+                    position: None,
+                    ..LIMITS
+                },
+            ))
+            .unwrap();
+            let mut drive = Drive::at(0);
+            axis.command(Command::Enable).unwrap();
+            let (mut position, mut reported, mut tripped) = (0.0, 0, None);
+            for cycle in 0..400 {
+                if cycle == 20 {
+                    axis.command(command).unwrap();
+                }
+                let inputs = Inputs {
+                    position: Some(position as i32),
+                    velocity: Some(reported),
+                    ..drive.inputs()
+                };
+                let out = axis.step(&inputs, DT);
+                drive.cycle(&out, DT);
+                reported = out.target_velocity;
+                position += f64::from(reported) / 60_000.0 * 2000.0 * factor * DT;
+                if let Some(trip) = axis.status().trip {
+                    tripped = Some((cycle, trip));
+                    break;
+                }
+            }
+            let (cycle, trip) = tripped.expect("a trip");
+            let late = if far { 60 } else { 110 };
+            assert!(cycle < 20 + late, "{mode} {factor}: {cycle}");
+            assert_eq!(
+                matches!(trip, Trip::VelocityContradiction { .. }),
+                !far,
+                "{mode} {factor}: {trip}"
+            );
+        }
+    }
+}
+
+/// A drive that shifts its position: the axis trips in the cycle that shows it, and drives nowhere.
+#[test]
+fn a_position_that_jumps_trips_at_once() {
+    for mode in [Mode::Csp, Mode::Csv, Mode::Cst, Mode::Pp, Mode::Pv] {
+        let config = AxisConfig {
+            absolute: true,
+            ..AxisConfig::new(
+                mode,
+                scale(),
+                Limits {
+                    following_error: None,
+                    ..LIMITS
+                },
+            )
+        };
+        let mut rig = Rig::new(Axis::new(config).unwrap(), Drive::at(0));
+        rig.axis.command(Command::Enable).unwrap();
+        rig.until(|s| s.ready, 100);
+        rig.run(100);
+        let before = rig.out;
+        rig.drive.position += 2000.0;
+        let status = rig.cycle();
+        assert!(
+            matches!(status.trip, Some(Trip::PositionJump { step, .. }) if step == 5.0),
+            "{mode}: {:?}",
+            status.trip
+        );
+        assert_eq!(rig.out.controlword, 0x0002);
+        assert!(!status.homed(), "the position refers to nothing");
+        if mode == Mode::Csp {
+            assert_eq!(rig.out.target_position, before.target_position);
+        }
+    }
 }

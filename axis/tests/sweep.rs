@@ -150,7 +150,7 @@ fn any_word_during_a_move_switch_or_homing_is_handled() {
                     assert_eq!(out.controlword & 0x0170, 0, "{statusword:#06x}");
                 }
                 // "Attained" alone has no effect before homing has started.
-                assert!(!status.homed || rig.drive.mode == Mode::Hm.code());
+                assert!(!status.homed() || rig.drive.mode == Mode::Hm.code());
             }
         }
     }

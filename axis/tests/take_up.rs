@@ -3,7 +3,9 @@
 use crate::common::{DT, LIMITS};
 use crate::compensation::{BACKLASH, COUNTS, Rig};
 use ecaxis_axis::compensation::{Compensation, Mechanics, ReferenceFlank};
-use ecaxis_axis::{AxisConfig, Command, Limits, Mode, Modes, SecondEncoder, Trip};
+use ecaxis_axis::{
+    Axis, AxisConfig, Command, Inputs, Limits, Mode, Modes, Scale, SecondEncoder, Trip,
+};
 
 const JERK: f64 = 40_000.0;
 
@@ -375,5 +377,43 @@ fn an_unsigned_encoder_has_large_counts() {
         } else {
             assert!(matches!(status.trip, Some(Trip::EncoderDifference { .. })));
         }
+    }
+}
+
+/// The drive's 32 bits wrap; a start cannot know how often, a return of the same drive can.
+#[test]
+fn home_of_an_absolute_encoder_survives_wraps_while_the_axis_exists() {
+    let axis = |absolute_start: bool| {
+        let scale = Scale::new(8_388_608.0, 1.0).unwrap();
+        let limits = Limits {
+            position: None,
+            velocity: 10.0,
+            ..LIMITS
+        };
+        let mut config = AxisConfig::new(Mode::Csp, scale, limits);
+        config.absolute = true;
+        config.absolute_start = absolute_start;
+        Axis::new(config).unwrap()
+    };
+    assert!(axis(true).status().homed());
+    let mut axis = axis(false);
+    assert!(!axis.status().homed());
+    let at = |axis: &mut Axis, position: i32| {
+        let inputs = Inputs {
+            statusword: 0x0250,
+            position: Some(position),
+            fresh: true,
+            ..Inputs::default()
+        };
+        axis.observe(&inputs, DT);
+        axis.status().position
+    };
+    // 255 turns, then one more than 256.
+    at(&mut axis, 255 << 23);
+    assert!((at(&mut axis, i32::MIN + (1 << 23)) - 257.0).abs() < 1e-9);
+    for (same, expected) in [(true, 257.0), (false, -255.0)] {
+        axis.restarted(same);
+        let position = at(&mut axis, i32::MIN + (1 << 23));
+        assert!((position - expected).abs() < 1e-9, "{same}: {position}");
     }
 }

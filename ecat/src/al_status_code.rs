@@ -121,7 +121,7 @@ pub fn al_status_hint(code: u16) -> Option<&'static str> {
             "no process data for longer than the watchdog allows: a cable, lost frames, or a delayed host"
         }
         INVALID_OUTPUT_CONFIGURATION => {
-            "the length of the outputs' SyncManager differs from the assigned RxPDOs (0x1C12); did a start-up SDO fail, or does the mapping differ?"
+            "the length of the outputs' SyncManager differs from the assigned RxPDOs (0x1C12); did a start-up SDO fail, or does the mapping differ? Some firmware refuses the watchdog trigger: see `watchdog_trigger`"
         }
         INVALID_INPUT_CONFIGURATION => {
             "the length of the inputs' SyncManager differs from the assigned TxPDOs (0x1C13); did a start-up SDO fail, or does the mapping differ?"
@@ -159,7 +159,9 @@ pub fn al_status_hint(code: u16) -> Option<&'static str> {
             "the EEPROM or firmware must be written again with the manufacturer's tool"
         }
         RESTARTED => "the device restarted; look at its supply",
-        MODULES_DIFFER => "the ESI module that `mode` picks is not what the device has",
+        MODULES_DIFFER => {
+            "the modules in its slots (0xF050) are not those that `modules` or `mode` configures; `ecaxis compare` shows both"
+        }
         SUPPLY_TOO_LOW | SUPPLY_TOO_HIGH => "look at the supply",
         TEMPERATURE_TOO_LOW | TEMPERATURE_TOO_HIGH => "look at the surroundings and the load",
         _ => return None,

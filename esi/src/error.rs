@@ -75,6 +75,9 @@ pub enum EsiProblem {
         "the root element is <{0}>, an ESI file starts with <EtherCATInfo>, a file of modules with <EtherCATModule>"
     )]
     NotEsi(String),
+    /// The file does not begin with a tag.
+    #[error("not XML: there is no < at the start")]
+    NotXml,
     /// The file has no element.
     #[error("there is no XML element in the file")]
     Empty,

@@ -49,8 +49,10 @@ pub struct SmLayout {
     pub sm: u8,
     /// The physical start address.
     pub start_address: u16,
-    /// The control byte, register 0x0804 of the SyncManager.
+    /// The ControlByte in the ESI, register 0x0804 of the SyncManager.
     pub control_byte: u8,
+    /// Writes of this area trigger the watchdog, whatever the ESI says.
+    pub watched: bool,
     /// The length in bytes.
     pub len: u16,
     /// The FMMU that the ESI assigns to this SyncManager.
@@ -58,6 +60,24 @@ pub struct SmLayout {
 }
 
 impl SmLayout {
+    /// Bit 6 of the ControlByte (ETG.1000.4, table 58): writing the area triggers the watchdog.
+    pub const WATCHDOG_TRIGGER: u8 = 0x40;
+
+    /// Returns the ControlByte that a MainDevice writes.
+    #[must_use]
+    pub const fn control(&self) -> u8 {
+        match self.watched {
+            true => self.control_byte | Self::WATCHDOG_TRIGGER,
+            false => self.control_byte,
+        }
+    }
+
+    /// True if writing the area triggers the watchdog.
+    #[must_use]
+    pub const fn has_trigger(&self) -> bool {
+        self.control() & Self::WATCHDOG_TRIGGER != 0
+    }
+
     /// True for three-buffer mode, in which each side always owns one buffer.
     fn is_buffered(&self) -> bool {
         self.start_address >= PROCESS_MEMORY && self.control_byte & 0x03 == 0
@@ -288,6 +308,7 @@ fn direction(
                 sm: number,
                 start_address: sm.start_address,
                 control_byte: sm.control_byte,
+                watched: false,
                 len,
                 fmmu,
             });

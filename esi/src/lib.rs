@@ -33,7 +33,7 @@ pub use mode::{Mode, UnknownMode};
 pub use model::*;
 pub use select::{
     DcSettings, DeviceQuery, EntryRef, SelectError, SelectOptions, SelectedModule, Selection,
-    UserSdo, find_device, offered_modes, select,
+    UserSdo, find_device, module_names, offered_modes, plugged_modules, select,
 };
-pub use startup::{IdnValue, StartupIdn, StartupSdo};
+pub use startup::{IdnValue, SDO_OF_MACHINE_FILE, StartupIdn, StartupSdo};
 pub use xml::{decode_text, parse, parse_where};

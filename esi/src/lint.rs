@@ -19,7 +19,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 use crate::address;
-use crate::model::{Device, Direction, EsiFile, InitCmd, Module, ObjectItem, Pdo, Position, SmUse};
+use crate::model::{Device, EsiFile, InitCmd, Module, Pdo, Position, Slots, SmUse};
 use crate::select::{SelectError, SelectOptions, offered_modes, select};
 
 /// A typical bus cycle, for checks that depend on the cycle time.
@@ -27,7 +27,6 @@ const CYCLE_NS: u64 = 1_000_000;
 /// The maximum number of module places over all devices of a file. A device without slots counts as
 /// one place.
 const MAX_EFFORT: usize = 20_000;
-const MAX_PLACES: u64 = 254;
 
 /// The severity of a finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -113,12 +112,8 @@ pub fn lint(file: &EsiFile) -> Vec<Finding> {
 
 /// Returns the number of module places that a selection visits.
 fn places(device: &Device) -> usize {
-    let slots = device.slots.iter().flat_map(|slots| &slots.slots);
-    let instances = slots.map(|slot| slot.max_instances.max(slot.min_instances).clamp(1, 254));
-    instances
-        .map(|count| usize::try_from(count).unwrap_or(1))
-        .sum::<usize>()
-        .clamp(1, 254)
+    let places = device.slots.iter().flat_map(Slots::places);
+    places.count().max(1)
 }
 
 #[derive(Default)]
@@ -181,13 +176,11 @@ fn device(found: &mut FindingBuilder, path: &str, device: &Device) {
         }
     }
     if let Some(slots) = &device.slots {
-        let each = slots.slots.iter();
-        let places: u64 = each
-            .map(|slot| u64::from(slot.max_instances.max(slot.min_instances).max(1)))
-            .sum();
-        if places > MAX_PLACES {
+        let places = slots.declared_places();
+        if places > Slots::MAX_PLACES as u64 {
             let message = format!(
-                "{places} places for modules; 0xF030 lists {MAX_PLACES}, and so many are used"
+                "{places} places for modules; 0xF030 lists {}, and so many are used",
+                Slots::MAX_PLACES
             );
             found.warn(slots.position, &format!("{path}/Slots"), message);
         }
@@ -219,10 +212,7 @@ fn pdos(found: &mut FindingBuilder, path: &str, device: &Device, list: &[Pdo], k
         let path = format!("{path}/{kind}[{}]", n + 1);
         self::pdo(found, &path, pdo, list);
         let Some(sm) = pdo.sm else { continue };
-        let (wanted, other) = match pdo.direction {
-            Direction::Rx => (SmUse::Outputs, SmUse::Inputs),
-            Direction::Tx => (SmUse::Inputs, SmUse::Outputs),
-        };
+        let wanted = SmUse::from(pdo.direction);
         match device.sync_managers.get(usize::from(sm)) {
             None => {
                 let message = format!(
@@ -232,9 +222,7 @@ fn pdos(found: &mut FindingBuilder, path: &str, device: &Device, list: &[Pdo], k
                 );
                 found.warn(pdo.position, &path, message);
             }
-            Some(sync)
-                if sync.usage == other || !matches!(sync.usage, SmUse::Outputs | SmUse::Inputs) =>
-            {
+            Some(sync) if sync.usage != wanted => {
                 let message = format!(
                     "PDO 0x{:04x} is assigned to Sm {sm}, which is for {:?} and not for {wanted:?}",
                     pdo.index, sync.usage
@@ -247,7 +235,9 @@ fn pdos(found: &mut FindingBuilder, path: &str, device: &Device, list: &[Pdo], k
 }
 
 fn pdo(found: &mut FindingBuilder, path: &str, pdo: &Pdo, list: &[Pdo]) {
-    let first = list.iter().find(|other| other.index == pdo.index);
+    // A virtual PDO is not an object of the device.
+    let mut same = list.iter().filter(|other| other.virtual_ == pdo.virtual_);
+    let first = same.find(|other| other.index == pdo.index);
     if let Some(first) = first.filter(|first| first.position != pdo.position) {
         let message = format!(
             "PDO 0x{:04x} is described twice, first on line {}",
@@ -291,32 +281,12 @@ fn commands(found: &mut FindingBuilder, path: &str, device: &Device, commands: &
                 format!("{what} names no Transition and is never sent"),
             );
         }
+        let place = (command.index, command.sub);
         let dictionary = &device.dictionary;
-        let item = dictionary.item(command.index, command.sub);
-        if let Some(item) = item.filter(|_| !command.complete_access) {
-            let bytes = item.default.len();
-            if bytes > 0 && bytes != command.data.len() && !is_text(item) {
-                let message = format!(
-                    "{what} is written with {} bytes, the object has {bytes}",
-                    command.data.len()
-                );
-                found.warn(command.position, &path, message);
-            }
-        } else if item.is_none()
-            && dictionary.object(command.index).is_none()
-            && !dictionary.objects.is_empty()
-        {
-            found.warn(
-                command.position,
-                &path,
-                format!("{what} is not in the dictionary"),
-            );
+        if let Some(how) = dictionary.contradiction(place, &command.data, command.complete_access) {
+            found.warn(command.position, &path, format!("{what} {how}"));
         }
     }
-}
-
-fn is_text(item: &ObjectItem) -> bool {
-    item.type_name.contains("STRING") || item.type_name.contains("ARRAY")
 }
 
 fn objects(found: &mut FindingBuilder, path: &str, device: &Device) {

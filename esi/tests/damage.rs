@@ -69,7 +69,17 @@ fn errors_name_position_path_and_reason() {
 #[test]
 fn parse_rejects_files_that_are_not_esi() {
     assert!(matches!(refused("").problem(), EsiProblem::Empty));
-    assert!(matches!(refused("plain text").problem(), EsiProblem::Empty));
+    assert!(matches!(refused(" \n").problem(), EsiProblem::Empty));
+    // Bytes before the first tag make it no tag of a document, whatever follows.
+    for text in [
+        "plain text",
+        "MZ\u{90}<EtherCATInfo/>",
+        "\u{1b}[31m<foo>bar</foo>",
+    ] {
+        let error = refused(text);
+        assert!(matches!(error.problem(), EsiProblem::NotXml), "{text:?}");
+        assert!(!error.to_string().contains(char::is_control), "{text:?}");
+    }
     assert!(matches!(
         refused("<EtherCATConfig/>").problem(),
         EsiProblem::NotEsi(_)
@@ -193,6 +203,29 @@ fn a_broken_pdo_is_skipped_alone_with_a_warning() {
     let selection = select(&file, &file.devices[0], &SelectOptions::default()).unwrap();
     assert_eq!(selection.rx.len(), 1);
     assert_eq!(selection.notes.len(), 2, "{:?}", selection.notes);
+}
+
+#[test]
+fn a_broken_assignment_is_skipped_alone_with_a_warning() {
+    let mapping = |name: &str, pdo: &str| {
+        format!(
+            "<AlternativeSmMapping><Name>{name}</Name><Sm No=\"2\"><Pdo>{pdo}</Pdo></Sm></AlternativeSmMapping>"
+        )
+    };
+    let both = mapping("A", "#x1600") + &mapping("B", "");
+    for inside in [
+        both.clone(),
+        format!("<Info><VendorSpecific><TwinCAT>{both}</TwinCAT></VendorSpecific></Info>"),
+    ] {
+        let file = parse(devices(&[&inside]).as_bytes()).unwrap();
+        let names: Vec<_> = file.devices[0]
+            .sm_mappings
+            .iter()
+            .map(|m| &*m.name)
+            .collect();
+        assert_eq!(names, ["A"], "{inside}");
+        assert_eq!(left_out(&file).len(), 1, "{inside}");
+    }
 }
 
 #[test]

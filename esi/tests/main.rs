@@ -14,5 +14,6 @@ mod selection;
 mod sii;
 mod sii_device;
 mod sii_vs_recorded;
+mod sync_managers;
 mod vendor_files;
 mod warnings;

@@ -481,3 +481,37 @@ fn sync1_is_the_delay_after_sync0() {
         assert_eq!(dc.activates_sync1(), activate != "#x300");
     }
 }
+
+/// CiA 402: the values of a drive have subindex 0. A file that maps another one, or no Controlword,
+/// is refused with the reason, and offers no mode.
+#[test]
+fn a_drive_whose_pdos_lack_the_values_of_the_mode_is_refused_with_the_reason() {
+    let good = pdo(
+        "RxPdo",
+        "Fixed=\"1\" Sm=\"2\"",
+        0x1600,
+        &[CONTROL, POSITION],
+    ) + STATUS;
+    let target = "<Index>#x607A</Index>";
+    for (rx, reason) in [
+        (
+            good.replace(target, &format!("{target}<SubIndex>4</SubIndex>")),
+            "D: mode csp needs 0x607A:00; line 1 maps 0x607A:04",
+        ),
+        (
+            good.replace("<Index>#x6040</Index>", "<Index>#x6041</Index>"),
+            "D has no mode csp: no RxPdo of the ESI has the Controlword 0x6040",
+        ),
+    ] {
+        let file = parse(&drive("", &rx, "")).unwrap();
+        let device = &file.devices[0];
+        let choice = SelectOptions {
+            mode: Some(Mode::Csp),
+            cycle_ns: MS,
+            ..SelectOptions::default()
+        };
+        let error = select(&file, device, &choice).unwrap_err();
+        assert_eq!(error.to_string(), reason);
+        assert_eq!(offered_modes(&file, device), []);
+    }
+}

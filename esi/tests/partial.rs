@@ -184,3 +184,24 @@ fn many_references_to_a_long_pdo_lose_their_device() {
     let message = &file.warnings[0].message;
     assert!(message.contains("exceed"), "{message}");
 }
+
+/// `ethercat xml` lists each device in an `EtherCATInfo` of its own.
+#[test]
+fn devices_of_a_list_have_numbers_and_vendors_of_their_own() {
+    let one = |n: u32| {
+        format!(
+            "<EtherCATInfo><Vendor><Id>{n}</Id><Name>V{n}</Name></Vendor><Descriptions><Devices>\
+             <Device><Type ProductCode=\"{n}\">T{n}</Type></Device></Devices></Descriptions></EtherCATInfo>"
+        )
+    };
+    let all: String = (1..=3).map(one).collect();
+    let file = format!("<EtherCATInfoList>{all}</EtherCATInfoList>").into_bytes();
+    let whole = parse(&file).unwrap();
+    for (n, device) in (1..).zip(&whole.devices) {
+        assert_eq!((device.number, device.identity.vendor), (n, n));
+        assert_eq!(whole.vendor_name(n), format!("V{n}"));
+    }
+    let second = parse_where(&file, &|header| header.number == 2).unwrap();
+    assert_eq!(second.devices.len(), 1);
+    assert_eq!(second.devices[0].type_name, "T2");
+}

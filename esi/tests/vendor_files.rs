@@ -65,7 +65,7 @@ fn the_epos4_file_is_read_exactly() {
     };
     let file = parse(&bytes).unwrap();
     assert_eq!(
-        (file.vendor.id, file.vendor.name.as_str()),
+        (file.vendors[0].id, file.vendors[0].name.as_str()),
         (0xfb, "maxon motor ag")
     );
     assert_eq!(

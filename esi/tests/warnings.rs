@@ -288,3 +288,57 @@ fn a_damaged_idn_command_is_left_out() {
     );
     assert!(lint(&file).iter().all(|f| f.severity != Severity::Error));
 }
+
+/// A virtual PDO is not an object of the device, so another PDO may have its index.
+#[test]
+fn a_virtual_pdo_may_share_the_index_of_another() {
+    let pdo = |attributes: &str, object: &str| {
+        format!(
+            "<TxPdo Fixed=\"1\" Sm=\"3\" {attributes}><Index>#x1a00</Index><Entry><Index>{object}</Index><BitLen>8</BitLen></Entry></TxPdo>"
+        )
+    };
+    let file = device("", &(pdo("Virtual=\"1\"", "#x1d09") + &pdo("", "#x6000")));
+    assert_eq!(
+        inputs(&choose(&file, None).unwrap()),
+        [(0x1a00, 0x6000, 0, 8)]
+    );
+    assert_eq!(lint(&file), []);
+}
+
+/// The device decides whether it takes a command that its dictionary contradicts.
+#[test]
+fn commands_against_the_dictionary_are_sent_with_a_note() {
+    let dictionary = "<Profile><Dictionary><DataTypes><DataType><Name>USINT</Name><BitSize>8</BitSize></DataType></DataTypes>\
+        <Objects><Object><Index>#x2000</Index><Name>A</Name><Type>USINT</Type><BitSize>8</BitSize><Flags><Access>ro</Access></Flags></Object>\
+        <Object><Index>#x2001</Index><Name>B</Name><Type>USINT</Type><BitSize>8</BitSize><Flags><Access>rw</Access></Flags></Object></Objects></Dictionary></Profile>";
+    let notes = |index: &str, data: &str| {
+        let mailbox = format!(
+            "<Mailbox><CoE><InitCmd><Transition>PS</Transition><Index>{index}</Index><SubIndex>0</SubIndex><Data>{data}</Data></InitCmd></CoE></Mailbox>"
+        );
+        let file = device(&mailbox, dictionary);
+        let selection = choose(&file, None).unwrap();
+        assert_eq!(selection.startup.len(), 1);
+        let found: Vec<_> = lint(&file)
+            .into_iter()
+            .map(|finding| finding.message)
+            .collect();
+        (selection.notes.join("; "), found.join("; "))
+    };
+    for (index, data, how) in [
+        ("#x2000", "01", "0x2000:00 is read-only in the dictionary"),
+        (
+            "#x2001",
+            "0100",
+            "0x2001:00 is written with 2 bytes, the object has 1",
+        ),
+        ("#x2002", "01", "0x2002:00 is not in the dictionary"),
+    ] {
+        let (note, finding) = notes(index, data);
+        assert_eq!(finding, how);
+        assert!(
+            note.contains(how) && note.ends_with("it is sent all the same"),
+            "{note}"
+        );
+    }
+    assert_eq!(notes("#x2001", "01"), (String::new(), String::new()));
+}

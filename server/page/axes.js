@@ -69,7 +69,7 @@ class Meter {
   #range;
   #digits;
 
-  constructor(name, unit, range, digits, key) {
+  constructor(name, unit, range, digits, key, note) {
     this.#digits = digits;
     this.#range = range;
     this.#value = h("span", { class: "value", "data-value": key });
@@ -81,7 +81,7 @@ class Meter {
     const limits = range ? (range[0] === -range[1] ? `±${text(range[1])}` : `${text(range[0])} … ${text(range[1])}`) : "no limit";
     this.row = h("div", { class: "meter" },
       h("span", { class: "name", text: name }), this.#value, h("span", { class: "unit", text: unit }), this.bar,
-      h("span", { class: "limits", text: limits, title: range ? `limits in ${unit}` : null }));
+      h("span", { class: "limits", text: note ? `${limits} *` : limits, title: [range && `limits in ${unit}`, note && `* ${note}`].filter(Boolean).join("\n") || null }));
     if (range) this.bar.querySelector(".zero").style.left = `${this.#at(0)}%`;
   }
 
@@ -107,6 +107,9 @@ class Meter {
   }
 }
 
+// What a position refers to; nothing for an axis without homing.
+const VALIDITY = { unknown: "not homed", homing: "homing", homed: "homed", absolute: "homed (absolute)" };
+
 class Card {
   #axis;
   #control;
@@ -125,8 +128,8 @@ class Card {
       velocity: decimals(limits.velocity ?? 1000, 4),
       error: decimals(limits.following_error ?? 1, 4),
     };
-    const meter = (key, name, unit, range, digits) => {
-      this.#meters[key] = new Meter(name, unit, range, digits, key);
+    const meter = (key, name, unit, range, digits, note) => {
+      this.#meters[key] = new Meter(name, unit, range, digits, key, note);
       return this.#meters[key].row;
     };
     const part = (key, tag, attributes) => (this.#part[key] = h(tag, attributes));
@@ -135,14 +138,14 @@ class Card {
         h("h2", { text: axis.name }),
         part("state", "span", { class: "chip" }),
         part("mode", "span", { class: "tag", title: "Mode of operation" }),
-        part("homed", "span", { class: "tag", title: "The reference position is known" })),
+        part("homed", "span", { class: "tag", "data-value": "position_validity", title: "What the position refers to" })),
       h("p", { class: "device", text: `${axis.device}${axis.group ? ` · group ${axis.group}` : ""}` }),
       part("doing", "p", { class: "doing" }),
       part("why", "p", { class: "why", role: "status" }),
       h("div", { class: "meters" },
         meter("position", "Position", axis.unit, range, digits.position),
         meter("velocity", "Velocity", axis.velocity_unit, both(limits.velocity), digits.velocity),
-        meter("torque", "Torque", axis.torque_unit ?? "%", both(limits.torque), 1),
+        meter("torque", "Torque", axis.torque_unit ?? "%", both(limits.torque), 1, axis.torque_limit_note),
         meter("following_error", "Following error", axis.unit, both(limits.following_error), digits.error)),
       h("dl", { class: "pairs" },
         h("div", {}, h("dt", { text: "Target" }), part("target", "dd", { "data-value": "target_position" })),
@@ -207,16 +210,18 @@ class Card {
     const part = this.#part;
     const bad = state.fault ?? state.trip;
     set(part.state, state.state === "unknown" ? "no data" : state.state);
-    mark(part.state, "data-state", state.state === "unknown" ? "unknown" : bad ? "bad" : state.enabled ? "good" : state.waiting ? "busy" : "idle");
+    mark(part.state, "data-state", state.state === "unknown" ? "unknown" : bad ? "bad" : state.enabled ? "good" : state.powered || state.waiting ? "busy" : "idle");
     set(part.mode, state.mode ? state.mode.toUpperCase() : "–");
-    set(part.homed, state.homed === null ? "" : state.homed ? "homed" : "not homed");
-    part.homed.hidden = !this.#axis.homing && !state.homed;
-    const doing = [state.doing && state.doing !== "nothing" ? state.doing : state.moving ? "moves" : state.enabled ? "at rest" : "no power"];
+    set(part.homed, VALIDITY[state.position_validity] ?? "");
+    part.homed.hidden = !part.homed.textContent;
+    const idle = state.enabled ? "at rest" : state.powered ? "has power, does not follow" : "no power";
+    const doing = [state.doing && state.doing !== "nothing" ? state.doing : state.moving ? "moves" : idle];
     if (state.internal_limit) doing.push("an internal limit of the drive is active");
     if (state.stream) doing.push(`stream: ${typeof state.stream === "string" ? state.stream : state.stream.state ?? "open"}`);
     set(part.doing, state.state === "unknown" ? "The bus is not in Op." : doing.join(" · "));
     const why = [
       state.fault && `Fault: ${state.fault}`, state.trip && `Trip: ${state.trip}`, state.stop && `Stops: ${state.stop}`,
+      state.power_loss && !bad && !state.stopped && `No power: ${state.power_loss}`,
       state.stopped && `Stopped: ${state.stopped}`, state.waiting && `Enabling waits: ${state.waiting}`,
     ].filter(Boolean);
     set(part.why, why.join("\n"));

@@ -12,13 +12,13 @@ use ecaxis_ecat::index::{AxisIndex, GroupIndex};
 use ecaxis_esi::address;
 use ecaxis_master::clock;
 use ecaxis_master::mailbox::worker::MailboxError;
-use ecaxis_master::supervise::operator::{ProgramRequest, Request as MachineRequest};
+use ecaxis_master::supervise::operator::{NodeCommand, ProgramRequest, Request as MachineRequest};
 use ecaxis_master::sys::shared_memory::SharedMemory;
 use serde_json::{Map, Value, json};
 use tokio::sync::Semaphore;
 
 use crate::command::{
-    ALL, Access, BusAction, Index, InterpolationName, Op, Point, ProgramAction, Request,
+    ALL, Access, BusAction, Index, InterpolationName, NodeAction, Op, Point, ProgramAction, Request,
 };
 use crate::diagnostics::diagnostics_as_json;
 use crate::error::{ErrorCode, OpError};

@@ -133,6 +133,13 @@ pub enum Op {
         output: String,
         value: f64,
     },
+    /// Commands the NMT state of a node behind a gateway. Refused while its axis has power.
+    Node {
+        device: String,
+        /// The node-ID.
+        node: u8,
+        action: NodeAction,
+    },
     /// Switches an input of the simulated bus: a name of `[signals]`, or `io.Input 1`. Needs no
     /// lease.
     SimInput { input: String, value: f64 },
@@ -233,6 +240,15 @@ pub enum ProgramAction {
     Resume,
     Step,
     Stop,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NodeAction {
+    Start,
+    Stop,
+    PreOperational,
+    Reset,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema, Serialize)]

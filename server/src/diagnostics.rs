@@ -155,7 +155,7 @@ fn axis(setup: &AxisSetup, device: &str, status: Option<&AxisStatus>) -> Diagnos
                     "controlword",
                     format!("{:#06x}: {controlword}", controlword.bits()),
                 ),
-                ("homed", status.homed.to_string()),
+                ("homed", status.homed().to_string()),
             ];
             (level, message, values)
         }

@@ -466,7 +466,8 @@ impl External {
             axis.source = Source::Nothing { blocked: true };
             return;
         };
-        let next = stream.advance(follower.path, machine.dt_s());
+        let rate = machine.rate(axis.axis);
+        let next = stream.advance(follower.path, rate, machine.dt_s());
         let end = match stream.state() {
             StreamState::Underrun => Some(StreamEnd::Underrun),
             _ if stream.finished(next) && follower.gear.is_none() => Some(StreamEnd::Done),

@@ -155,6 +155,7 @@ impl Observer for Reporter<'_> {
                 restarted,
                 home,
                 first,
+                ..
             } => hub.event(json!({
                 "event": "device_returned", "device": device.name, "after_s": *after_ns as f64 * 1e-9,
                 "restarted": restarted, "home_lost": *home == Some(Home::Lost), "first": first,

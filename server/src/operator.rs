@@ -114,7 +114,7 @@ impl ServerOperator {
                     "replaced by another command",
                 )),
             ),
-            RequestEvent::Input { result, .. } => {
+            RequestEvent::Signal { result, .. } => {
                 let refused = |why: &String| OpError::new(ErrorCode::Refused, why);
                 let outcome = result.as_ref().map(|()| Map::new()).map_err(refused);
                 self.hub.finish(ticket, outcome);
@@ -331,6 +331,7 @@ impl ServerOperator {
             | Request::Reset { .. }
             | Request::SetMode { .. }
             | Request::SetOutput { .. }
+            | Request::Node { .. }
             | Request::SimInput(_)
             | Request::Override { .. }
             | Request::Hold { .. }
@@ -369,9 +370,8 @@ impl ServerOperator {
             Request::SetOutput { output, value } => {
                 let mut outputs = self.hub.outputs.iter();
                 if let Some(index) = outputs.position(|(known, _)| *known == output) {
-                    self.hub.set_output(index, value);
+                    self.hub.set_output(index, Some(value));
                 }
-                outcome = false;
             }
             Request::StopAll
             | Request::EmergencyStop
@@ -402,6 +402,11 @@ impl ServerOperator {
         let due = self.published.is_none_or(|at| at.elapsed() >= PUBLISH);
         if due || at_once {
             self.published = Some(Instant::now());
+            for (index, (_, signal)) in self.hub.outputs.iter().enumerate() {
+                if view.snapshot.locked_outputs.get(signal.device) == Some(&true) {
+                    self.hub.set_output(index, None);
+                }
+            }
             self.hub.publish(Latest {
                 snapshot: view.snapshot.clone(),
                 hands: view.hands.clone(),

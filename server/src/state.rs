@@ -134,6 +134,7 @@ fn axis_setup(machine: &Machine, index: AxisIndex, axis: &AxisSetup) -> Value {
             "torque": limits.torque,
             "following_error": limits.following_error,
         },
+        "torque_limit_note": axis.torque_limit.note(),
         "jog_velocity": MAX_MANUAL_SPEED * limits.velocity,
         "modulo": config.scale.modulo(),
         "group": machine.group_name(group),
@@ -337,6 +338,7 @@ fn axis_state(
     let status = latest.and_then(|latest| latest.snapshot.axes.get(index));
     let (Some(latest), Some(status)) = (latest, status) else {
         return json!({"name": setup.name, "state": "unknown", "enabled": false, "ready": false,
+                      "powered": false, "position_validity": "unknown", "power_loss": Value::Null,
                       "mode": Value::Null, "position": Value::Null, "velocity": Value::Null,
                       "torque": Value::Null, "target_position": Value::Null,
                       "target_velocity": Value::Null, "target_torque": Value::Null,
@@ -369,13 +371,15 @@ fn known_state(setup: &AxisSetup, status: &AxisStatus) -> Value {
         "name": setup.name,
         "state": status.state.to_string(),
         "time_in_state_s": status.time_in_state_s,
+        "powered": status.powered,
         "enabled": status.enabled,
         "ready": status.ready,
         "mode": status.mode.to_string().to_lowercase(),
         "moving": status.moving,
         "at_rest": status.at_rest,
         "in_target": status.in_target,
-        "homed": status.homed,
+        "homed": status.homed(),
+        "position_validity": status.validity.to_string(),
         "position": status.position,
         "velocity": status.velocity,
         "torque": status.torque,
@@ -394,6 +398,7 @@ fn known_state(setup: &AxisSetup, status: &AxisStatus) -> Value {
         "fault": text(status.fault.map(|fault| fault.to_string())),
         "trip": text(status.trip.map(|trip| trip.to_string())),
         "stop": text(stop),
+        "power_loss": text(status.power_loss_cause.map(|cause| cause.to_string())),
         "internal_limit": status.internal_limit,
     })
 }

@@ -30,10 +30,12 @@ mod foe;
 pub mod frame;
 pub mod gateway;
 pub mod network;
+mod quirks;
 mod random;
 pub mod serve;
 mod soe;
 
+pub use coe::startup::StartupWrite;
 pub use device::{DeviceOptions, MailboxOptions, SimDevice, SimError};
 pub use drive::{ElasticLoad, PitchError, PlantParams, Track};
 pub use esc::al::AlState;
@@ -44,6 +46,7 @@ pub use firmware::{FirmwareHeader, FirmwareOptions};
 pub use foe::{FileStore, FoeOptions};
 pub use network::topology::{PortRequest, SecondPort, Topology, TopologyError, Uplink};
 pub use network::{FrameOutcome, Nic, Segment, SegmentOptions};
+pub use quirks::{Cycles, Delay, Quirk, QuirkPoint, QuirkValue, Quirks};
 pub use serve::{ServeError, ServeStats, Server};
 
 /// True time of the simulation in ns. Each device clock drifts from the true time.

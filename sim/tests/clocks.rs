@@ -181,6 +181,7 @@ fn op_waits_for_the_first_pulse() {
     let now = bus.segment.device(0).unwrap().system_time(bus.now).unwrap();
     activate(&mut bus, 0x1001, now + 100_000_000);
     bus.to(0x1001, SAFEOP);
+    bus.first_outputs(0x1001);
     assert_eq!(bus.request(0x1001, 8), (4, 0));
     bus.wait(110_000_000);
     assert_eq!(bus.read_u16(0x1001, 0x130), 8);

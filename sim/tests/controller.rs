@@ -239,6 +239,7 @@ fn states_change_only_by_standard_transitions() {
     bus.write(s, 0x81e, &[0]);
     bus.sm(s, 3, 0x1200, 4, 0x20);
     assert_eq!(bus.request(s, 0x14), (4, 0));
+    bus.first_outputs(s);
     assert_eq!(bus.request(s, 8), (8, 0));
     assert_eq!(bus.request(s, 4), (4, 0));
     assert_eq!(bus.request(s, 8), (8, 0));

@@ -58,6 +58,7 @@ fn two_drives() -> Option<(Bus, usize, usize)> {
         bus.write(station, 0x990, &(now + 20_000_000).to_le_bytes());
         bus.write(station, 0x980, &[0, 3]);
         bus.to(station, SAFEOP);
+        bus.first_outputs(station);
         bus.request(station, 8);
     }
     bus.wait(30_000_000);

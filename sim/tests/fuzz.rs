@@ -55,6 +55,8 @@ const KEYS: &[&str] = &[
     "delay",
     "serial",
     "alias",
+    "value",
+    "mask",
     "with",
 ];
 const KINDS: &[&str] = &[
@@ -78,6 +80,11 @@ const KINDS: &[&str] = &[
     "sync-late",
     "watchdog",
     "other-main-device",
+    "statusword",
+    "zero-inputs",
+    "position-shift",
+    "sto",
+    "enable-input",
     "melt",
 ];
 const STATES: &[&str] = &[

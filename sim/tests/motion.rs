@@ -2,7 +2,7 @@
 
 use crate::common::*;
 use ecaxis_sim::drive::{State, input};
-use ecaxis_sim::{DeviceOptions, PlantParams, SimDevice, Track};
+use ecaxis_sim::{DeviceOptions, FaultScript, PlantParams, Quirks, SimDevice, Track};
 
 const EPOS4: &str = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml";
 const VALUE_RANGE: u32 = 0x0609_0030;
@@ -124,12 +124,27 @@ struct Inputs {
 impl Axis {
     /// Returns the axis in SafeOp.
     fn new(track: Track) -> Option<Self> {
+        Self::with(PlantParams {
+            track,
+            ..PlantParams::default()
+        })
+    }
+
+    /// Returns a drive with one quirk, in SafeOp.
+    fn with_quirk(key: &str, value: f64) -> Option<Self> {
+        let mut quirks = Quirks::default();
+        let quirk = Quirks::TABLE.iter().find(|quirk| quirk.key == key);
+        quirk.unwrap().set(&mut quirks, value);
+        Self::with(PlantParams {
+            quirks,
+            ..PlantParams::default()
+        })
+    }
+
+    fn with(plant: PlantParams) -> Option<Self> {
         let file = ecaxis_esi::parse(&fixture(EPOS4)?).unwrap();
         let options = DeviceOptions {
-            plant: PlantParams {
-                track,
-                ..PlantParams::default()
-            },
+            plant,
             ..DeviceOptions::default()
         };
         let device = SimDevice::from_esi(&file.devices[0], &file.modules, options).unwrap();
@@ -186,6 +201,13 @@ impl Axis {
         }
         assert_eq!(self.inputs.statusword & 0x6f, 0x27);
         assert_eq!(self.inputs.mode, self.outputs.mode);
+    }
+
+    /// Begins faults now.
+    fn begin(&mut self, script: &str) {
+        let script = FaultScript::parse(script).unwrap();
+        let now = self.bus.now;
+        self.bus.segment.start_faults(script, now);
     }
 
     fn device(&mut self) -> &mut SimDevice {
@@ -340,4 +362,164 @@ fn touch_probe_latches_the_position_at_the_edge() {
         axis.device().drive().unwrap().state(),
         State::OperationEnabled
     );
+}
+
+#[test]
+fn all_inputs_are_zero_at_the_beginning_of_op() {
+    let Some(mut axis) = Axis::with_quirk("zero_inputs", 10e6) else {
+        return;
+    };
+    axis.cycles(5);
+    assert_ne!(axis.inputs.statusword, 0);
+    axis.bus.request(STATION, 8);
+    let zero: Vec<bool> = (0..40)
+        .map(|_| {
+            axis.cycle();
+            axis.inputs.statusword == 0 && axis.inputs.mode == 0
+        })
+        .collect();
+    let count = zero.iter().filter(|zero| **zero).count();
+    assert!((9..=11).contains(&count), "{zero:?}");
+}
+
+#[test]
+fn a_written_home_position_is_confirmed_and_not_kept() {
+    for (key, kept) in [("home_offset_not_kept", 0), ("home_offset_negated", 77)] {
+        let Some(mut axis) = Axis::with_quirk(key, 1.0) else {
+            return;
+        };
+        let written = 77_i32.to_le_bytes();
+        axis.bus.download(STATION, 0x30b0, 0, &written).unwrap();
+        let read = axis.bus.upload(STATION, 0x30b0, 0).unwrap();
+        assert_eq!(read, i32::to_le_bytes(kept), "{key}");
+    }
+}
+
+/// A client that writes 0x6040 by SDO enables the drive before Op.
+#[test]
+fn sdo_writes_to_the_controlword_act_before_op() {
+    for (key, state) in [
+        ("controlword_by_sdo", State::OperationEnabled),
+        ("halt_ignored", State::SwitchOnDisabled),
+    ] {
+        let Some(mut axis) = Axis::with_quirk(key, 1.0) else {
+            return;
+        };
+        for word in [0x06_u16, 0x07, 0x0f] {
+            axis.bus
+                .download(STATION, 0x6040, 0, &word.to_le_bytes())
+                .unwrap();
+            axis.bus.wait(10_000_000);
+        }
+        assert_eq!(axis.device().drive().unwrap().state(), state, "{key}");
+    }
+    // The Controlword of the last process data does not enable it again.
+    let mut axis = Axis::with_quirk("controlword_by_sdo", 1.0).unwrap();
+    axis.enable();
+    axis.outputs.controlword = 0x06;
+    axis.cycles(10);
+    axis.bus.request(STATION, 4);
+    axis.bus.wait(50_000_000);
+    let state = axis.device().drive().unwrap().state();
+    assert_eq!(state, State::SwitchOnDisabled);
+}
+
+#[test]
+fn a_fault_shows_another_statusword_for_some_inputs() {
+    let Some(mut axis) = Axis::new(Track::default()) else {
+        return;
+    };
+    axis.enable();
+    let usual = axis.inputs.statusword;
+    let position = axis.inputs.position;
+    for (keys, word, others) in [
+        ("kind = 'statusword'\nvalue = 0x56", 0x56, true),
+        (
+            "kind = 'statusword'\nvalue = 0\nmask = 0x1000",
+            usual & !0x1000,
+            true,
+        ),
+        ("kind = 'zero-inputs'", 0, false),
+    ] {
+        axis.begin(&format!("[[fault]]\n{keys}\ncount = 2\n"));
+        let seen: Vec<(u16, i8)> = (0..6)
+            .map(|_| {
+                axis.cycle();
+                (axis.inputs.statusword, axis.inputs.mode)
+            })
+            .collect();
+        let strange = (word, if others { 8 } else { 0 });
+        let count = seen.iter().filter(|seen| **seen == strange).count();
+        assert_eq!(count, 2, "{keys}: {seen:04x?}");
+        assert_eq!(seen.last(), Some(&(usual, 8)), "{keys}");
+        // The drive itself is not affected.
+        assert_eq!(axis.inputs.position, position);
+    }
+    axis.begin("[[fault]]\nkind = 'statusword'\nvalue = 0\nfor = '10ms'\n");
+    axis.cycles(8);
+    assert_eq!(axis.inputs.statusword, 0);
+    axis.cycles(8);
+    assert_eq!(axis.inputs.statusword, usual);
+}
+
+#[test]
+fn a_fault_shifts_all_positions() {
+    let Some(mut axis) = Axis::new(Track::default()) else {
+        return;
+    };
+    axis.enable();
+    let before = axis.inputs.position;
+    axis.outputs.mode = 3;
+    axis.cycles(10);
+    axis.begin("[[fault]]\nkind = 'position-shift'\nvalue = -3000\n");
+    axis.cycles(5);
+    assert!((axis.inputs.position - before + 3000).abs() <= 1);
+}
+
+#[test]
+fn the_drive_loses_its_torque_by_sto_and_by_its_enable_input() {
+    for (kind, low) in [("sto", 0x40), ("enable-input", 0x21)] {
+        let Some(mut axis) = Axis::new(Track::default()) else {
+            return;
+        };
+        axis.enable();
+        axis.begin(&format!("[[fault]]\nkind = '{kind}'\nfor = '30ms'\n"));
+        axis.cycles(10);
+        assert_eq!(axis.inputs.statusword & 0x6f, low, "{kind}");
+        assert!(!axis.device().drive().unwrap().power_on());
+        for word in [0x06, 0x07, 0x0f] {
+            axis.outputs.controlword = word;
+            axis.cycles(4);
+            assert_eq!(axis.inputs.statusword & 0x6f, low, "{kind}");
+        }
+        axis.outputs.controlword = 0x06;
+        axis.cycles(20);
+        axis.enable();
+    }
+}
+
+/// The motor coasts on after the loss of power, and an absolute encoder counts it.
+#[test]
+fn an_absolute_encoder_keeps_its_position_without_power() {
+    for (key, keeps) in [("absolute_encoder", true), ("halt_ignored", false)] {
+        let Some(mut axis) = Axis::with_quirk(key, 1.0) else {
+            return;
+        };
+        axis.enable();
+        for _ in 0..200 {
+            axis.outputs.target += 20;
+            axis.cycle();
+        }
+        axis.begin("[[fault]]\nkind = 'power-off'\nfor = '3s'\n");
+        axis.bus.wait(4_000_000_000);
+        let now = axis.bus.now;
+        axis.bus.segment.advance(now);
+        let drive = axis.device().drive().unwrap();
+        let (position, speed) = (drive.position_counts(), drive.velocity_rev_s());
+        assert_eq!(position > 4000, keeps, "{key}: {position}");
+        assert_eq!(speed, 0.0);
+        let shown = axis.device().object(0x6064, 0).unwrap();
+        let shown = i32::from_le_bytes(shown.try_into().unwrap());
+        assert_eq!(i64::from(shown), position);
+    }
 }

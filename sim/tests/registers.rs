@@ -177,6 +177,7 @@ fn terminal_in_op(control: u8) -> Bus {
     bus.sm(S, 0, 0x1000, 2, control);
     bus.sm(S, 1, 0x1100, 2, 0x00);
     bus.to(S, SAFEOP);
+    assert_eq!(bus.read(S, 0x440, 1), [0], "not yet triggered");
     bus.to(S, OP);
     bus
 }
@@ -193,7 +194,6 @@ fn process_data_watchdog_follows_divider_and_time() {
         let mut bus = terminal_in_op(0x44);
         bus.write(S, 0x400, &divider.to_le_bytes());
         bus.write(S, 0x420, &time.to_le_bytes());
-        assert_eq!(bus.read(S, 0x440, 1), [0], "not yet triggered");
         bus.write(S, 0x1000, &[1, 2]);
         let sent = bus.now;
         assert_eq!(bus.read(S, 0x440, 1), [1]);

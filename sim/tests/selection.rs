@@ -204,3 +204,88 @@ fn mapping_entry_takes_its_own_length() {
     };
     assert_eq!((value(1), value(2)), (vec![0x11, 0x66], vec![0x22, 0x33]));
 }
+
+/// Returns a device with one oversampled input of 16 bits, at most ten samples a cycle.
+fn oversampler(mailbox: &str, increment: u16) -> Device {
+    let text = format!(
+        "<EtherCATInfo><Vendor><Id>1</Id></Vendor><Descriptions><Devices><Device Physics=\"YY\">\
+         <Type ProductCode=\"1\">S</Type><Fmmu>Outputs</Fmmu><Fmmu>Inputs</Fmmu>\
+         <Sm StartAddress=\"#x1000\" DefaultSize=\"128\" ControlByte=\"#x26\" Enable=\"1\">MBoxOut</Sm>\
+         <Sm StartAddress=\"#x1080\" DefaultSize=\"128\" ControlByte=\"#x22\" Enable=\"1\">MBoxIn</Sm>\
+         <Sm StartAddress=\"#x1100\" ControlByte=\"#x64\" Enable=\"1\">Outputs</Sm>\
+         <Sm StartAddress=\"#x1400\" ControlByte=\"#x20\" Enable=\"1\">Inputs</Sm>\
+         <TxPdo Fixed=\"1\" Sm=\"3\" OSFac=\"1\" OSMax=\"10\" OSIndexInc=\"{increment}\">\
+         <Index>#x1a00</Index><Entry><Index>#x6000</Index><SubIndex>1</SubIndex>\
+         <BitLen>16</BitLen></Entry></TxPdo>{mailbox}\
+         <Dc><OpMode><Name>X4</Name><AssignActivate>#x730</AssignActivate>\
+         <Sm No=\"3\"><Pdo OSFac=\"4\">#x1a00</Pdo></Sm></OpMode></Dc>\
+         </Device></Devices></Descriptions></EtherCATInfo>"
+    );
+    ecaxis_esi::parse(text.as_bytes())
+        .unwrap()
+        .devices
+        .remove(0)
+}
+
+/// ETG.2000: `OSFac` of an OpMode. The samples of a cycle are further PDOs or a longer one. Without
+/// an object for it, the device takes their number from the length of the SyncManager.
+#[test]
+fn oversampled_inputs_have_one_sample_or_those_of_an_op_mode() {
+    const S: u16 = 0x1001;
+    let assignable = "<Mailbox><CoE PdoAssign=\"1\"/></Mailbox>";
+    for (mailbox, increment, samples) in [
+        (assignable, 16, &[0x1a00_u16, 0x1a01, 0x1a02, 0x1a03][..]),
+        (assignable, 0, &[0x1a00]),
+        ("", 16, &[]),
+        ("", 0, &[]),
+    ] {
+        let mut bus = Bus::new(vec![sim(&oversampler(mailbox, increment))]);
+        bus.mailboxes = [(0x1000, 128), (0x1080, 128)];
+        bus.address_all();
+        for (len, accepted) in [(2, true), (4, false), (8, true), (2, true)] {
+            // Acknowledges the refusal before.
+            bus.request(S, u16::from(INIT) | 0x10);
+            for n in [0, 1, 3] {
+                bus.write(S, 0x806 + n * 8, &[0]);
+            }
+            if mailbox.is_empty() {
+                bus.to(S, PREOP);
+            } else {
+                bus.preop(S);
+                let assigned = if len == 8 { samples } else { &[0x1a00] };
+                bus.download(S, 0x1c13, 0, &[0]).unwrap();
+                for (sub, pdo) in (1..).zip(assigned) {
+                    bus.download(S, 0x1c13, sub, &pdo.to_le_bytes()).unwrap();
+                }
+                bus.download(S, 0x1c13, 0, &[assigned.len() as u8]).unwrap();
+            }
+            bus.sm(S, 3, 0x1400, len, 0x20);
+            bus.request(S, SAFEOP.into());
+            let state = bus.segment.device(0).unwrap().al_state();
+            let reached = state == ecaxis_sim::AlState::SafeOp;
+            assert_eq!(reached, accepted, "{mailbox} {increment}: {len} bytes");
+        }
+    }
+}
+
+/// The object of an oversampled PDO has all samples of a cycle; a mapping entry may have fewer.
+#[test]
+fn oversampled_pdo_is_mapped_with_any_number_of_samples() {
+    const S: u16 = 0x1001;
+    let mut device = oversampler(
+        "<Mailbox><CoE PdoAssign=\"1\" PdoConfig=\"1\"/></Mailbox>",
+        0,
+    );
+    device.tx_pdos[0].fixed = false;
+    let mut bus = Bus::new(vec![sim(&device)]);
+    bus.mailboxes = [(0x1000, 128), (0x1080, 128)];
+    bus.address_all();
+    bus.preop(S);
+    bus.download(S, 0x1c13, 0, &[0]).unwrap();
+    for (bits, accepted) in [(16, true), (64, true), (80, false)] {
+        bus.download(S, 0x1a00, 0, &[0]).unwrap();
+        let entry = [bits, 1, 0x00, 0x60];
+        let done = bus.download(S, 0x1a00, 1, &entry);
+        assert_eq!(done.is_ok(), accepted, "{bits} bits");
+    }
+}

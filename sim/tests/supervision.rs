@@ -56,6 +56,7 @@ fn in_op(limit: u8) -> Bus {
     bus.write(STATION, 0x990, &(now + 10 * CYCLE).to_le_bytes());
     bus.write(STATION, 0x980, &[0, 3]);
     bus.to(STATION, SAFEOP);
+    bus.first_outputs(STATION);
     bus.request(STATION, u16::from(OP));
     bus.wait(20 * CYCLE);
     let pulse = bus.segment.device(0).unwrap().sync0_log().last().unwrap();
@@ -203,4 +204,46 @@ fn sync_losses_have_their_al_status_code_and_emergency() {
             assert_eq!(drive.state(), State::Fault, "{what}");
         }
     }
+}
+
+/// ETG.1020: a device with outputs enters Op only once they have come, and names their absence with
+/// AL status code 0x0019. A device without outputs has nothing to wait for.
+#[test]
+fn op_waits_for_the_first_outputs() {
+    const REFUSED: (u16, u16) = (0x14, 0x19);
+    const REQUEST: u16 = OP as u16;
+    let mut device = coe_device();
+    let in_safe_op = |device: &ecaxis_esi::model::Device| {
+        let mut bus = Bus::new(vec![sim(device)]);
+        bus.address_all();
+        bus.preop(STATION);
+        if !device.rx_pdos.is_empty() {
+            bus.sm(STATION, 2, 0x1100, 4, 0x64);
+        }
+        bus.sm(STATION, 3, 0x1200, 4, 0x20);
+        bus.to(STATION, SAFEOP);
+        bus
+    };
+    let mut bus = in_safe_op(&device);
+    assert_eq!(bus.request(STATION, REQUEST), (4, 0));
+    bus.wait(1_000_000_000);
+    assert_eq!(status(&mut bus), REFUSED);
+    // Outputs that come while the device waits.
+    assert_eq!(bus.request(STATION, REQUEST | 0x10), (4, 0));
+    bus.write(STATION, 0x1100, &[1, 0, 2, 0]);
+    assert_eq!(status(&mut bus), (8, 0));
+    // The watchdog ends their validity.
+    bus.wait(200_000_000);
+    assert_eq!(status(&mut bus), (0x14, 0x1b));
+    assert_eq!(bus.request(STATION, REQUEST | 0x10), (4, 0));
+    bus.wait(1_000_000_000);
+    assert_eq!(status(&mut bus), REFUSED);
+    // Those of an earlier SafeOp do not count.
+    bus.request(STATION, u16::from(PREOP) | 0x10);
+    bus.to(STATION, SAFEOP);
+    assert_eq!(bus.request(STATION, REQUEST), (4, 0));
+
+    device.rx_pdos.clear();
+    let mut bus = in_safe_op(&device);
+    assert_eq!(bus.request(STATION, REQUEST), (8, 0));
 }

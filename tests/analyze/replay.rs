@@ -3,7 +3,7 @@
 use ecaxis_master::session::{Options, Progress};
 
 use super::recorded;
-use ecaxis_test_support::{axes, load, machine, root, run, virtual_time};
+use ecaxis_test_support::{axes, faults, load, machine, root, run, virtual_time};
 
 fn moved(options: Options) -> (String, Vec<String>) {
     let (outcome, heard) = run(load("demo.toml"), options);
@@ -25,29 +25,36 @@ fn moved(options: Options) -> (String, Vec<String>) {
     )
 }
 
+/// Also if an answer arrives in the moment in which its frame is repeated: it is not the answer of
+/// the repetition.
 #[test]
 fn a_replayed_run_has_the_same_outcome() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let path = folder.path().join("run.pcapng");
-    let once = Options {
-        repeat: Some(1),
-        ..virtual_time()
+    let late = |delay: &str| {
+        format!("[[fault]]\nkind = \"frame-delay\"\ncount = 1\ndelay = \"{delay}\"\n")
     };
-    let first = moved(Options {
-        record: Some(path.clone()),
-        ..once.clone()
-    });
-    // A recording of the replay has the same bytes at the same times.
-    let again = folder.path().join("again.pcapng");
-    let second = moved(Options {
-        replay: Some(path.clone()),
-        record: Some(again.clone()),
-        ..once
-    });
-    assert_eq!(first, second);
-    assert!(
-        std::fs::read(path).expect("a recording") == std::fs::read(again).expect("a recording")
-    );
+    for script in [String::new(), late("30ms"), late("29995us"), late("45ms")] {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let path = folder.path().join("run.pcapng");
+        let once = Options {
+            repeat: Some(1),
+            ..virtual_time()
+        };
+        let first = moved(Options {
+            record: Some(path.clone()),
+            faults: faults(&script).faults,
+            ..once.clone()
+        });
+        // A recording of the replay has the same bytes at the same times.
+        let again = folder.path().join("again.pcapng");
+        let second = moved(Options {
+            replay: Some(path.clone()),
+            record: Some(again.clone()),
+            ..once
+        });
+        assert_eq!(first, second, "{script}");
+        let [path, again] = [path, again].map(|of| std::fs::read(of).expect("a recording"));
+        assert!(path == again, "{script}");
+    }
 }
 
 #[test]

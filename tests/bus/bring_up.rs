@@ -1,12 +1,15 @@
 //! The bring-up of many devices at the same time.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use ecaxis_master::bringup::StepTime;
+use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::config::{self, Machine};
-use ecaxis_master::session::Progress;
+use ecaxis_master::link::sim::SimLink;
+use ecaxis_master::session::{Progress, run_on, simulated_bus};
 use ecaxis_test_support::recordings::{FPWR, datagrams};
-use ecaxis_test_support::{axes, machine, recorded, root, run, virtual_time};
+use ecaxis_test_support::{Heard, axes, machine, recorded, root, run, virtual_time};
 
 /// Runs a machine without power and returns the steps of its bring-up.
 fn bring_up(mut machine: Machine) -> Vec<StepTime> {
@@ -116,4 +119,72 @@ fn up_to_512_devices_come_up_and_check_refuses_more() {
             .contains("a bus has at most 512 SubDevices"),
         "{error}"
     );
+}
+
+/// A device in the place of another one was reported as missing if the file has its kind elsewhere.
+#[test]
+fn another_device_in_a_place_is_named() {
+    let terminals = |kinds: &[&str]| {
+        let mut text = "enable = false\n[bus]\nnic = \"sim\"\ncycle = \"4ms\"\n".to_owned();
+        for (position, kind) in kinds.iter().enumerate() {
+            text += &format!(
+                "[[device]]\nname = \"t{position}\"\nesi = \"esi/terminals.xml\"\n\
+                 type = \"{kind}\"\nposition = {position}\n"
+            );
+        }
+        machine(&text)
+    };
+    let file = ["CP0", "DI8", "DO8", "DI4", "DO4"];
+    for (bus, place, parts) in [
+        (
+            &["CP0", "DO8", "DO8", "DI4", "DO4"][..],
+            Some("`t1` (position 1"),
+            ["DI8", "DO8"],
+        ),
+        (
+            &["CP0", "DI8", "DO8", "DO4", "DO4"],
+            Some("`t3` (position 3"),
+            ["DI4", "DO4"],
+        ),
+        // The last one is missing as well.
+        (
+            &["CP0", "DO8", "DO8", "DI4"],
+            Some("`t1` (position 1"),
+            ["DI8", "DO8"],
+        ),
+        // One is missing in the middle.
+        (
+            &["CP0", "DO8", "DI4", "DO4"],
+            None,
+            ["missing: `t1` (position 1)", "4 of 5 SubDevices answer"],
+        ),
+        (
+            &["CP0", "DI8", "DO8"],
+            None,
+            ["missing: `t3` (position 3)", "3 of 5 SubDevices answer"],
+        ),
+    ] {
+        let options = virtual_time();
+        options.clock.enter();
+        let segment = simulated_bus(&terminals(bus), 1, None, None).expect("a bus");
+        let mut heard = Heard::default();
+        let link = Box::new(SimLink::new(segment));
+        let stop = Arc::<CancelToken>::default();
+        let outcome = run_on(link, terminals(&file), options, stop, &mut heard);
+        let error = outcome.result.expect_err("another bus").to_string();
+        assert!(
+            error.contains(place.unwrap_or("missing")),
+            "{bus:?}: {error}"
+        );
+        let names = |part: &str| match part {
+            "DI8" => "8 digital inputs".to_owned(),
+            "DO8" => "8 digital outputs".to_owned(),
+            "DI4" => "4 digital inputs".to_owned(),
+            "DO4" => "4 digital outputs".to_owned(),
+            other => other.to_owned(),
+        };
+        for part in parts {
+            assert!(error.contains(&names(part)), "{bus:?}: {error}");
+        }
+    }
 }

@@ -8,7 +8,9 @@ use ecaxis_master::config::{self, ConfigError, Machine};
 use ecaxis_test_support::random::Random;
 use ecaxis_test_support::recordings::process_images;
 use ecaxis_test_support::script::{Act, home, move_to, perform_well};
-use ecaxis_test_support::{assert_contains, faults, recorded, root, run, run_badly, run_well};
+use ecaxis_test_support::{
+    assert_contains, faults, recorded, root, run, run_badly, run_well, with_load_encoder,
+};
 
 const COUNTS: f64 = 400.0;
 const BACKLASH: f64 = 0.05;
@@ -19,23 +21,8 @@ const ERRORS: &str =
 
 /// The EPOS4 with a position of the load.
 fn esi() -> String {
-    let text = std::fs::read_to_string(root().join("configs/esi/EPOS4.xml")).expect("our file");
-    let item = |sub, name, kind, bits, at| {
-        format!(
-            "<SubItem><SubIdx>{sub}</SubIdx><Name>{name}</Name><Type>{kind}</Type><BitSize>{bits}</BitSize>\
-             <BitOffs>{at}</BitOffs><Flags><Access>ro</Access><PdoMapping>T</PdoMapping></Flags></SubItem>"
-        )
-    };
-    let kind = format!(
-        "<DataType><Name>DT60E4</Name><BitSize>48</BitSize>{}{}</DataType><DataType><Name>BOOL</Name>",
-        item(0, "Highest subindex", "USINT", 8, 0),
-        item(1, "Position of the load", "DINT", 32, 16)
-    );
-    let object = "<Object><Index>#x60E4</Index><Name>Additional position actual value</Name><Type>DT60E4</Type>\
-        <BitSize>48</BitSize><Info><SubItem><Name>Highest subindex</Name><Info><DefaultValue>1</DefaultValue></Info></SubItem>\
-        </Info><Flags><Access>ro</Access><PdoMapping>T</PdoMapping></Flags></Object>\n              <Object>\n                <Index>#x6065</Index>";
-    let text = text.replacen("<DataType><Name>BOOL</Name>", &kind, 1);
-    text.replacen("<Object>\n                <Index>#x6065</Index>", object, 1)
+    let epos4 = std::fs::read_to_string(root().join("configs/esi/EPOS4.xml"));
+    with_load_encoder(&epos4.expect("our file"))
 }
 
 struct Bench(tempfile::TempDir);

@@ -71,7 +71,8 @@ fn unknown_names_are_explained() {
         "no axis is named `io`; axes: `x`, `y`",
         "no device is named `oi`; devices: `x`, `y`, `io`",
         "`io` has no input \"Input 9\" in its process data; did you mean `Input 1`?",
-        "`x.Controlword` is written by the axis itself; give the axis a command instead",
+        "`x.Controlword` is written by the axis `x` in line 7; a controller may not write it; give the axis \
+         a command instead",
     ];
     assert_eq!(said, expected);
 }

@@ -309,3 +309,26 @@ fn a_gateway_of_another_size_is_refused_with_both_sizes() {
     println!("{error}");
     assert_contains(&error, &["gateway", "130", "16"]);
 }
+
+/// The node refuses an object of its configuration, so the gateway does not start it.
+#[test]
+fn a_node_that_is_not_configured_is_named() {
+    let machine = machine(
+        "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[[device]]\nname = \"gateway\"\nesi = \"esi/gateway.xml\"\n\
+         type = \"GW64\"\nposition = 0\n[device.can]\nsync = \"4ms\"\n[[device.node]]\nid = 6\n\
+         drive = \"EPOS 24/1\"\nguarding = \"50ms\"\n\
+         outputs = [{ pdo = 1, at = 12, objects = [\"0x6040\", \"0x2062\"] }, { pdo = 3, at = 18 }]\n\
+         inputs = [{ pdo = 1, at = 12, objects = [\"0x6041\", \"0x6064\"] }, { pdo = 3, at = 18 }]\n\
+         objects = [{ index = 0x1400, sub = 2, value = 0xFD, type = \"u8\" }]\n\
+         [device.node.axis]\nname = \"b\"\nencoder = 2000\n\
+         limits = { velocity = 50.0, acceleration = 250.0 }\n[[step]]\nmove = { b = 5.0 }\n",
+    );
+    let (error, _) = run_badly(machine, virtual_time());
+    println!("{error}");
+    let parts = [
+        "`b`",
+        "does not reach Operation enabled",
+        "node 6 on its CAN network is",
+    ];
+    assert_contains(&error, &parts);
+}

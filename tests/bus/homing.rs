@@ -308,7 +308,7 @@ fn an_impossible_homing_is_rejected_with_the_file() {
         (
             mapped,
             "homing = { method = 40 }",
-            "method 40 is not one of",
+            "method 40 is none of CiA 402",
         ),
         (mapped, "homing = { method = -3 }", "needs the current"),
         (

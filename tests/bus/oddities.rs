@@ -58,9 +58,20 @@ const ROWS: &[Row] = &[
         bytes: [8, 6],
         ..ROW
     },
-    // ETG.2000: the SyncManagers' texts say what the missing FMMU maps.
+    // ETG.2000: the PDOs of a SyncManager say what the missing FMMU maps.
     Row {
         device: "one-fmmu",
+        written: &[(0x0600, OUTPUTS_FMMU), (0x0610, INPUTS_FMMU)],
+        ..ROW
+    },
+    // ETG.1000.4: the direction is bits 2 and 3 of the control byte; ETG.2000: `Sm` of the PDOs.
+    Row {
+        device: "unnamed-sync-managers",
+        written: &[(0x0600, OUTPUTS_FMMU), (0x0610, INPUTS_FMMU)],
+        ..ROW
+    },
+    Row {
+        device: "renamed-sync-managers",
         written: &[(0x0600, OUTPUTS_FMMU), (0x0610, INPUTS_FMMU)],
         ..ROW
     },

@@ -133,9 +133,12 @@ fn bench() -> Bench {
     bench
 }
 
+/// The inputs at the start.
+const WHOLE: &str = "{ at = \"0s\", set = { pot = 1000 } },\n";
+
 /// Returns three axes with inputs for hold and override, switched at random or not at all.
 fn machine(bench: &Bench, steps: &str, random: Option<u64>) -> Machine {
-    let mut inputs = String::from("{ at = \"0s\", set = { pot = 1000 } },\n");
+    let mut inputs = String::from(WHOLE);
     if let Some(seed) = random {
         let mut random = Random::new(seed);
         let mut at = 700;
@@ -150,6 +153,10 @@ fn machine(bench: &Bench, steps: &str, random: Option<u64>) -> Machine {
         }
         inputs += "{ at = \"5500ms\", set = { held = false, pot = 1000 } },\n";
     }
+    with_inputs(bench, steps, &inputs)
+}
+
+fn with_inputs(bench: &Bench, steps: &str, inputs: &str) -> Machine {
     let mut text = format!(
         "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[signals]\nheld = \"io.Input 1\"\npot = \"io.Analog 1\"\n\
          [override]\nhold = {{ held = true }}\ninput = \"pot\"\nfull = 1000\n[sim]\ninputs = [\n{inputs}]\n"
@@ -281,6 +288,128 @@ fn random_overrides_keep_limits_paths_and_ends() {
             "{}",
             kind.name
         );
+    }
+}
+
+/// A hold at three moments of each kind of motion: all axes rest together until it ends, and go on.
+#[test]
+fn a_held_machine_rests_whatever_moves_it() {
+    let bench = bench();
+    let actual = kind(
+        "gear of reported positions",
+        "[[step]]\ngear = { y = { to = \"x\", ratio = 0.5, actual = true, smoothing = \"10ms\" } }\n[[step]]\nmove = { x = 12.0 }\n[[step]]\nmove = { x = 2.0 }\n",
+        false,
+        [12.0, 6.0, 0.0],
+    );
+    for kind in KINDS.iter().chain([&actual]) {
+        let mut holds = 0;
+        // Cycles of 1 ms without a hold.
+        let free = with_inputs(&bench, kind.steps, WHOLE);
+        let (options, recording) = recorded(virtual_time(), bench.path());
+        run_well(free.clone(), options);
+        let lasts = targets(&free, &recording)[0].len();
+        for at in [800, 950, 1100] {
+            if lasts < at + 50 {
+                continue;
+            }
+            let inputs = format!(
+                "{WHOLE}{{ at = \"{at}ms\", set = {{ held = true }} }},\n{{ at = \"{}ms\", set = {{ held = false }} }},\n",
+                at + 4000
+            );
+            let machine = with_inputs(&bench, kind.steps, &inputs);
+            let (options, recording) = recorded(virtual_time(), bench.path());
+            run_well(machine.clone(), options);
+            let targets = targets(&machine, &recording);
+            let [x, y, z] = &targets;
+            let all: Vec<_> = x
+                .iter()
+                .zip(y)
+                .zip(z)
+                .map(|((x, y), z)| [x, y, z])
+                .collect();
+            let rests = all.chunk_by(|a, b| a == b);
+            let longest = rests.map(<[_]>::len).max().unwrap_or(0);
+            assert!(longest > 3000, "{} at {at} ms: {longest} cycles", kind.name);
+            let resting = all.chunk_by(|a, b| a == b).rfind(|rest| rest.len() > 3000);
+            holds += usize::from(resting.is_some_and(|rest| rest.last() != all.last()));
+        }
+        assert!(holds > 0, "{}: no hold on the way", kind.name);
+    }
+}
+
+/// A hold interrupts the search for home by the drive. The step begins it again afterwards.
+#[test]
+fn a_held_machine_does_not_search_home() {
+    let bench = Bench::new();
+    let text = "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[signals]\nheld = \"io.Input 1\"\n[override]\nhold = { held = true }\n\
+        [sim]\ninputs = [\n{ at = \"0s\", set = { held = true } },\n{ at = \"2s\", set = { held = false } },\n\
+        { at = \"2200ms\", set = { held = true } },\n{ at = \"4s\", set = { held = false } },\n]\n\
+        [[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"\nposition = 0\nmode = \"csp\"\n\
+        pdo.rx = [\"0x6040\", \"0x607A\", \"0x6060\"]\npdo.tx = [\"0x6041\", \"0x6064\", \"0x6061\", \"0x606C\", \"0x6077\"]\n\
+        [device.axis]\nencoder = 2000\nlimits = { velocity = 20.0, acceleration = 500.0, following_error = 2.0 }\n\
+        homing = { method = 23, search = 2.0, zero = 0.5, acceleration = 100.0 }\n\
+        [device.sim]\ntrack = { home = [2.0, 9.0] }\n\
+        [[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 1\n\
+        [[step]]\nenable = true\n[[step]]\nhome = [\"x\"]\n";
+    let machine = bench.machine(text);
+    let (options, recording) = recorded(virtual_time(), bench.path());
+    let summary = run_well(machine, options);
+    assert!(summary.machine_seconds > 4.5, "{}", summary.machine_seconds);
+    let images = process_images(&recording);
+    let actual = images.iter().filter(|(_, data)| data.len() >= 6);
+    let actual: Vec<_> = actual
+        .map(|(_, data)| i32::from_le_bytes([data[2], data[3], data[4], data[5]]))
+        .collect();
+    // It rests twice: until the first search, and while this is interrupted.
+    let rests = actual.chunk_by(|a, b| a.abs_diff(*b) <= 1);
+    let rests = rests.filter(|rest| rest.len() > 1500).count();
+    assert!(rests >= 2, "{rests}");
+}
+
+/// However short the hold is, the step `home` begins again.
+#[test]
+fn a_short_hold_does_not_end_a_step_that_homes() {
+    let bench = Bench::new();
+    for (hold_ms, cycle) in [(1, "1ms"), (4, "1ms"), (20, "1ms"), (50, "2ms")] {
+        let end = 2_200 + hold_ms;
+        let text = format!(
+            "[bus]\nnic = \"sim\"\ncycle = \"{cycle}\"\n[signals]\nheld = \"io.Input 1\"\n[override]\nhold = {{ held = true }}\n\
+             [sim]\ninputs = [\n{{ at = \"2200ms\", set = {{ held = true }} }},\n{{ at = \"{end}ms\", set = {{ held = false }} }},\n]\n\
+             [[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"\nposition = 0\nmode = \"csp\"\n\
+             pdo.rx = [\"0x6040\", \"0x607A\", \"0x6060\"]\npdo.tx = [\"0x6041\", \"0x6064\", \"0x6061\", \"0x606C\", \"0x6077\"]\n\
+             [device.axis]\nencoder = 2000\nlimits = {{ velocity = 20.0, acceleration = 500.0, following_error = 2.0 }}\n\
+             homing = {{ method = 23, search = 1.0, zero = 0.5, acceleration = 100.0 }}\n\
+             [device.sim]\ntrack = {{ home = [8.0, 9.0] }}\n\
+             [[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 1\n\
+             [[step]]\nenable = true\n[[step]]\nhome = [\"x\"]\n"
+        );
+        let summary = run_well(bench.machine(&text), virtual_time());
+        assert_eq!(summary.program_runs, 1, "{hold_ms} ms");
+    }
+}
+
+/// A drive that changes its mode only without power has none while it goes into homing and back.
+/// Whenever the hold comes, home is found after it.
+#[test]
+fn a_hold_during_a_change_of_mode_without_power_does_not_end_homing() {
+    let bench = Bench::new();
+    for at_ms in (300..=600).step_by(11) {
+        for hold_ms in [1, 300] {
+            let end = at_ms + hold_ms;
+            let text = format!(
+                "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[signals]\nheld = \"io.Input 1\"\n[override]\nhold = {{ held = true }}\n\
+                 [sim]\ninputs = [\n{{ at = \"{at_ms}ms\", set = {{ held = true }} }},\n{{ at = \"{end}ms\", set = {{ held = false }} }},\n]\n\
+                 [[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"\nposition = 0\nmode = \"csp\"\n\
+                 pdo.rx = [\"0x6040\", \"0x607A\", \"0x6060\"]\npdo.tx = [\"0x6041\", \"0x6064\", \"0x6061\", \"0x606C\", \"0x6077\"]\n\
+                 [device.axis]\nencoder = 2000\nmode_change = \"no-power\"\nlimits = {{ velocity = 20.0, acceleration = 500.0, following_error = 2.0 }}\n\
+                 homing = {{ method = 37, search = 1.0, zero = 0.5, acceleration = 100.0 }}\n\
+                 [device.sim]\nquirks = {{ mode_without_power = true }}\n\
+                 [[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 1\n\
+                 [[step]]\nenable = true\n[[step]]\nhome = [\"x\"]\n[[step]]\nmove = {{ x = 1.0 }}\n"
+            );
+            let summary = run_well(bench.machine(&text), virtual_time());
+            assert_eq!(summary.program_runs, 1, "{hold_ms} ms at {at_ms} ms");
+        }
     }
 }
 

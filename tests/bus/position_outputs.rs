@@ -5,6 +5,7 @@
 
 use std::fmt::Write as _;
 
+use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::random::Random;
 use ecaxis_test_support::recordings::process_images;
 use ecaxis_test_support::{assert_contains, faults, machine, recorded, run_badly, run_well};
@@ -147,31 +148,57 @@ fn an_output_is_off_without_power_and_in_a_stop() {
         "[[position_output]]\noutput = \"io.Output 1\"\naxis = \"x\"\nranges = [[-60.0, 60.0]]\n";
     let steps =
         "[[step]]\nenable = true\n[[step]]\nvelocity = { x = 10.0 }\n[[step]]\ndwell = \"2s\"\n";
-    let folder = tempfile::tempdir().expect("a folder");
-    let script = "[[fault]]\nkind = \"drive-fault\"\ndevice = 0\nat = \"1s\"\ncode = 0x8611\n";
-    let (options, path) = recorded(faults(script), folder.path());
-    run_badly(machine(&text(outputs, steps)), options);
-    let images = process_images(&path);
-    let mut on = 0;
-    for (out, data) in images
-        .iter()
-        .filter(|(out, data)| out.len().min(data.len()) > TERMINAL)
-    {
-        let statusword = u16::from_le_bytes([data[0], data[1]]);
-        let powered = statusword & 0x6f == 0x27;
-        if out[TERMINAL] & 1 != 0 {
-            on += 1;
-            // The Statusword answers the outputs before it.
-            assert!(powered || statusword & 0x08 != 0, "{statusword:#06x}");
+    for fault in [
+        "kind = \"drive-fault\"\ncode = 0x8611",
+        // A trip, found while the axis acts.
+        "kind = \"position-shift\"\nvalue = 500000",
+    ] {
+        let folder = tempfile::tempdir().expect("a folder");
+        let script = format!("[[fault]]\n{fault}\ndevice = 0\nat = \"1s\"\n");
+        let (options, path) = recorded(faults(&script), folder.path());
+        run_badly(machine(&text(outputs, steps)), options);
+        let images = process_images(&path);
+        let mut on = 0;
+        for (out, data) in images
+            .iter()
+            .filter(|(out, data)| out.len().min(data.len()) > TERMINAL)
+        {
+            let statusword = u16::from_le_bytes([data[0], data[1]]);
+            let powered = statusword & 0x6f == 0x27;
+            if out[TERMINAL] & 1 != 0 {
+                on += 1;
+                // The Statusword answers the outputs before it.
+                assert!(powered || statusword & 0x08 != 0, "{statusword:#06x}");
+                assert_eq!(out[0] & 0x0f, 0x0f, "on in the cycle of the stop: {fault}");
+            }
+        }
+        assert!(on > 300, "{on}");
+        let last = images
+            .iter()
+            .rev()
+            .find(|(out, _)| out.len() > TERMINAL)
+            .expect("cycles");
+        assert_eq!(last.0[TERMINAL] & 1, 0);
+    }
+}
+
+/// A group without axes is never reset, so its output would come back on unasked.
+#[test]
+fn an_output_in_a_group_of_devices_alone_is_refused() {
+    let outputs =
+        "[[position_output]]\noutput = \"io.Output 1\"\naxis = \"x\"\nranges = [[1.0, 2.0]]\n";
+    let group = "[[stop.group]]\nname = \"g\"\ndevices = [\"io\"]\n";
+    for (outside, refused) in [("continue", true), ("stop", false)] {
+        let group = format!("{group}outside = \"{outside}\"\n");
+        let parsed = Bench::new().parse(&text(&format!("{outputs}{group}"), ""));
+        assert_eq!(parsed.is_err(), refused, "{parsed:?}");
+        if let Err(error) = parsed {
+            assert_contains(
+                &error,
+                &["`io.Output 1` would come on by itself", "group `g`"],
+            );
         }
     }
-    assert!(on > 300, "{on}");
-    let last = images
-        .iter()
-        .rev()
-        .find(|(out, _)| out.len() > TERMINAL)
-        .expect("cycles");
-    assert_eq!(last.0[TERMINAL] & 1, 0);
 }
 
 #[test]

@@ -8,11 +8,11 @@ use ecaxis_master::clock::{self, Nanos};
 use ecaxis_master::config::Machine;
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
-use ecaxis_master::session::{self, Outcome, simulated_bus};
+use ecaxis_master::session::{self, Options, Outcome, simulated_bus};
 use ecaxis_sim::Segment;
 use ecaxis_test_support::bench::Bench;
 use ecaxis_test_support::recordings::{APWR, BWR, Datagram, FPWR, Frame, LRW, datagrams};
-use ecaxis_test_support::{Heard, faults, load, recorded, run, run_well, virtual_time};
+use ecaxis_test_support::{Heard, faults, load, machine, recorded, run, run_well, virtual_time};
 
 const MS: u64 = 1_000_000;
 
@@ -442,5 +442,120 @@ fn refused_interpolation_time_is_a_warning() {
         let warnings = heard.warnings();
         let about = |text: &&String| text.contains("refuses the interpolation time");
         assert_eq!(warnings.iter().any(|w| about(&w)), warned, "{warnings:?}");
+    }
+}
+
+/// ETG.1000.6, PDO assignment: a device whose SyncManager carries no PDO may lack the object of its
+/// assignment, or refuse to clear it. Neither prevents the run.
+#[test]
+fn an_assignment_that_cannot_be_cleared_is_no_error() {
+    for (code, warned) in [(0x0602_0000_u32, false), (0x0601_0002, true)] {
+        let bench = Bench::new();
+        let machine = bench.machine(
+            "enable = false\n[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n\
+             [[device]]\nname = \"io\"\nesi = \"esi/MIO2.xml\"\nposition = 0\n\
+             modules = [\"-\", \"OUT8\"]\n",
+        );
+        let script =
+            format!("[[fault]]\nkind = \"sdo-abort\"\nindex = 0x1c13\ncode = 0x{code:08x}\n");
+        let (outcome, heard) = run(machine, shortly(&script));
+        let result = outcome.result.map_err(|error| error.to_string());
+        assert_eq!(result, Ok(()), "0x{code:08x}");
+        let warnings = heard.warnings();
+        let about = |text: &&String| text.contains("refuses 0x1c13:00");
+        assert_eq!(warnings.iter().any(|w| about(&w)), warned, "{warnings:?}");
+    }
+}
+
+/// Devices without a program run until the end.
+fn shortly(script: &str) -> Options {
+    Options {
+        limit: Some(20 * MS),
+        ..faults(script)
+    }
+}
+
+fn block(modules: &str) -> Machine {
+    machine(&format!(
+        "enable = false\n[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n\
+         [[device]]\nname = \"io\"\nesi = \"esi/MIO2.xml\"\nposition = 0\nmodules = {modules}\n"
+    ))
+}
+
+/// ETG.1020, AL status codes 0x0052 and 0x0070: a coupler that still looks for its terminals comes up
+/// once it is ready, and one that does not become ready is named.
+#[test]
+fn coupler_that_is_not_ready_is_asked_again() {
+    let abort = "kind = \"sdo-abort\"\nindex = 0xf030\ncode = 0x08000022";
+    let refuse = "kind = \"refuse-state\"\nstate = \"safe-op\"\ncode";
+    for fault in [
+        format!("{refuse} = 0x52"),
+        format!("{refuse} = 0x70"),
+        abort.to_owned(),
+    ] {
+        let script = format!("[[fault]]\n{fault}\n");
+        let soon = format!("{script}for = \"2s\"\n");
+        let (outcome, heard) = run(block("[\"IN8\", \"OUT8\"]"), shortly(&soon));
+        let result = outcome.result.map_err(|error| error.to_string());
+        assert_eq!(result, Ok(()), "{fault}: {:?}", heard.warnings());
+        let (outcome, _) = run(block("[\"IN8\", \"OUT8\"]"), shortly(&script));
+        let error = outcome.result.expect_err("it is never ready").to_string();
+        assert!(error.contains("`io` (position 0"), "{error}");
+        assert!(error.contains("it was not ready within 10 s"), "{error}");
+    }
+    // Without the error bit, the first request lasts as long as the whole wait.
+    let keys = "[\"IN8\", \"OUT8\"]\n[device.sim]\nquirks = { error_bit_missing = true }";
+    let soon = format!("[[fault]]\n{refuse} = 0x52\nfor = \"2s\"\n");
+    let (outcome, _) = run(block(keys), shortly(&soon));
+    outcome.result.expect("it is asked again");
+}
+
+/// Lists of an earlier configuration are cleared, once a coupler is ready, and as far as the device
+/// lets it: a check of the user's own start-up SDOs does not concern them.
+#[test]
+fn a_list_that_is_not_cleared_is_a_warning() {
+    let ignored = "[[fault]]\nkind = \"sdo-ignored\"\nindex = 0xf030\n";
+    let (outcome, heard) = run(block("[]\nstartup = { verify = true }"), shortly(ignored));
+    outcome.result.expect("the device runs");
+    let warnings = heard.warnings();
+    let named = |w: &&String| w.contains("0xf030:00") && w.contains("holds 0x02");
+    assert_eq!(warnings.iter().filter(named).count(), 1, "{warnings:?}");
+
+    let busy = "[[fault]]\nkind = \"sdo-abort\"\nindex = 0xf030\ncode = 0x08000022\nfor = \"2s\"\n";
+    let (outcome, heard) = run(block("[]"), shortly(busy));
+    outcome.result.expect("the device runs");
+    assert!(!heard.warnings().iter().any(|w| w.contains("0xf030")));
+}
+
+/// The modules in the slots are others than those of the file. The device refuses them, or takes them.
+#[test]
+fn modules_that_differ_are_named() {
+    let (plugged, file) = (block("[\"OUT8\", \"IN8\"]"), block("[\"IN8\", \"OUT8\"]"));
+    // The device detects its modules by itself, whatever the list says.
+    let keeps = (1..=2)
+        .map(|sub| format!("[[fault]]\nkind = \"sdo-ignored\"\nindex = 0xf030\nsub = {sub}\n"));
+    let keeps: String = keeps.collect();
+    let refuses = "[[fault]]\nkind = \"refuse-state\"\nstate = \"safe-op\"\ncode = 0x70\n";
+    let difference = "it detects the modules [OUT8, IN8] (0xF050), the file configures [IN8, OUT8]";
+    for (script, is_refused) in [(keeps.clone() + refuses, true), (keeps, false)] {
+        let options = shortly(&script);
+        options.clock.enter();
+        let bus = simulated_bus(&plugged, 1, options.faults.as_ref(), None).expect("a bus");
+        let mut heard = Heard::default();
+        let link = Box::new(SimLink::new(bus));
+        let stop = Arc::<CancelToken>::default();
+        let outcome = session::run_on(link, file.clone(), options, stop, &mut heard);
+        let error = outcome.result.err().map(|error| error.to_string());
+        if is_refused {
+            let error = error.expect("it refuses SafeOp");
+            assert!(error.contains(difference), "{error}");
+            assert!(error.contains("0x0070"), "{error}");
+        } else {
+            let warnings = heard.warnings();
+            assert!(
+                warnings.iter().any(|w| w.contains(difference)),
+                "{warnings:?} {error:?}"
+            );
+        }
     }
 }

@@ -33,7 +33,8 @@ pub struct Fault {
     pub lasts: Option<f64>,
     /// The keys of this fault kind, as TOML.
     pub keys: Vec<(&'static str, String)>,
-    pub device: Option<(u16, String)>,
+    /// Its position, and its name with those of its axes.
+    pub device: Option<(u16, Vec<String>)>,
     pub effect: Effect,
 }
 
@@ -60,8 +61,8 @@ impl Fault {
         self
     }
 
-    pub fn device(mut self, position: u16, name: &str) -> Self {
-        self.device = Some((position, name.to_string()));
+    pub fn device(mut self, position: u16, names: Vec<String>) -> Self {
+        self.device = Some((position, names));
         self
     }
 
@@ -79,7 +80,7 @@ impl Fault {
         let named = self
             .device
             .as_ref()
-            .is_some_and(|of| text.contains(&format!("`{}`", of.1)));
+            .is_some_and(|of| of.1.iter().any(|name| text.contains(&format!("`{name}`"))));
         let cause = report.cause.as_str();
         let silence = matches!(cause, "silence" | "nobody-answers")
             || [
@@ -101,11 +102,16 @@ impl Fault {
             "link-break" | "power-off" | "absent" => named || first && silence,
             // A drive in a mode of motion reports RxPDO timeout (docs/drive-motion.md).
             "watchdog" => {
-                let words = ["atchdog", "0x8250", "0x8180"];
+                let words = ["atchdog", "0x8250", "0x8180", "0xf8250"];
                 named && (cause == "watchdog" || words.iter().any(|word| text.contains(word)))
             }
             "sync-late" => named && (cause == "sync" || text.contains("ync")),
-            "other-main-device" => cause == "other-main-device" || text.contains("MainDevice"),
+            "other-main-device" => {
+                cause == "other-main-device"
+                    || ["MainDevice", "another program"]
+                        .iter()
+                        .any(|word| text.contains(word))
+            }
             "drive-fault" => {
                 let code = self.value("code").unwrap_or_default();
                 named && (text.contains(code) || text.contains("drive fault"))
@@ -115,6 +121,11 @@ impl Fault {
             _ => named,
         }
     }
+}
+
+/// True for a property of the simulated drive, which is in the machine file.
+fn is_quirk(fault: &Fault) -> bool {
+    fault.kind.starts_with("quirk ")
 }
 
 /// The relevant texts of a report.
@@ -133,7 +144,7 @@ fn ms(seconds: f64) -> String {
 /// Returns the script as TOML text.
 pub fn script(seed: u64, faults: &[Fault]) -> String {
     let mut text = format!("seed = {}\n", seed % 1_000_000);
-    for fault in faults {
+    for fault in faults.iter().filter(|fault| !is_quirk(fault)) {
         let _ = write!(text, "\n[[fault]]\nkind = \"{}\"\n", fault.kind);
         if fault.at > 0.0 {
             let _ = writeln!(text, "at = \"{}\"", ms(fault.at));

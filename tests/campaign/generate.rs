@@ -6,7 +6,9 @@ use std::fmt::Write as _;
 use super::faults::{Effect, Fault, Moment, script};
 use super::random::Random;
 use super::scenes;
+use super::shaft::Feed;
 use super::view::{Axis, CSP, CST, CSV, Machine, PP, PV};
+use super::wire::{Profile, packed};
 
 /// A planned run with the facts that the judge needs.
 #[derive(Debug, Clone)]
@@ -17,10 +19,18 @@ pub struct Plan {
     pub faults: Vec<Fault>,
     /// `--for`, in seconds.
     pub ends_at: f64,
+    /// The program runs once, without a limit of time.
+    pub once: bool,
     /// The machine file itself may cause a failure.
     pub may_fail: bool,
     pub machine_file: String,
     pub fault_script: String,
+    /// Other files in the folder of the machine file.
+    pub files: Vec<(String, String)>,
+    /// The features of this run, for the statistics.
+    pub features: Vec<&'static str>,
+    /// The master on another machine.
+    pub shaft: Option<Feed>,
 }
 
 /// A drive of `configs/esi`: its default process data and its velocity unit.
@@ -71,7 +81,17 @@ pub struct Draft {
     pub may_fail: bool,
     /// Names of I/O devices by position.
     pub passive: Vec<(u16, String)>,
-    devices: String,
+    pub devices: String,
+    /// Keys of `[bus]`.
+    pub bus: String,
+    /// Tables between the devices and the program.
+    pub tables: String,
+    pub once: bool,
+    /// The probability that a drive has a quirk.
+    pub quirks: f64,
+    pub files: Vec<(String, String)>,
+    pub features: Vec<&'static str>,
+    pub shaft: Option<Feed>,
     pub stop: String,
     /// `on_emergency` of axes that are added later.
     pub on_emergency: &'static str,
@@ -91,8 +111,6 @@ pub struct Wanted {
     pub jerk_s: Option<f64>,
     /// Quick stop deceleration 0x6085 in rpm/s.
     pub quick_stop: Option<u32>,
-    /// A user-defined start-up SDO.
-    pub sdo: Option<(u16, i32)>,
     /// Without a range.
     pub endless: bool,
 }
@@ -107,6 +125,10 @@ impl Draft {
                 lost_frames: random.pick(&[2, 3, 3, 3, 5, 8]),
                 pipelined: random.chance(0.2),
                 axes: Vec::new(),
+                terminals: Vec::new(),
+                gantries: Vec::new(),
+                switches: Vec::new(),
+                hold: None,
             },
             random,
             faults: Vec::new(),
@@ -114,6 +136,13 @@ impl Draft {
             may_fail: false,
             passive: Vec::new(),
             devices: String::new(),
+            bus: String::new(),
+            tables: String::new(),
+            once: false,
+            quirks: 0.0,
+            files: Vec::new(),
+            features: Vec::new(),
+            shaft: None,
             stop: String::new(),
             on_emergency: "quick-stop",
             steps: String::new(),
@@ -128,7 +157,7 @@ impl Draft {
     pub fn drive(&mut self, wanted: Wanted) -> usize {
         let random = &mut self.random;
         // The SV1 has its own range and lacks the objects that a scene may require.
-        let free = wanted.every_mode || wanted.quick_stop.is_some() || wanted.sdo.is_some();
+        let free = wanted.every_mode || wanted.quick_stop.is_some();
         let kind = if free || wanted.endless {
             random.pick(&[EPOS4, EPOS4, IDX])
         } else {
@@ -151,8 +180,7 @@ impl Draft {
         let reach = velocity * 1.5;
         let loops = every_mode;
         let name = format!("a{}", self.machine.axes.len());
-        let position = self.next_position;
-        self.next_position += 1;
+        let position = self.place();
 
         let text = &mut self.devices;
         let mode_name = mode_name(mode);
@@ -168,9 +196,6 @@ impl Draft {
         )];
         if let Some(quick_stop) = wanted.quick_stop {
             sdo.push(format!("{{ index = 0x6085, value = {quick_stop} }}"));
-        }
-        if let Some((index, value)) = wanted.sdo {
-            sdo.push(format!("{{ index = {index:#06x}, value = {value} }}"));
         }
         let _ = writeln!(text, "sdo = [{}]", sdo.join(", "));
         if every_mode {
@@ -232,8 +257,13 @@ impl Draft {
             name,
             position,
             mode,
-            outputs: outputs.to_vec(),
-            inputs: inputs.to_vec(),
+            profile: Profile::Cia402,
+            outputs: packed(outputs, 0),
+            inputs: packed(inputs, 0),
+            period: 1,
+            enables: 1,
+            follows_bit: true,
+            goal: None,
             counts,
             velocity_scale: if kind.rpm { rpm } else { counts },
             acceleration_scale: if kind.rpm { rpm } else { 0.0 },
@@ -249,14 +279,22 @@ impl Draft {
             loops,
             may_lose_power: false,
             disturbed: false,
+            node: false,
+            node_fails: false,
             alone: false,
         });
         self.machine.axes.len() - 1
     }
 
-    pub fn io(&mut self) -> u16 {
-        let position = self.next_position;
+    /// Returns the position of the next device.
+    pub fn place(&mut self) -> u16 {
         self.next_position += 1;
+        self.next_position - 1
+    }
+
+    pub fn io(&mut self) -> u16 {
+        let position = self.place();
+        self.machine.terminals.push(position);
         let name = format!("io{position}");
         let _ = write!(
             self.devices,
@@ -270,17 +308,18 @@ impl Draft {
         usize::from(self.next_position)
     }
 
+    /// Returns the names of the device at a position and of its axes.
+    fn names(&self, position: u16) -> Vec<String> {
+        let axes = self.machine.axes.iter();
+        let axes = axes.filter(|axis| axis.position == position);
+        let passive = self.passive.iter().filter(|of| of.0 == position);
+        let names = axes.map(|axis| axis.name.clone());
+        names.chain(passive.map(|of| of.1.clone())).collect()
+    }
+
     /// Name of the device at a position.
     pub fn name(&self, position: u16) -> String {
-        let axis = self
-            .machine
-            .axes
-            .iter()
-            .find(|axis| axis.position == position);
-        let io = self.passive.iter().find(|of| of.0 == position);
-        axis.map(|axis| axis.name.clone())
-            .or(io.map(|of| of.1.clone()))
-            .unwrap_or_default()
+        self.names(position).into_iter().next().unwrap_or_default()
     }
 
     pub fn step(&mut self, lines: &str) {
@@ -316,20 +355,22 @@ impl Draft {
     pub fn fault(&mut self, fault: Fault) {
         if let Some((position, _)) = &fault.device
             && matches!(fault.kind, "load" | "blocked" | "stuck")
-            && let Some(axis) = self
-                .machine
-                .axes
-                .iter_mut()
-                .find(|of| of.position == *position)
         {
-            axis.disturbed = true;
+            let axes = self.machine.axes.iter_mut();
+            let axes = axes.filter(|axis| axis.position == *position);
+            axes.for_each(|axis| axis.disturbed = true);
+        }
+        if let Some((position, _)) = &fault.device {
+            let axes = self.machine.axes.iter_mut();
+            let nodes = axes.filter(|axis| axis.position == *position && axis.node);
+            nodes.for_each(|axis| axis.node_fails = true);
         }
         self.faults.push(fault);
     }
 
     /// Creates a fault of the device at a position.
     pub fn strike(&mut self, kind: &'static str, at: f64, position: u16, effect: Effect) -> Fault {
-        Fault::new(kind, at, effect).device(position, &self.name(position))
+        Fault::new(kind, at, effect).device(position, self.names(position))
     }
 
     fn finish(self, seed: u64, scene: &'static str) -> Plan {
@@ -342,7 +383,9 @@ impl Draft {
         if machine.pipelined {
             file.push_str("exchange = \"pipelined\"\n");
         }
+        file.push_str(&self.bus);
         file.push_str(&self.devices);
+        file.push_str(&self.tables);
         if !self.stop.is_empty() {
             let _ = write!(file, "\n[stop]\n{}", self.stop);
         }
@@ -355,7 +398,11 @@ impl Draft {
             machine: self.machine,
             faults: self.faults,
             ends_at: self.ends_at,
+            once: self.once,
             may_fail: self.may_fail,
+            files: self.files,
+            features: self.features,
+            shaft: self.shaft,
         }
     }
 }

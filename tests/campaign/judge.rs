@@ -1,8 +1,9 @@
 //! Judges a run: the data that reached the drives, and whether exit code and report match.
 
+use super::relations;
 use super::rules;
 use super::stops;
-use super::view::{Machine, Moment, moments};
+use super::view::{Machine, Moment, views};
 use super::wire::{Inputs, Wire};
 
 /// One violated rule.
@@ -29,6 +30,8 @@ pub struct Report {
     pub stop_s: Option<f64>,
     /// True if the stop was a failure.
     pub failed: bool,
+    /// True if the program ran to its end.
+    pub completed: bool,
 }
 
 impl Report {
@@ -70,9 +73,7 @@ impl Findings<'_> {
 
 /// Returns every finding, in the order of the rules.
 pub fn judge(machine: &Machine, wire: &Wire, report: &Report) -> Vec<Finding> {
-    let views: Vec<Vec<Moment>> = (0..machine.axes.len())
-        .map(|drive| moments(machine, wire, drive))
-        .collect();
+    let views = views(machine, wire);
     let stop = stops::machine_stop(machine, wire, report, &views);
     let mut list = Vec::new();
     if let Some(at) = wire.malformed.first() {
@@ -96,5 +97,6 @@ pub fn judge(machine: &Machine, wire: &Wire, report: &Report) -> Vec<Finding> {
         stops::check(machine, axis, view, wire, stop, report, &mut findings);
         list.append(&mut findings.list);
     }
+    list.append(&mut relations::check(machine, wire, &views, stop, report));
     list
 }

@@ -14,14 +14,19 @@
 #![allow(clippy::print_stdout, reason = "figures of the campaign")]
 
 mod by_hand;
+mod contradictions;
+mod determinism;
 mod faults;
+mod features;
 mod generate;
 mod judge;
 mod pcapng;
 mod random;
+mod relations;
 mod rules;
 mod run;
 mod scenes;
+mod shaft;
 mod stops;
 mod tally;
 mod tests;

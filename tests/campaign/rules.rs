@@ -2,7 +2,7 @@
 //! document.
 
 use super::judge::{Finding, Findings};
-use super::view::{Axis, CSP, CST, CSV, Machine, Moment};
+use super::view::{Axis, CSP, CST, CSV, HOMING, Machine, Moment, RECENT, set_points};
 use super::wire::Inputs;
 
 /// A velocity loop adds a bounded part of its own (`docs/axis.md`, "What holds on the wire").
@@ -12,11 +12,29 @@ const TORQUE_SLOPE: f64 = 10.0;
 /// The number of cycles that a set-point continues without an answer (`docs/architecture.md`, "A
 /// lost frame").
 const RUNS_ON: usize = 2;
+/// The cycles for which a command may stay in a state that does not permit it.
+const HELD: usize = 10;
 
 pub fn check(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut Findings<'_>) {
+    let moments = &set_points(axis, moments)[..];
     let mut previous: Option<&Moment> = None;
+    let mut held = 0;
     for moment in moments {
-        controlword(moment, findings);
+        // A command stays while the drive reports a state that it does not have for long.
+        let stays = |last: &Moment| last.sent.controlword == moment.sent.controlword;
+        held = match broken_controlword(moment) {
+            None => 0,
+            Some(_) => held + 1,
+        };
+        let fault = moment.last().is_some_and(Inputs::is_fault);
+        // Words that CiA 402 does not list hold the command for a second.
+        let most = match moment.last().is_some_and(is_unlisted) {
+            true => HELD + usize::try_from(1_000_000_000 / machine.cycle_ns).unwrap_or(usize::MAX),
+            false => HELD,
+        };
+        if held > 0 && (held > most || fault || !previous.is_some_and(stays)) {
+            controlword(moment, findings);
+        }
         mode_before_operation(axis, previous, moment, findings);
         at_rest_before_operation(axis, moment, findings);
         limits(axis, moment, findings);
@@ -33,44 +51,47 @@ pub fn check(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut 
 /// Controlword: a command is sent only in a state from which it causes a transition, as last
 /// reported (IEC 61800-7-201, table 27 and figure 11).
 fn controlword(moment: &Moment, findings: &mut Findings<'_>) {
-    let word = moment.sent.controlword;
-    // The newest reports may have come too late for this cycle.
-    let reports: Vec<Inputs> = moment
-        .recent()
+    let Some(rule) = broken_controlword(moment) else {
+        return;
+    };
+    let words: Vec<String> = reports(moment)
         .iter()
-        .take(2)
-        .copied()
-        .chain(moment.in_time)
+        .map(|report| format!("{:04x}", report.statusword))
         .collect();
+    let word = moment.sent.controlword;
+    let detail = format!("Controlword {word:04x} at Statusword {}", words.join(", "));
+    findings.add(rule, moment, detail);
+}
+
+/// The newest reports may have come too late for this cycle.
+fn reports(moment: &Moment) -> Vec<Inputs> {
+    let recent = moment.recent().iter().take(2).copied();
+    recent.chain(moment.in_time).collect()
+}
+
+/// Neither a state that lasts nor a fault (IEC 61800-7-201, table 30).
+fn is_unlisted(report: &Inputs) -> bool {
+    let lasting = [0x21, 0x23, 0x27, 0x07, 0x40, 0x60];
+    !report.is_fault() && !lasting.contains(&(report.statusword & 0x6f))
+}
+
+fn broken_controlword(moment: &Moment) -> Option<&'static str> {
+    let word = moment.sent.controlword;
+    let reports = reports(moment);
+    if reports.is_empty() {
+        return (word != 0).then_some("controlword-before-report");
+    }
     let any = |allowed: &[u16]| {
         reports
             .iter()
             .any(|report| allowed.contains(&(report.statusword & 0x6f)))
     };
-    let detail = || {
-        let words: Vec<String> = reports
-            .iter()
-            .map(|report| format!("{:04x}", report.statusword))
-            .collect();
-        format!("Controlword {word:04x} at Statusword {}", words.join(", "))
-    };
-    if reports.is_empty() {
-        if word != 0 {
-            findings.add("controlword-before-report", moment, detail());
-        }
-        return;
-    }
     let fault = reports.iter().all(|report| report.is_fault());
     let (ready, on, enabled, quick) = (0x21, 0x23, 0x27, 0x07);
-    if moment.requests_operation() && (fault || !any(&[on, enabled, quick])) {
-        findings.add("controlword", moment, detail());
-    }
-    if word & 0x8f == 0x07 && (fault || !any(&[ready, on, enabled])) {
-        findings.add("controlword", moment, detail());
-    }
-    if word & 0x80 != 0 && !reports.iter().any(|report| report.is_fault()) {
-        findings.add("controlword", moment, detail());
-    }
+    let operation = moment.requests_operation() && (fault || !any(&[on, enabled, quick]));
+    let switch_on = word & 0x8f == 0x07 && (fault || !any(&[ready, on, enabled]));
+    let reset = word & 0x80 != 0 && !reports.iter().any(|report| report.is_fault());
+    (operation || switch_on || reset).then_some("controlword")
 }
 
 /// Operation enabled is requested only after 0x6061 shows the mode (`docs/axis.md`).
@@ -95,16 +116,29 @@ fn mode_before_operation(
     }
 }
 
+/// Before Operation enabled, outputs may follow any of so many reports.
+const FOLLOWED: usize = 4;
+
 /// Before Operation enabled the target is one of the positions reported last, other targets are 0
 /// (`docs/architecture.md`, "An axis never surprises").
 fn at_rest_before_operation(axis: &Axis, moment: &Moment, findings: &mut Findings<'_>) {
-    let reports = moment.recent();
+    let reports = &moment.recent()[..moment.recent().len().min(FOLLOWED)];
+    if moment.asked(axis) == HOMING || moment.shown(axis) == HOMING {
+        return;
+    }
+    // A node that returns is known to be OPERATIONAL only after its reports; until then it gets a
+    // quick stop.
+    if axis.period > 1 && moment.sent.controlword & 0x06 != 0x06 {
+        return;
+    }
     // Bit 9: the drive processes the target.
     let moves = |report: &Inputs| {
         let remote = report.statusword & 0x0200 != 0;
-        report.is_operation_enabled() || report.is_quick_stop() || !remote
+        let listed = report.is_listed();
+        report.is_operation_enabled() || report.is_quick_stop() || !remote || !listed
     };
-    if reports.is_empty() || moment.age > 0 || reports.iter().take(2).any(moves) {
+    let certain = !reports.is_empty() && moment.age == 0 && !moment.doubtful && !axis.node_fails;
+    if !certain || reports.iter().take(2).any(moves) {
         return;
     }
     let sent = &moment.sent;
@@ -130,14 +164,18 @@ fn at_rest_before_operation(axis: &Axis, moment: &Moment, findings: &mut Finding
 }
 
 /// In CSP, CSV and CST bit 12 says that the drive follows its target; until it does, the target is
-/// the actual value (IEC 61800-7-201, 16.3, 17.3 and 18.3).
+/// the actual value (IEC 61800-7-201, 16.3, 17.3 and 18.3). A bit that is lost counts after ten
+/// cycles (`docs/axis.md`).
 fn drive_follows(axis: &Axis, moment: &Moment, findings: &mut Findings<'_>) {
     let reports = moment.recent();
+    if !axis.follows_bit {
+        return;
+    }
     let ignores = |report: &Inputs| {
         let cyclic = matches!(report.mode.unwrap_or(axis.mode), CSP | CSV | CST);
         cyclic && report.is_operation_enabled() && report.statusword & 0x1000 == 0
     };
-    let enough = reports.len() > 3 && reports.iter().all(ignores);
+    let enough = reports.len() == RECENT && reports.iter().all(ignores);
     if !enough || !moment.requests_operation() || moment.age > 0 {
         return;
     }
@@ -195,6 +233,7 @@ fn in_force(axis: &Axis, pair: &[Moment]) -> Option<i8> {
     let certain = now.requests_operation()
         && before.requests_operation()
         && now.is_operation_enabled()
+        && now.has_followed(axis)
         && before.asked(axis) == asked
         && now.shown(axis) == asked;
     certain.then_some(asked)
@@ -212,10 +251,11 @@ fn step(pair: &[Moment]) -> Option<i64> {
 
 /// In CSP a target steps by at most velocity × cycle, and a step changes by at most acceleration ×
 /// cycle² (`docs/axis.md`, "What holds on the wire"). The exception: a set-point freezes after more
-/// than two cycles without an answer (`docs/architecture.md`, "A lost frame"). Late answers count
+/// than two cycles without an answer, also of the other half of a gantry
+/// (`docs/architecture.md`, "A lost frame"). Late answers count
 /// as answers.
 fn positions(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut Findings<'_>) {
-    let most = axis.velocity_step(machine) + 1.0;
+    let most = axis.set_point_step(machine) + 1.0;
     let change = axis.acceleration_step(machine) + 2.0;
     let mut last_step: Option<i64> = None;
     for three in moments.windows(3) {
@@ -233,7 +273,16 @@ fn positions(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut 
             let detail = format!("{from:?} → {to:?}: {step} counts, limit {most:.2}");
             findings.add("csp-step", now, detail);
         }
-        let frozen = step == 0 && now.silent + now.left_out > RUNS_ON;
+        let waits = |moment: &Moment| {
+            let silent = moment.silent.max(moment.half_silent);
+            silent + moment.left_out > RUNS_ON * axis.period
+        };
+        let frozen = step == 0 && (waits(now) || axis.node_fails);
+        // A frozen set-point starts again from rest.
+        let left_out = now.cycle > before.cycle + axis.period;
+        if waits(before) || axis.node && left_out {
+            last_step = last_step.map(|_| 0);
+        }
         let differs = last_step.map_or(0, |last| (step - last).abs());
         if differs as f64 > change * (1.0 + 1e-6) && !frozen {
             let last = last_step.unwrap_or(0);
@@ -312,6 +361,10 @@ fn range(axis: &Axis, moments: &[Moment], findings: &mut Findings<'_>) {
 /// three steps away, after any number of lost frames (`docs/architecture.md`, "A lost frame"). This
 /// also applies if the requested mode changed and came back.
 fn gaps(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut Findings<'_>) {
+    // A gateway holds a target for a SYNC, and its answer does not show what a node received.
+    if axis.period > 1 {
+        return;
+    }
     let step = axis.velocity_step(machine);
     let most = RUNS_ON + machine.answer_to_outputs();
     let mut held: Option<(usize, i32)> = None;
@@ -340,8 +393,18 @@ fn gaps(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut Findi
         let in_csp = answer.mode.unwrap_or(axis.mode) == CSP && answer.is_operation_enabled();
         if let Some((before, last)) = held.filter(|_| in_csp) {
             let cycles = number - before;
+            // Until 0x6061 shows CSP, targets follow the reported positions.
+            let reported = now.recent().windows(2).map(|pair| {
+                let way = pair[0].position.wrapping_sub(pair[1].position);
+                f64::from(way).abs()
+            });
+            let step = match now.shown(axis) {
+                CSP => step,
+                _ => reported.take(3).fold(step, f64::max),
+            };
             let way = f64::from(target.wrapping_sub(last)).abs();
-            let limit = cycles.min(most) as f64 * step + 1.0;
+            // Both targets are rounded.
+            let limit = cycles.min(most) as f64 * step + 2.0;
             if way > limit {
                 let detail = format!(
                     "{last} → {target}: {way} counts, limit {limit:.1}; the drive got the first \

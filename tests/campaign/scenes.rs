@@ -2,6 +2,7 @@
 //! machine, a program and faults; times, sizes and phases are random.
 
 use super::faults::{Effect, Fault, Moment};
+use super::features;
 use super::generate::{Draft, Wanted, mode_name};
 use super::view::{CSP, CST, CSV, PP, PV};
 
@@ -9,7 +10,7 @@ use super::view::{CSP, CST, CSV, PP, PV};
 pub type Scene = (&'static str, fn(&mut Draft));
 
 /// All scenes. Mode changes appear most often, because they have the most phases.
-pub const SCENES: [Scene; 16] = [
+pub const SCENES: [Scene; 32] = [
     ("anything", anything),
     ("two-faults", two_faults),
     ("device-missing", device_missing),
@@ -26,6 +27,22 @@ pub const SCENES: [Scene; 16] = [
     ("groups", groups),
     ("emergency", emergency),
     ("no-fault", no_fault),
+    ("line", features::line),
+    ("gear", features::gear),
+    ("cam", features::cam),
+    ("superimpose", features::superimpose),
+    ("path", features::path),
+    ("table", features::table),
+    ("gantry", features::gantries),
+    ("position-output", features::position_output),
+    ("second-encoder", features::encoder),
+    ("probe", features::touch_probe),
+    ("profile-modes", features::profile_modes),
+    ("gateway-axis", features::gateway_axis),
+    ("sercos", features::sercos_axes),
+    ("hold", features::held),
+    ("line-shaft", features::line_shaft),
+    ("quirks", features::quirks),
 ];
 
 /// An upper bound of the time from the first frame to motion: bring-up and enabling.
@@ -82,7 +99,7 @@ fn program(draft: &mut Draft) {
     draft.turn(0.7);
 }
 
-fn random_fault(draft: &mut Draft, at: f64) -> Fault {
+pub fn random_fault(draft: &mut Draft, at: f64) -> Fault {
     let devices = draft.devices() as u16;
     let random = &mut draft.random;
     let any = random.below(usize::from(devices)) as u16;
@@ -96,7 +113,7 @@ fn random_fault(draft: &mut Draft, at: f64) -> Fault {
     let cycle = draft.machine.seconds();
     let lost = draft.machine.lost_frames;
     let open = Effect::Open;
-    match random.below(16) {
+    match random.below(20) {
         0 => {
             let count = random.pick(&[1, 2, lost - 1, lost, lost + 1, 60]);
             Fault::new(
@@ -150,7 +167,20 @@ fn random_fault(draft: &mut Draft, at: f64) -> Fault {
         13 => draft
             .strike("emergency", at, drive, Effect::None)
             .key("code", "0x5000"),
-        14 => {
+        14 => draft.strike("sto", at, drive, open).lasting(0.1),
+        15 => {
+            let count = random.pick(&[1, 3, 8, 40]);
+            draft
+                .strike("zero-inputs", at, drive, open)
+                .key("count", count)
+        }
+        16 => {
+            let counts = random.pick(&["3", "400", "-90000"]);
+            draft
+                .strike("position-shift", at, drive, open)
+                .key("value", counts)
+        }
+        17 => {
             let lasts = random.pick(&[0.02, 2.0]);
             draft.strike("blocked", at, drive, open).lasting(lasts)
         }
@@ -463,24 +493,14 @@ fn short_break(draft: &mut Draft) {
 /// A drive that displays a mode other than the requested one.
 fn other_mode(draft: &mut Draft) {
     let mode = draft.random.pick(&[CSP, CSV]);
-    let other = draft.random.pick(&[CST, CSP, CSV, PV]);
-    let ignored = draft.random.chance(0.5) || other == mode;
-    let sdo = if ignored {
-        None
-    } else {
-        Some((0x6060, i32::from(other)))
-    };
     let wanted = Wanted {
         mode: Some(mode),
-        sdo,
         endless: true,
         ..Wanted::default()
     };
     draft.drive(wanted);
-    if ignored {
-        let fault = draft.strike("sdo-ignored", 0.0, 0, Effect::Open);
-        draft.fault(fault.key("index", "0x6060").key("sub", 0));
-    }
+    let fault = draft.strike("sdo-ignored", 0.0, 0, Effect::Open);
+    draft.fault(fault.key("index", "0x6060").key("sub", 0));
     draft.turn(0.5);
     draft.may_fail = true;
     draft.ends_at = 0.8;

@@ -1,7 +1,7 @@
 //! The end of motion: rules for the time after a stop of an axis.
 
 use super::judge::{Findings, Report};
-use super::view::{Axis, CSP, CST, CSV, Machine, Moment};
+use super::view::{Axis, CSP, CST, CSV, Machine, Moment, set_points};
 use super::wire::Wire;
 
 /// The cycles from the cause to the outputs that respond to it.
@@ -14,6 +14,8 @@ const TURNS: f64 = 0.05;
 /// Additional time after the ramp: settling (0.1 s, `docs/motion.md`, "Groups") and dead time.
 const SETTLES_S: f64 = 0.15;
 const OP: u8 = 8;
+/// The cycles in which a command to enable may last without power.
+const UNPOWERED: usize = 20;
 
 /// The reason for a stop and its first cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -31,20 +33,22 @@ fn earlier(one: Option<Stop>, other: Option<Stop>) -> Option<Stop> {
 
 /// Finds the cause by which one drive stops its group: a fault while enabled, or no process data
 /// for `lost_frames` cycles (`docs/motion.md`, "Groups").
-fn seen(machine: &Machine, view: &[Moment]) -> Option<Stop> {
+fn seen(machine: &Machine, axis: &Axis, view: &[Moment]) -> Option<Stop> {
+    // An axis behind a gateway takes a report with its next set-point.
+    let later = 2 * (axis.period - 1);
     let mut enabled = false;
     for moment in view {
         let fault = moment.last().is_some_and(|report| report.is_fault());
         if enabled && fault {
             return Some(Stop {
-                cycle: moment.cycle,
+                cycle: moment.cycle + later,
                 why: "drive fault",
             });
         }
         let missing = moment.silent >= machine.lost_frames;
         if enabled && missing && moment.requests_operation() {
             return Some(Stop {
-                cycle: moment.cycle,
+                cycle: moment.cycle + later,
                 why: "no process data",
             });
         }
@@ -73,7 +77,7 @@ pub fn machine_stop(
     let mut stop = reported;
     for (axis, view) in machine.axes.iter().zip(views) {
         if !axis.alone {
-            stop = earlier(stop, seen(machine, view));
+            stop = earlier(stop, seen(machine, axis, view));
         }
     }
     stop
@@ -88,14 +92,17 @@ pub fn check(
     report: &Report,
     findings: &mut Findings<'_>,
 ) {
+    let sent = &set_points(axis, view)[..];
     if let Some(stop) = stop {
-        speeds(machine, axis, view, stop, findings);
-        duration(machine, axis, view, stop, findings);
+        speeds(machine, axis, sent, stop, findings);
+        duration(machine, axis, sent, stop, findings);
         enabled_again(axis, view, stop, findings);
     }
     power(machine, axis, view, report, findings);
+    power_lost(axis, view, report, findings);
+    enabled_too_often(axis, view, findings);
     op_left(machine, axis, view, wire, report, findings);
-    silence(machine, view, findings);
+    silence(machine, axis, view, findings);
     reported(machine, axis, view, report, findings);
     end(view, findings);
 }
@@ -112,7 +119,7 @@ fn speeds(
     stop: Stop,
     findings: &mut Findings<'_>,
 ) {
-    let from = stop.cycle + REACTION + machine.answer_to_outputs();
+    let from = stop.cycle + REACTION * axis.period + machine.answer_to_outputs();
     let mut slowest: Option<(i8, i64)> = None;
     let rounding = axis.velocity_scale * axis.velocity * 0.001;
     for pair in view.windows(2).filter(|pair| pair[0].cycle >= from) {
@@ -168,7 +175,7 @@ fn duration(
 ) {
     let ramp = axis.velocity / axis.acceleration + axis.acceleration / axis.jerk;
     let cycles = (ramp + SETTLES_S) / machine.seconds();
-    let last = stop.cycle + cycles as usize + REACTION + machine.answer_to_outputs();
+    let last = stop.cycle + cycles as usize + REACTION * axis.period + machine.answer_to_outputs();
     let Some(after) = view.iter().position(|moment| moment.cycle >= last) else {
         return;
     };
@@ -197,7 +204,7 @@ fn duration(
 
 /// After a stop of the machine nothing is enabled again (`docs/motion.md`, "Groups").
 fn enabled_again(axis: &Axis, view: &[Moment], stop: Stop, findings: &mut Findings<'_>) {
-    let from = stop.cycle + REACTION;
+    let from = stop.cycle + REACTION * axis.period;
     let mut lost = None;
     for moment in view
         .iter()
@@ -290,8 +297,8 @@ fn op_left(
 
 /// Operation enabled is no longer requested from a drive without answers for `lost_frames` cycles
 /// (`docs/machine-file.md`, `stop.bus_lost`).
-fn silence(machine: &Machine, view: &[Moment], findings: &mut Findings<'_>) {
-    let most = machine.lost_frames + REACTION;
+fn silence(machine: &Machine, axis: &Axis, view: &[Moment], findings: &mut Findings<'_>) {
+    let most = machine.lost_frames + REACTION * axis.period;
     let silent = |moment: &&Moment| moment.silent > most && moment.requests_operation();
     if let Some(moment) = view.iter().find(silent) {
         let detail = format!("without an answer for {} cycles", moment.silent);
@@ -326,6 +333,62 @@ fn reported(
         }
         let state = moment.last().map_or(0, |report| report.statusword & 0x6f);
         enabled = matches!(state, 0x27 | 0x07);
+    }
+}
+
+/// A drive that was in Operation enabled and reports another state has lost its power: the axis takes
+/// the command to enable back, and a run that goes on without the axis does not end well. An
+/// unlisted Statusword says nothing about the power (`docs/stops.md`).
+fn power_lost(axis: &Axis, view: &[Moment], report: &Report, findings: &mut Findings<'_>) {
+    let mut since: Option<usize> = None;
+    let mut enabled = false;
+    for moment in view {
+        let state = moment.last().map_or(0, |report| report.statusword & 0x6f);
+        let listed = matches!(state, 0x00 | 0x20 | 0x40 | 0x60 | 0x21 | 0x23);
+        let lost = enabled && moment.requests_operation() && listed;
+        if moment.age > 0 {
+            continue;
+        }
+        since = if lost {
+            since.or(Some(moment.cycle))
+        } else {
+            None
+        };
+        let cycles = since.map_or(0, |since| moment.cycle - since);
+        if cycles > UNPOWERED * axis.period {
+            let detail = format!("Statusword {state:02x} for {cycles} cycles while enabled");
+            findings.add("operation-requested-without-power", moment, detail);
+            return;
+        }
+        if lost && report.exit == 0 && !axis.alone && !axis.node_fails {
+            findings.add(
+                "exit-0-after-power-loss",
+                moment,
+                format!("Statusword {state:02x}"),
+            );
+        }
+        enabled = moment.requests_operation() && (enabled || moment.is_operation_enabled());
+    }
+}
+
+/// Power returns by a command only: the program has as many as the drive gets power.
+fn enabled_too_often(axis: &Axis, view: &[Moment], findings: &mut Findings<'_>) {
+    let mut count = 0;
+    let mut powered = false;
+    for moment in view.iter().filter(|moment| moment.age == 0) {
+        let Some(report) = moment.last() else {
+            continue;
+        };
+        let enabled = report.is_operation_enabled();
+        // A gateway that restarts shows a powered drive again, without a command to it.
+        count += usize::from(enabled && !powered && moment.requests_operation());
+        // A quick stop that ends in motion continues the same power.
+        powered = enabled || powered && report.is_quick_stop();
+        if count > axis.enables && !axis.node_fails {
+            let detail = format!("{count} times, the program has {}", axis.enables);
+            findings.add("power-without-command", moment, detail);
+            return;
+        }
     }
 }
 

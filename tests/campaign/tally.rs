@@ -16,6 +16,7 @@ pub struct Tally {
     cycles: usize,
     exits: BTreeMap<i32, usize>,
     faults: BTreeMap<&'static str, usize>,
+    features: BTreeMap<&'static str, usize>,
     pub right: usize,
     /// Runs whose report names no fault of the script.
     pub wrong: Vec<String>,
@@ -32,6 +33,9 @@ impl Tally {
         *self.exits.entry(outcome.exit).or_default() += 1;
         for fault in &plan.faults {
             *self.faults.entry(fault.kind).or_default() += 1;
+        }
+        for feature in &plan.features {
+            *self.features.entry(feature).or_default() += 1;
         }
         let (seed, scene) = (plan.seed, plan.scene);
         let kinds: Vec<&str> = plan.faults.iter().map(|fault| fault.kind).collect();
@@ -67,6 +71,7 @@ impl fmt::Display for Tally {
             cycles,
             exits,
             faults,
+            features,
             right,
             ..
         } = self;
@@ -78,6 +83,7 @@ impl fmt::Display for Tally {
         )?;
         writeln!(f, "exit codes {exits:?}")?;
         writeln!(f, "faults {faults:?}")?;
+        writeln!(f, "features {features:?}")?;
         writeln!(f, "causes: {right} of {failed} name a fault of the script")?;
         for line in &self.wrong {
             writeln!(f, "  {line}")?;

@@ -4,8 +4,8 @@
 use super::by_hand::{CYCLE, INPUTS, OUTPUTS, Row, recording};
 use super::judge::{Finding, Report, judge};
 use super::pcapng::{self, Packet};
-use super::view::{Axis, CSP, CSV, Machine};
-use super::wire::{self, DriveLayout};
+use super::view::{Axis, CSP, CSV, Machine, Moment, Switch, views};
+use super::wire::{self, Profile, packed};
 
 const ENABLED: u16 = 0x1237;
 
@@ -20,8 +20,13 @@ fn machine() -> Machine {
             name: "x".to_string(),
             position: 1,
             mode: CSP,
-            outputs: OUTPUTS.to_vec(),
-            inputs: INPUTS.to_vec(),
+            profile: Profile::Cia402,
+            outputs: packed(&OUTPUTS, 0),
+            inputs: packed(&INPUTS, 0),
+            period: 1,
+            enables: 1,
+            follows_bit: true,
+            goal: None,
             counts: 2000.0,
             velocity_scale: 60.0,
             acceleration_scale: 60.0,
@@ -33,8 +38,14 @@ fn machine() -> Machine {
             loops: false,
             may_lose_power: false,
             disturbed: false,
+            node: false,
+            node_fails: false,
             alone: false,
         }],
+        terminals: Vec::new(),
+        gantries: Vec::new(),
+        switches: Vec::new(),
+        hold: None,
     }
 }
 
@@ -110,13 +121,8 @@ impl Case {
     fn findings(&self) -> Vec<Finding> {
         let file = recording(&self.rows, &self.al_control);
         let packets: Vec<Packet<'_>> = pcapng::packets(&file).expect("a recording");
-        let axis = &self.machine.axes[0];
-        let layout = DriveLayout {
-            position: axis.position,
-            outputs: axis.outputs.clone(),
-            inputs: axis.inputs.clone(),
-        };
-        let wire = wire::read(&packets, &[layout]);
+        let layout = self.machine.axes[0].layout();
+        let wire = wire::read(&packets, &[layout], &[]);
         assert_eq!(wire.cycles.len(), self.rows.len());
         judge(&self.machine, &wire, &self.report)
     }
@@ -435,6 +441,121 @@ fn judge_finds_unreported_failures() {
 }
 
 #[test]
+fn judge_finds_power_without_a_command() {
+    let mut lost = Case::new(40);
+    let from = turning(40);
+    for row in &mut lost.rows[from..from + 30] {
+        row.answer = row.answer.map(|of| (0x0250, of.1, of.2));
+    }
+    lost.breaks("operation-requested-without-power");
+    lost.breaks("exit-0-after-power-loss");
+    let mut again = Case::new(40).failed();
+    for (number, row) in again.rows[from..from + 30].iter_mut().enumerate() {
+        row.controlword = if number < 26 { 0x06 } else { 0x0f };
+        row.answer = row.answer.map(|of| (0x0231, of.1, of.2));
+    }
+    again.breaks("power-without-command");
+    again.machine.axes[0].enables = 2;
+    let rules = again.findings();
+    assert!(rules.iter().all(|of| of.rule != "power-without-command"));
+}
+
+#[test]
+fn judge_finds_a_program_that_ends_elsewhere() {
+    let mut case = Case::new(40);
+    case.report.completed = true;
+    let position = case.rows.iter().rev().find(|row| row.controlword == 0x0f);
+    let position = f64::from(position.expect("enabled").position);
+    case.machine.axes[0].goal = Some(position / 2000.0);
+    case.is_clean();
+    case.machine.axes[0].goal = Some((position + 20.0) / 2000.0);
+    case.breaks("done-elsewhere");
+}
+
+/// Returns views of two halves: the second one is `offset` counts off from a cycle on.
+fn halves(offset: i32, from: usize) -> (Machine, Vec<Vec<Moment>>) {
+    let case = Case::new(40);
+    let file = recording(&case.rows, &[]);
+    let packets = pcapng::packets(&file).expect("a recording");
+    let wire = wire::read(&packets, &[case.machine.axes[0].layout()], &[]);
+    let view = views(&case.machine, &wire).swap_remove(0);
+    let mut other = view.clone();
+    for moment in &mut other[from..] {
+        moment.sent.position = moment.sent.position.map(|position| position + offset);
+    }
+    let mut machine = machine();
+    machine.axes.push(machine.axes[0].clone());
+    machine.gantries = vec![[0, 1]];
+    (machine, vec![view, other])
+}
+
+fn relations(machine: &Machine, views: &[Vec<Moment>]) -> Vec<&'static str> {
+    let wire = wire::Wire::default();
+    let found = super::relations::check(machine, &wire, views, None, &Report::default());
+    found.iter().map(|finding| finding.rule).collect()
+}
+
+#[test]
+fn judge_finds_halves_of_a_gantry_that_part() {
+    let (machine, views) = halves(100, 0);
+    assert!(relations(&machine, &views).is_empty());
+    let (machine, views) = halves(2, turning(40));
+    assert_eq!(relations(&machine, &views), ["gantry-apart"]);
+    let (machine, mut views) = halves(0, 0);
+    for moment in &mut views[1][turning(40)..] {
+        moment.sent.controlword = 0x02;
+    }
+    assert_eq!(relations(&machine, &views), ["gantry-half-alone"]);
+}
+
+/// Returns what the rules say of an output that is on in these cycles, for a range that the axis
+/// passes. `homes`: its positions are undefined before it is homed.
+fn switched(homes: bool, on: impl Fn(usize, &Moment) -> bool) -> Vec<&'static str> {
+    let (mut machine, mut views) = halves(0, 0);
+    machine.gantries.clear();
+    (machine.axes, views) = (vec![machine.axes[0].clone()], vec![views.swap_remove(0)]);
+    machine.terminals = vec![2];
+    machine.switches = vec![Switch {
+        terminal: 0,
+        bit: 3,
+        axis: 0,
+        ranges: vec![[900.0, 1700.0]],
+        lead_s: 0.0,
+        homes,
+    }];
+    let mut wire = wire::Wire::default();
+    for moment in &views[0] {
+        let sent = Some(u8::from(on(moment.cycle, moment)) << 3);
+        wire.cycles.push(wire::Cycle {
+            at: moment.at,
+            back: None,
+            complete: true,
+            drives: Vec::new(),
+            terminals: vec![wire::Terminal { sent, heard: None }],
+        });
+    }
+    let found = super::relations::check(&machine, &wire, &views, None, &Report::default());
+    found.iter().map(|finding| finding.rule).collect()
+}
+
+#[test]
+fn judge_finds_outputs_that_are_wrong() {
+    let inside = |moment: &Moment| (900..1700).contains(&moment.sent.position.unwrap_or(0));
+    let powered = |moment: &Moment| moment.requests_operation();
+    let right = |_: usize, moment: &Moment| inside(moment) && powered(moment);
+    assert!(switched(false, right).is_empty());
+    assert!(switched(true, |_, _| false).is_empty());
+    assert_eq!(switched(true, right), ["output-undefined"]);
+    assert_eq!(switched(false, |_, _| false), ["output-missing"]);
+    assert_eq!(
+        switched(false, |cycle, _| cycle == 1),
+        ["output-without-power"]
+    );
+    let late = |_: usize, moment: &Moment| powered(moment) && moment.sent.position > Some(900);
+    assert_eq!(switched(false, late), ["output-outside"]);
+}
+
+#[test]
 fn judge_does_not_read_outputs_as_inputs_of_a_missing_device() {
     let mut case = Case::new(40);
     // Another device is missing: the working counter is wrong, but the drive's inputs are valid.
@@ -448,16 +569,7 @@ fn judge_does_not_read_outputs_as_inputs_of_a_missing_device() {
     row.answer = Some((row.controlword, row.mode, row.position));
     let file = recording(&case.rows, &[]);
     let packets = pcapng::packets(&file).expect("a recording");
-    let axis = &case.machine.axes[0];
-    let (outputs, inputs) = (axis.outputs.clone(), axis.inputs.clone());
-    let wire = wire::read(
-        &packets,
-        &[DriveLayout {
-            position: 1,
-            outputs,
-            inputs,
-        }],
-    );
+    let wire = wire::read(&packets, &[case.machine.axes[0].layout()], &[]);
     assert!(wire.cycles[from].drives[0].expect("sent").heard.is_none());
     assert!(!wire.cycles[from].complete);
 }
@@ -467,7 +579,7 @@ fn damaged_recordings_are_refused_and_never_panic() {
     let file = recording(&fault_report(10), &[]);
     for end in 0..file.len().min(2000) {
         if let Ok(packets) = pcapng::packets(&file[..end]) {
-            wire::read(&packets, &[]);
+            wire::read(&packets, &[], &[]);
         }
     }
     assert!(pcapng::packets(&file[..file.len() - 1]).is_err());

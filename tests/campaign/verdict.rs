@@ -51,11 +51,15 @@ pub fn report(exit: i32, result: &Value, outcome: &mut Outcome) -> Report {
     let stop = events.iter().find(is_stop);
     let stop_s = stop.and_then(|event| event["at_s"].as_f64());
     let failed = stop.is_some_and(|event| event["failure"] == Value::Bool(true));
+    let runs = result.pointer("/summary/program_runs");
+    let interrupted = result.pointer("/summary/interrupted") == Some(&Value::Bool(true));
+    let completed = !interrupted && runs.and_then(Value::as_u64).is_some_and(|runs| runs > 0);
     Report {
         exit,
         text: said,
         stop_s,
         failed,
+        completed,
     }
 }
 

@@ -1,6 +1,6 @@
 //! The data that one drive received, and the data that its MainDevice could know at that time.
 
-use super::wire::{Cycle, Inputs, Outputs, Wire};
+use super::wire::{Cycle, DriveLayout, Inputs, Outputs, Place, Profile, Wire};
 
 /// CiA 402 modes of operation (IEC 61800-7-201, table 41).
 pub const CSP: i8 = 8;
@@ -8,9 +8,13 @@ pub const CSV: i8 = 9;
 pub const CST: i8 = 10;
 pub const PP: i8 = 1;
 pub const PV: i8 = 3;
+pub const HOMING: i8 = 6;
 
-/// The number of kept reports: outputs may follow any of the last ones.
-const RECENT: usize = 4;
+/// Cycles in which a report that a drive cannot mean does not count.
+const DOUBTED: usize = 5;
+
+/// The number of kept reports.
+pub const RECENT: usize = 12;
 
 /// The machine as the generator wrote it.
 #[derive(Debug, Clone)]
@@ -19,6 +23,28 @@ pub struct Machine {
     pub lost_frames: usize,
     pub pipelined: bool,
     pub axes: Vec<Axis>,
+    /// The positions of devices without a drive.
+    pub terminals: Vec<u16>,
+    /// The halves of gantries, as indices of axes.
+    pub gantries: Vec<[usize; 2]>,
+    pub switches: Vec<Switch>,
+    /// The input that holds the machine: index of the terminal, and bit.
+    pub hold: Option<(usize, u8)>,
+}
+
+/// An output that is on while the target of an axis is in a range.
+#[derive(Debug, Clone)]
+pub struct Switch {
+    /// The index of the terminal.
+    pub terminal: usize,
+    pub bit: u8,
+    /// The index of the axis.
+    pub axis: usize,
+    /// Ranges in counts, from inclusive to exclusive.
+    pub ranges: Vec<[f64; 2]>,
+    pub lead_s: f64,
+    /// The positions of the axis are undefined until it is homed.
+    pub homes: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -26,8 +52,17 @@ pub struct Axis {
     pub name: String,
     pub position: u16,
     pub mode: i8,
-    pub outputs: Vec<u16>,
-    pub inputs: Vec<u16>,
+    pub profile: Profile,
+    pub outputs: Vec<Place>,
+    pub inputs: Vec<Place>,
+    /// The cycles of a set-point: 1, or those of the gateway's SYNC.
+    pub period: usize,
+    /// How often the program may give power.
+    pub enables: usize,
+    /// The drive serves Statusword bit 12, or the file says so.
+    pub follows_bit: bool,
+    /// The position in units at which the program ends, if it ends.
+    pub goal: Option<f64>,
     /// Counts per unit, and the values of 0x60FF and 0x6083 for one unit/s and one unit/s².
     pub counts: f64,
     pub velocity_scale: f64,
@@ -44,6 +79,11 @@ pub struct Axis {
     pub may_lose_power: bool,
     /// The script applies a torque to the shaft.
     pub disturbed: bool,
+    /// The axis is a node behind a gateway.
+    pub node: bool,
+    /// A fault of the script concerns the gateway of the axis or its node: what it reports is not of the
+    /// node in every cycle.
+    pub node_fails: bool,
     /// The axis is in a group that stops alone.
     pub alone: bool,
 }
@@ -54,9 +94,24 @@ impl Axis {
         self.velocity * self.counts * machine.seconds()
     }
 
-    /// Returns the change of the step per cycle at the acceleration limit.
+    /// Returns the counts per set-point at the velocity limit.
+    pub fn set_point_step(&self, machine: &Machine) -> f64 {
+        self.velocity_step(machine) * self.period as f64
+    }
+
+    /// Returns the change of the step per set-point at the acceleration limit.
     pub fn acceleration_step(&self, machine: &Machine) -> f64 {
-        self.acceleration * self.counts * machine.seconds().powi(2)
+        let seconds = machine.seconds() * self.period as f64;
+        self.acceleration * self.counts * seconds.powi(2)
+    }
+
+    pub fn layout(&self) -> DriveLayout {
+        DriveLayout {
+            position: self.position,
+            profile: self.profile,
+            outputs: self.outputs.clone(),
+            inputs: self.inputs.clone(),
+        }
     }
 }
 
@@ -84,6 +139,8 @@ pub struct Moment {
     pub cycle: usize,
     pub at: u64,
     pub sent: Outputs,
+    /// A report in [`RECENT`] cycles had values that the drive cannot mean.
+    pub doubtful: bool,
     /// The last reports, newest first; only the first `heard` are valid.
     recent: [Inputs; RECENT],
     heard: usize,
@@ -93,6 +150,9 @@ pub struct Moment {
     pub age: usize,
     /// Consecutive cycles without any answer, even a late one.
     pub silent: usize,
+    /// Likewise of the other half of a gantry, whose set-points wait together (`docs/motion.md`,
+    /// gantries).
+    pub half_silent: usize,
     /// Whole cycles that were skipped before this one.
     pub left_out: usize,
     /// The reported speed in counts per cycle: the least of the last three, 0 if their signs
@@ -120,6 +180,18 @@ impl Moment {
             .is_some_and(|report| report.is_operation_enabled())
     }
 
+    /// The last report shows that the drive follows its targets, if it shows that at all.
+    pub fn follows(&self, axis: &Axis) -> bool {
+        let shown = |report: &Inputs| report.statusword & 0x1000 != 0;
+        !axis.follows_bit || self.last().is_some_and(shown)
+    }
+
+    /// One of the last reports shows that: a drive may lose the bit for ten cycles.
+    pub fn has_followed(&self, axis: &Axis) -> bool {
+        let shown = |report: &Inputs| report.statusword & 0x1000 != 0;
+        !axis.follows_bit || self.recent().iter().any(shown)
+    }
+
     pub fn asked(&self, axis: &Axis) -> i8 {
         self.sent.mode.unwrap_or(axis.mode)
     }
@@ -136,6 +208,17 @@ impl Inputs {
         self.statusword & 0x6f == 0x27
     }
 
+    /// True for a state of the table (IEC 61800-7-201, table 29).
+    pub fn is_listed(&self) -> bool {
+        matches!(self.statusword & 0x4f, 0x00 | 0x40 | 0x0f | 0x08)
+            || matches!(self.statusword & 0x6f, 0x21 | 0x23 | 0x27 | 0x07)
+    }
+
+    /// Not ready to switch on.
+    fn is_starting(&self) -> bool {
+        self.statusword & 0x4f == 0
+    }
+
     pub fn is_quick_stop(&self) -> bool {
         self.statusword & 0x6f == 0x07
     }
@@ -146,17 +229,18 @@ impl Inputs {
 }
 
 /// Returns every cycle in which the drive was in the process data.
-pub fn moments(machine: &Machine, wire: &Wire, drive: usize) -> Vec<Moment> {
+fn moments(machine: &Machine, wire: &Wire, drive: usize) -> Vec<Moment> {
     let mut moments: Vec<Moment> = Vec::new();
+    let period = machine.axes[drive].period;
     let delay = machine.answer_to_outputs();
-    let mut reports: Vec<(usize, Inputs)> = Vec::new();
+    let mut reports = Reports::default();
     let (mut age, mut silent, mut in_time) = (0, 0, None);
     for (number, cycle) in wire.cycles.iter().enumerate() {
         if let Some(due) = number.checked_sub(delay) {
             let answer = wire.cycles[due].drives[drive].and_then(|of| of.heard);
             match answer {
                 Some((back, inputs)) if machine.is_in_time(&wire.cycles[due], back) => {
-                    reports.push((due, inputs));
+                    reports.add(period, due, inputs);
                     (age, in_time) = (0, Some(inputs));
                 }
                 _ => age += 1,
@@ -164,7 +248,7 @@ pub fn moments(machine: &Machine, wire: &Wire, drive: usize) -> Vec<Moment> {
             // The MainDevice computes outputs when the previous cycle has stopped waiting.
             let made = cycle.at.saturating_sub(machine.cycle_ns * 6 / 25);
             silent = silent_cycles(wire, drive, due, made, silent);
-            late_reports(wire, drive, due, cycle.at, &mut reports);
+            reports.add_late(wire, (drive, period), due, cycle.at);
         }
         let Some(exchange) = cycle.drives[drive] else {
             continue;
@@ -174,7 +258,7 @@ pub fn moments(machine: &Machine, wire: &Wire, drive: usize) -> Vec<Moment> {
             .map_or(cycle.at, |of| wire.cycles[of].at);
         let gap = (cycle.at - previous + machine.cycle_ns / 2) / machine.cycle_ns;
         let mut recent = [Inputs::default(); RECENT];
-        let newest = reports.iter().rev().map(|(_, inputs)| *inputs);
+        let newest = reports.list.iter().rev().map(|(_, inputs)| *inputs);
         for (to, inputs) in recent.iter_mut().zip(newest) {
             *to = inputs;
         }
@@ -182,16 +266,53 @@ pub fn moments(machine: &Machine, wire: &Wire, drive: usize) -> Vec<Moment> {
             cycle: number,
             at: cycle.at,
             sent: exchange.sent,
+            doubtful: reports
+                .doubted_at
+                .is_some_and(|at| number < at + RECENT * period),
             recent,
-            heard: reports.len().min(RECENT),
+            heard: reports.list.len().min(RECENT),
             in_time,
             age,
             silent,
+            half_silent: 0,
             left_out: (gap as usize).saturating_sub(1),
-            speed: speed(&reports),
+            speed: speed(&reports.list),
         });
     }
     moments
+}
+
+/// Returns the moments of every drive.
+pub fn views(machine: &Machine, wire: &Wire) -> Vec<Vec<Moment>> {
+    let mut views: Vec<Vec<Moment>> = (0..machine.axes.len())
+        .map(|drive| moments(machine, wire, drive))
+        .collect();
+    for [first, second] in &machine.gantries {
+        for (own, other) in [(*first, *second), (*second, *first)] {
+            let silences: Vec<(usize, usize)> =
+                views[other].iter().map(|m| (m.cycle, m.silent)).collect();
+            for moment in &mut views[own] {
+                let at = silences.binary_search_by_key(&moment.cycle, |(cycle, _)| *cycle);
+                moment.half_silent = at.map_or(0, |at| silences[at].1);
+            }
+        }
+    }
+    views
+}
+
+/// Returns the moments that bring a set-point. Behind a gateway, the outputs stay for a SYNC: the
+/// moments in which they change, and others where they do not change for longer.
+pub fn set_points(axis: &Axis, moments: &[Moment]) -> Vec<Moment> {
+    let mut kept: Vec<Moment> = Vec::new();
+    for moment in moments {
+        let stays = kept.last().is_some_and(|last| {
+            last.sent == moment.sent && moment.cycle < last.cycle + 2 * axis.period
+        });
+        if axis.period == 1 || !stays {
+            kept.push(*moment);
+        }
+    }
+    kept
 }
 
 fn silent_cycles(wire: &Wire, drive: usize, due: usize, now: u64, before: usize) -> usize {
@@ -208,19 +329,46 @@ fn silent_cycles(wire: &Wire, drive: usize, due: usize, now: u64, before: usize)
         .unwrap_or(before + 1)
 }
 
-/// Adds each late report once.
-fn late_reports(
-    wire: &Wire,
-    drive: usize,
-    due: usize,
-    now: u64,
-    reports: &mut Vec<(usize, Inputs)>,
-) {
-    let newest = reports.last().map_or(0, |report| report.0 + 1);
-    for number in newest.max(due.saturating_sub(8))..=due {
-        let answer = wire.cycles[number].drives[drive].and_then(|of| of.heard);
-        if let Some((_, inputs)) = answer.filter(|(back, _)| *back < now) {
-            reports.push((number, inputs));
+/// The reports of a drive, each with its cycle.
+#[derive(Default)]
+struct Reports {
+    list: Vec<(usize, Inputs)>,
+    /// The cycle after that of the last report, also of one that does not count.
+    next: usize,
+    started: bool,
+    doubted: usize,
+    doubted_at: Option<usize>,
+}
+
+impl Reports {
+    /// Adds each late report once.
+    fn add_late(&mut self, wire: &Wire, (drive, period): (usize, usize), due: usize, now: u64) {
+        for number in self.next.max(due.saturating_sub(8))..=due {
+            let answer = wire.cycles[number].drives[drive].and_then(|of| of.heard);
+            if let Some((_, inputs)) = answer.filter(|(back, _)| *back < now) {
+                self.add(period, number, inputs);
+            }
+        }
+    }
+
+    /// Adds a report, unless a gateway repeats it until the next SYNC, or the drive cannot mean it: an
+    /// unlisted Statusword, or Not ready to switch on after the start, for up to five cycles
+    /// (`docs/axis.md`).
+    fn add(&mut self, period: usize, number: usize, inputs: Inputs) {
+        self.next = number + 1;
+        self.started |= !inputs.is_starting();
+        let doubtful = self.started && inputs.is_starting() || !inputs.is_listed();
+        if doubtful {
+            self.doubted_at = Some(number);
+        }
+        if doubtful && self.doubted < DOUBTED * period {
+            self.doubted += 1;
+            return;
+        }
+        self.doubted = 0;
+        let repeats = |last: &(usize, Inputs)| last.1 == inputs && number < last.0 + period;
+        if period == 1 || !self.list.last().is_some_and(repeats) {
+            self.list.push((number, inputs));
         }
     }
 }
@@ -229,6 +377,10 @@ fn speed(reports: &[(usize, Inputs)]) -> f64 {
     let Some(last) = reports.last_chunk::<4>() else {
         return 0.0;
     };
+    // Homing changes the positions.
+    if last.iter().any(|(_, report)| report.mode == Some(HOMING)) {
+        return 0.0;
+    }
     let mut slowest = f64::INFINITY;
     let mut direction = 0.0;
     for pair in last.windows(2) {

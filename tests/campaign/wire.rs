@@ -23,12 +23,46 @@ const PROCESS_RAM: u16 = 0x1000;
 /// The bytes before the first datagram: Ethernet and EtherCAT header.
 const HEADERS: usize = 16;
 
+/// An object at a place of its device's process data, in bytes.
+#[derive(Debug, Clone, Copy)]
+pub struct Place {
+    pub object: u16,
+    pub at: usize,
+}
+
+/// Returns objects that follow one another from a byte on.
+pub fn packed(objects: &[u16], from: usize) -> Vec<Place> {
+    let mut at = from;
+    let place = |&object: &u16| {
+        let place = Place { object, at };
+        at += size(object);
+        place
+    };
+    objects.iter().map(place).collect()
+}
+
+/// The words of a drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Profile {
+    Cia402,
+    /// S-0-0134 and S-0-0135 in place of 0x6040 and 0x6041 (IEC 61800-7-204).
+    Sercos,
+}
+
 /// The judge's knowledge of a drive before it reads the recording.
 #[derive(Debug, Clone)]
 pub struct DriveLayout {
     pub position: u16,
-    pub outputs: Vec<u16>,
-    pub inputs: Vec<u16>,
+    pub profile: Profile,
+    pub outputs: Vec<Place>,
+    pub inputs: Vec<Place>,
+}
+
+/// The first bytes of a device without a drive: outputs as sent, inputs as answered.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Terminal {
+    pub sent: Option<u8>,
+    pub heard: Option<u8>,
 }
 
 /// The output objects as sent.
@@ -69,6 +103,8 @@ pub struct Cycle {
     pub complete: bool,
     /// The exchanges in drive order; `None` while a drive is not in the process data.
     pub drives: Vec<Option<Exchange>>,
+    /// In the order of the terminals.
+    pub terminals: Vec<Terminal>,
 }
 
 /// A write to AL control.
@@ -172,6 +208,8 @@ struct Pending {
 
 struct Reader<'a> {
     drives: &'a [DriveLayout],
+    /// The positions of devices without a drive.
+    terminals: &'a [u16],
     wire: Wire,
     stations: BTreeMap<u16, u16>,
     fmmus: BTreeMap<u16, [u8; FMMU_REGISTERS]>,
@@ -187,10 +225,11 @@ struct Reader<'a> {
 /// The maximum delay in cycles at which a reply is matched by its index.
 const LATEST: usize = 200;
 
-/// Reads the recording of a machine with these drives.
-pub fn read(packets: &[Packet<'_>], drives: &[DriveLayout]) -> Wire {
+/// Reads the recording of a machine with these drives and terminals.
+pub fn read(packets: &[Packet<'_>], drives: &[DriveLayout], terminals: &[u16]) -> Wire {
     let mut reader = Reader {
         drives,
+        terminals,
         wire: Wire::default(),
         stations: BTreeMap::new(),
         fmmus: BTreeMap::new(),
@@ -237,8 +276,19 @@ impl Reader<'_> {
             let writes = |datagram: &&Datagram<'_>| matches!(datagram.command, LWR | LRW);
             let mut found = datagrams.iter().filter(writes);
             if let Some(bytes) = found.find_map(|datagram| region.of(datagram)) {
-                let sent = outputs(&layout.outputs, bytes);
+                let sent = outputs(layout, bytes);
                 self.wire.cycles[cycle].drives[drive] = Some(Exchange { sent, heard: None });
+            }
+        }
+        for (number, position) in self.terminals.iter().enumerate() {
+            let region = self.regions.get(position).and_then(|of| of.outputs);
+            let writes = |datagram: &&Datagram<'_>| matches!(datagram.command, LWR | LRW);
+            let bytes = region.and_then(|of| {
+                let mut found = datagrams.iter().filter(writes);
+                found.find_map(|datagram| of.of(datagram))
+            });
+            if let Some(bytes) = bytes {
+                self.wire.cycles[cycle].terminals[number].sent = bytes.first().copied();
             }
         }
         let (source, index) = (frame[11], datagrams[0].index);
@@ -260,6 +310,7 @@ impl Reader<'_> {
             back: None,
             complete: false,
             drives: vec![None; self.drives.len()],
+            terminals: vec![Terminal::default(); self.terminals.len()],
         });
     }
 
@@ -383,9 +434,17 @@ impl Reader<'_> {
                 if datagram.command == LWR || !full && bytes == as_sent {
                     continue;
                 }
-                let heard = inputs(&layout.inputs, bytes);
                 if let Some(exchange) = &mut self.wire.cycles[pending.cycle].drives[drive] {
+                    let heard = inputs(layout, bytes, &exchange.sent);
                     exchange.heard = Some((at, heard));
+                }
+            }
+            for (number, position) in self.terminals.iter().enumerate() {
+                let region = self.regions.get(position).and_then(|of| of.inputs);
+                let bytes = region.and_then(|of| of.of(datagram));
+                if let Some(bytes) = bytes.filter(|_| datagram.command != LWR && full) {
+                    self.wire.cycles[pending.cycle].terminals[number].heard =
+                        bytes.first().copied();
                 }
             }
         }
@@ -415,35 +474,42 @@ impl Reader<'_> {
 fn size(object: u16) -> usize {
     match object {
         0x6060 | 0x6061 => 1,
-        0x6040 | 0x6041 | 0x6071 | 0x6077 | 0x60b2 => 2,
+        0x6040 | 0x6041 | 0x6071 | 0x6077 | 0x60b2 | 0x60b8 | 0x60b9 => 2,
         _ => 4,
     }
 }
 
 /// Splits the data into its objects.
 fn objects<'a>(
-    layout: &'a [u16],
+    layout: &'a [Place],
     bytes: &'a [u8],
 ) -> impl Iterator<Item = (u16, [u8; 4])> + use<'a> {
-    let mut at = 0;
-    layout.iter().map_while(move |&object| {
+    layout.iter().map_while(move |&Place { object, at }| {
         let piece = bytes.get(at..at + size(object))?;
-        at += piece.len();
         let mut held = [0; 4];
         held[..piece.len()].copy_from_slice(piece);
         Some((object, held))
     })
 }
 
-fn outputs(layout: &[u16], bytes: &[u8]) -> Outputs {
+/// The position mode of drives behind a gateway is CSP.
+fn mode(held: [u8; 4]) -> i8 {
+    match held[0].cast_signed() {
+        -1 => 8,
+        mode => mode,
+    }
+}
+
+fn outputs(layout: &DriveLayout, bytes: &[u8]) -> Outputs {
     let mut outputs = Outputs::default();
-    for (object, held) in objects(layout, bytes) {
+    for (object, held) in objects(&layout.outputs, bytes) {
         let word = u16::from_le_bytes([held[0], held[1]]);
         let long = i32::from_le_bytes(held);
         match object {
+            0x6040 if layout.profile == Profile::Sercos => outputs.controlword = controlword(word),
             0x6040 => outputs.controlword = word,
-            0x6060 => outputs.mode = Some(held[0].cast_signed()),
-            0x607a => outputs.position = Some(long),
+            0x6060 => outputs.mode = Some(mode(held)),
+            0x607a | 0x2062 => outputs.position = Some(long),
             0x60ff => outputs.velocity = Some(long),
             0x6071 => outputs.torque = Some(word.cast_signed()),
             0x6081 => outputs.profile_velocity = Some(long.cast_unsigned()),
@@ -455,15 +521,43 @@ fn outputs(layout: &[u16], bytes: &[u8]) -> Outputs {
     outputs
 }
 
-fn inputs(layout: &[u16], bytes: &[u8]) -> Inputs {
+fn inputs(layout: &DriveLayout, bytes: &[u8], sent: &Outputs) -> Inputs {
     let mut inputs = Inputs::default();
-    for (object, held) in objects(layout, bytes) {
+    for (object, held) in objects(&layout.inputs, bytes) {
+        let word = u16::from_le_bytes([held[0], held[1]]);
         match object {
-            0x6041 => inputs.statusword = u16::from_le_bytes([held[0], held[1]]),
+            0x6041 if layout.profile == Profile::Sercos => {
+                inputs.statusword = statusword(word, sent.controlword);
+            }
+            0x6041 => inputs.statusword = word,
             0x6064 => inputs.position = i32::from_le_bytes(held),
-            0x6061 => inputs.mode = Some(held[0].cast_signed()),
+            0x6061 => inputs.mode = Some(mode(held)),
             _ => {}
         }
     }
     inputs
+}
+
+/// Returns the Controlword that says the same as S-0-0134: bit 15 drive on, bit 14 drive enable, bit
+/// 13 drive halt.
+fn controlword(master_control: u16) -> u16 {
+    match master_control & 0xe000 {
+        0xe000 => 0x000f,
+        0x4000 | 0x6000 => 0x0002,
+        _ => 0x0000,
+    }
+}
+
+/// Returns the Statusword that says the same as S-0-0135: bits 15 and 14 readiness, bit 13 error of
+/// class 1. A drive with torque that is not commanded to be on decelerates.
+fn statusword(drive_status: u16, controlword: u16) -> u16 {
+    match (drive_status >> 14, drive_status & 0x2000 != 0) {
+        (3, false) if controlword & 0x0f == 0x0f => 0x1237,
+        (3, false) => 0x0217,
+        (3, true) => 0x021f,
+        (_, true) => 0x0218,
+        (2, false) => 0x0233,
+        (1, false) => 0x0250,
+        _ => 0x0200,
+    }
 }

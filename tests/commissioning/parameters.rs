@@ -12,7 +12,6 @@ use ecaxis_master::acyclic::image::{with_alias, write};
 use ecaxis_master::acyclic::parameters::compare::compare;
 use ecaxis_master::acyclic::parameters::dictionary;
 use ecaxis_master::acyclic::parameters::restore::restore;
-use ecaxis_master::acyclic::parameters::restore_order::is_setting;
 use ecaxis_master::acyclic::parameters::upload::{UploadResult, collect};
 use ecaxis_master::acyclic::{AlState, al};
 use ecaxis_master::acyclic::{DatagramClient, Registers, device, mailbox};
@@ -24,6 +23,7 @@ use ecaxis_master::link::scan_answers::ScanAnswers;
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::mailbox::worker::EmergencySink;
 use ecaxis_master::mailbox::{CoeClient, Emergencies, FoeClient, MailboxTransport, ObjectList};
+use ecaxis_master::parameters::class::CopyRule;
 use ecaxis_master::parameters::dump::Dump;
 use ecaxis_master::parameters::{DataType, Kind, items};
 use ecaxis_master::report::{Cause, Error};
@@ -322,6 +322,7 @@ async fn everything(wire: &DatagramClient, position: u16, dictionary: &Dictionar
 /// Changes every changeable setting, saves it in a file, and restores it to the other drive.
 fn from_one_to_the_other(machine: Machine) -> (usize, usize) {
     let dictionary = machine.devices[DeviceIndex(0)].selection.dictionary.clone();
+    let rule = CopyRule::to_other_unit(0xfb);
     let work = Box::new(move |link: &mut SimLink| {
         carried(link, async |wire| {
             let before = everything(&wire, 0, &dictionary).await;
@@ -332,7 +333,7 @@ fn from_one_to_the_other(machine: Machine) -> (usize, usize) {
                 for list in [0x1c12, 0x1c13] {
                     let _ = coe.download(&wire, list, 0, false, &[0]).await;
                 }
-                for parameter in before.parameters.iter().filter(|p| is_setting(p)) {
+                for parameter in before.parameters.iter().filter(|p| rule.copies(p)) {
                     let (index, sub) = (parameter.at.index, parameter.at.sub);
                     let mut value = parameter.value.clone();
                     if let (Kind::Unsigned | Kind::Signed, Some(first)) =
@@ -354,7 +355,7 @@ fn from_one_to_the_other(machine: Machine) -> (usize, usize) {
 
             let left = everything(&wire, 0, &dictionary).await;
             let right = everything(&wire, 1, &dictionary).await;
-            let differ = compare(&left.parameters, &right.parameters, false);
+            let differ = compare(&left.parameters, &right.parameters, rule, false);
             assert!(changed > 0 && !differ.is_empty());
             let dump = Dump {
                 parameters: left.parameters,
@@ -367,7 +368,7 @@ fn from_one_to_the_other(machine: Machine) -> (usize, usize) {
                 .expect("there")
                 .1;
             let restored = with_device(&wire, 1, async |coe| {
-                let file = &dump.parameters;
+                let file = (dump.parameters.as_slice(), rule);
                 let done = restore(coe, &wire, &at, Some(&dictionary), file, &mut |_, _| {}).await;
                 done.expect("restored")
             })
@@ -375,20 +376,24 @@ fn from_one_to_the_other(machine: Machine) -> (usize, usize) {
             assert!(restored.complete(), "{restored:?}");
             // Elements beyond the count of a shorter list are not written.
             let meant = differ.iter().filter(|difference| difference.left.is_some());
-            assert_eq!(restored.written, meant.count(), "{restored:?}");
+            assert_eq!(restored.written.len(), meant.count(), "{restored:?}");
 
             let right = everything(&wire, 1, &dictionary).await;
-            let differ_now = compare(&dump.parameters, &right.parameters, false);
+            let differ_now = compare(&dump.parameters, &right.parameters, rule, false);
             assert_eq!(differ_now, []);
             // A second restore has nothing to write.
             let again = with_device(&wire, 1, async |coe| {
-                let file = &dump.parameters;
+                let file = (dump.parameters.as_slice(), rule);
                 let done = restore(coe, &wire, &at, Some(&dictionary), file, &mut |_, _| {}).await;
                 done.expect("restored")
             })
             .await;
-            assert_eq!((again.written, again.complete()), (0, true), "{again:?}");
-            (differ.len(), restored.written)
+            assert_eq!(
+                (again.written.len(), again.complete()),
+                (0, true),
+                "{again:?}"
+            );
+            (differ.len(), restored.written.len())
         })
     });
     on(machine, vec![work])[0]

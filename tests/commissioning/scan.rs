@@ -325,6 +325,39 @@ position = 3
     assert!(ran.out.contains("4 SubDevices"), "{}", ran.out);
 }
 
+/// Slots that are empty on the bus were written as a list that gave them their default modules.
+#[test]
+fn scan_write_keeps_slots_empty() {
+    let bench = Bench::new();
+    for (modules, written) in [
+        ("[\"-\", \"-\"]", "modules = [] # no module is plugged"),
+        ("[]", "modules = [] # no module is plugged"),
+        ("[\"IN8\"]", "modules = [\"IN8\"] # as they are plugged"),
+        ("[\"-\", \"IN8\"]", "modules = [\"-\", \"IN8\"]"),
+    ] {
+        let device = "name = \"block\"\nesi = \"esi/MIO2.xml\"\nposition = 0\n";
+        let text = format!(
+            "enable = false\n[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[[device]]\n{device}modules = {modules}\n"
+        );
+        bench.write("bench.toml", &text);
+        let scan = ["scan", "--sim", "bench.toml", "--esi", "esi", "--force"];
+        bench.well(&[&scan[..], &["--write", "machine.toml"]].concat());
+        let text = bench.read("machine.toml");
+        // The columns depend on the other keys.
+        let words: Vec<&str> = text.split_whitespace().collect();
+        assert!(words.join(" ").contains(written), "{modules}: {text}");
+        for (file, bus) in [
+            ("machine.toml", "bench.toml"),
+            ("bench.toml", "machine.toml"),
+        ] {
+            let compared = bench.well(&["compare", file, "--sim", bus]);
+            assert_eq!(compared, "as in the file\n", "{modules}");
+        }
+        let ran = bench.ecaxis(&["run", "machine.toml", "--virtual", "--for", "50ms"]);
+        assert_eq!(ran.code, 0, "{modules}: {}", ran.err);
+    }
+}
+
 /// A truncated ESI file does not hide the others, and is named.
 #[test]
 fn scan_names_esi_files_that_it_cannot_read() {

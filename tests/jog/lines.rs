@@ -5,7 +5,7 @@ use std::process::Stdio;
 
 use serde_json::Value;
 
-use ecaxis_test_support::program;
+use ecaxis_test_support::{program, root};
 
 /// Returns exit code, standard output and standard error.
 fn script(lines: &str, more: &[&str]) -> (i32, String, String) {
@@ -68,6 +68,64 @@ quit
     }
     let (_, again, _) = script(lines, &[]);
     assert_eq!(again, out, "virtual time is the same every time");
+}
+
+/// The mode of a drive without 0x6061 in its process data is read over CoE. Enabling waits for it,
+/// and the first move is not stopped by it.
+#[test]
+fn first_move_of_a_drive_with_a_hidden_mode_arrives() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let esi = root().join("configs/esi/EPOS4.xml").display().to_string();
+    let text = format!(
+        "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[[device]]\nname = \"a\"\nesi = \"{esi}\"\nposition = 0\n\
+         mode = \"csp\"\npdo.rx = [\"0x6040\", \"0x607A\"]\npdo.tx = [\"0x6041\", \"0x6064\"]\n[device.axis]\n\
+         encoder = 2000\nlimits = {{ velocity = 50.0, acceleration = 500.0 }}\n"
+    );
+    let file = folder.path().join("m.toml");
+    std::fs::write(&file, text).expect("written");
+    let lines = "enable a\nwait\nmove a 2\nwait\nstatus\nmove a 3\nwait\nstatus\n";
+    let (code, out, err) = script_for(file.to_str().expect("text"), lines, &[]);
+    assert_eq!(code, 0, "{err}");
+    let all: Vec<&str> = out.lines().collect();
+    assert_eq!(all[0], "a: enabled", "{out}");
+    for (news, status, position) in [(1, 2, 2.0), (3, 4, 3.0)] {
+        assert_eq!(all[news], "a: is there", "{out}");
+        let (_, rest) = all[status].split_once("CSP, ").expect("a status");
+        let reported: f64 = rest
+            .split_once(' ')
+            .expect("a unit")
+            .0
+            .parse()
+            .expect("a number");
+        assert!((reported - position).abs() < 0.01, "{out}");
+    }
+}
+
+/// Behind a gateway, PP has no profile velocity in the process data.
+#[test]
+fn motion_by_hand_in_pp_is_refused_with_its_reason() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let esi = root().join("configs/esi/gateway.xml").display().to_string();
+    let text = format!(
+        "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[[device]]\nname = \"gateway\"\nesi = \"{esi}\"\n\
+         type = \"GW64\"\nposition = 0\n[device.can]\nsync = \"4ms\"\n[[device.node]]\nid = 6\n\
+         drive = \"EPOS 24/1\"\nmode = \"pp\"\n\
+         outputs = [{{ pdo = 1, at = 12, objects = [\"0x6040\", \"0x607A\"] }}, {{ pdo = 3, at = 18 }}]\n\
+         inputs = [{{ pdo = 1, at = 12, objects = [\"0x6041\", \"0x6064\"] }}, {{ pdo = 3, at = 18 }}]\n\
+         [device.node.axis]\nname = \"b\"\nencoder = 2000\n\
+         limits = {{ velocity = 50.0, acceleration = 250.0 }}\n"
+    );
+    let file = folder.path().join("m.toml");
+    std::fs::write(&file, text).expect("written");
+    for (line, part) in [
+        ("jog b 5", "a jog needs CSP, CSV or PV; the axis is in PP"),
+        ("move b 5", "move it by a program, or use it in CSP"),
+    ] {
+        let lines = format!("enable b\nwait\n{line}\nwait\nstatus\n");
+        let (code, out, err) = script_for(file.to_str().expect("text"), &lines, &[]);
+        assert_eq!(code, 1, "{out}{err}");
+        assert!(err.contains(part), "{err}");
+    }
 }
 
 #[test]

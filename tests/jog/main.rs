@@ -12,7 +12,8 @@ use ecaxis_master::supervise::operator::{
     Activity, HOLD_TO_RUN_TIMEOUT, MAX_MANUAL_SPEED, OperatorInput, Presence, Request,
     RequestEvent, View,
 };
-use ecaxis_test_support::{axes, faults, machine, virtual_time};
+use ecaxis_test_support::recordings::process_images;
+use ecaxis_test_support::{axes, faults, machine, recorded, virtual_time};
 use operator::{Seen, by_hand, here, request};
 
 /// The first two axes.
@@ -95,6 +96,85 @@ fn a_released_axis_brakes() {
     assert_eq!(news, ["enabled", "let go, brakes", "stopped"]);
 }
 
+/// Both axes of `axes(2)` in groups of their own, without which the machine goes on.
+const GROUPS: &str = "\n[[stop.group]]\nname = \"gx\"\naxes = [\"a0\"]\noutside = \"continue\"\n\
+    \n[[stop.group]]\nname = \"gy\"\naxes = [\"a1\"]\noutside = \"continue\"\n";
+
+/// The stop of one group leaves the motions of the others alone: a jog and a move of `X` go on while
+/// the drive of `Y` has a fault or loses its power.
+#[test]
+fn the_stop_of_a_group_does_not_stop_the_others() {
+    let text = format!("{}{GROUPS}", axes(2));
+    for kind in ["drive-fault\"\ncode = 0x8611", "power-off\""] {
+        for jogs in [true, false] {
+            let script = format!("[[fault]]\nkind = \"{kind}\ndevice = 1\nat = \"1.5s\"\n");
+            let folder = tempfile::tempdir().expect("a folder");
+            let (options, recording) = recorded(faults(&script), folder.path());
+            let (mut asked, mut begun) = (false, false);
+            let (_, seen) = by_hand(
+                machine(&text),
+                options,
+                once_enabled(move |_, since| {
+                    if since > 6.0 {
+                        return None;
+                    }
+                    let first = !std::mem::replace(&mut asked, true);
+                    if first {
+                        return Some(request(Request::Enable { axis: Y }));
+                    }
+                    if jogs {
+                        return Some(match since {
+                            ..4.0 => request(Request::Jog {
+                                axis: X,
+                                velocity: 1.0,
+                            }),
+                            _ => here(),
+                        });
+                    }
+                    let go = Request::MoveTo {
+                        axis: X,
+                        position: 4.0,
+                        speed: 0.02,
+                    };
+                    let begins = !std::mem::replace(&mut begun, true);
+                    Some(if begins { request(go) } else { here() })
+                }),
+            );
+            within_limits(&seen, 0);
+            let news: Vec<_> = seen.iter().flat_map(|s| &s.news).collect();
+            let ends = |event: &&&RequestEvent| event.axis() == Some(X);
+            let last = news.iter().rfind(ends).map(ToString::to_string);
+            let expected = if jogs { "stopped" } else { "is there" };
+            assert_eq!(last.as_deref(), Some(expected), "{kind} {jogs}: {news:?}");
+            let way = seen.last().expect("cycles").axes[0].target_position;
+            assert!(way > 3.9, "{kind} {jogs}: {way}");
+            // The drive of `X` received one motion, at 1 turn/s = 2 counts a cycle, and nothing else.
+            let images = process_images(&recording);
+            let first = |(out, _): &(Vec<u8>, Vec<u8>)| {
+                let word = u16::from_le_bytes([out[0], out[1]]);
+                let target = i32::from_le_bytes([out[2], out[3], out[4], out[5]]);
+                (word, target)
+            };
+            let powered: Vec<_> = images.iter().map(first).collect();
+            let enabled = |(word, _): &(u16, i32)| *word == 0x000f;
+            let begin = powered.iter().position(enabled).expect("enabled");
+            let end = powered.iter().rposition(enabled).expect("enabled");
+            let powered = &powered[begin..=end];
+            assert!(powered.iter().all(enabled), "{kind} {jogs}: power was lost");
+            let moves = |three: &&[(u16, i32)]| three[1].1 != three[0].1;
+            let moving = powered.windows(2).filter(moves).count();
+            let starts = powered
+                .windows(3)
+                .filter(|three| three[1].1 == three[0].1 && three[2].1 != three[1].1);
+            let starts = starts.count();
+            assert!(
+                moving > 3900 && starts == 1,
+                "{kind} {jogs}: {moving} cycles, {starts} starts"
+            );
+        }
+    }
+}
+
 #[test]
 fn an_absent_operator_starts_nothing_and_stops_all_motion() {
     for jogs in [true, false] {
@@ -140,6 +220,108 @@ fn an_absent_operator_starts_nothing_and_stops_all_motion() {
         let stands = moving.map(|s| s.time_s).next_back().expect("it moves") - ready;
         assert!((0.5..0.53).contains(&stands), "moves until {stands} s");
     }
+}
+
+/// Nothing brakes a torque that has ended. The drive's quick stop follows after the time of a stop,
+/// and keeps its power until the operator leaves.
+#[test]
+fn a_torque_without_an_operator_ends_in_a_quick_stop() {
+    let text = epos4(
+        r#""0x607A", "0x6071""#,
+        r#""0x6064", "0x606C", "0x6077""#,
+        r#"
+limits = { position = [-1000.0, 1000.0], velocity = 50.0, acceleration = 500.0, jerk = 20000.0, torque = 100.0 }
+[device.sim]
+motor = { viscous_friction = 0.0, coulomb_friction = 1e-5 }
+"#,
+    );
+    let folder = tempfile::tempdir().expect("a folder");
+    let (options, recording) = recorded(virtual_time(), folder.path());
+    let mut next = 0;
+    let (outcome, _) = by_hand(
+        machine(&text),
+        options,
+        once_enabled(move |_, since| {
+            let plan = [
+                (
+                    0.0,
+                    Request::SetMode {
+                        axis: X,
+                        mode: Mode::Cst,
+                    },
+                ),
+                (
+                    0.5,
+                    Request::Torque {
+                        axis: X,
+                        percent: 5.0,
+                        ramp_s: 0.0,
+                    },
+                ),
+            ];
+            if since > 8.0 {
+                return None;
+            }
+            let mut turn = match plan.get(next) {
+                Some((at, wanted)) if since >= *at => {
+                    next += 1;
+                    request(*wanted)
+                }
+                _ => here(),
+            };
+            if since >= 1.5 {
+                turn.presence = Presence::Away;
+            }
+            Some(turn)
+        }),
+    );
+    outcome.result.expect("an ended torque fails no run");
+    // Controlword and torque as received, position and velocity as reported.
+    let cycles: Vec<(u16, i16, i32, i32)> = process_images(&recording)
+        .iter()
+        .filter(|(out, inputs)| out.len().min(inputs.len()) >= 11)
+        .map(|(out, inputs)| {
+            let long =
+                |at: usize| i32::from_le_bytes(inputs[at..at + 4].try_into().expect("four bytes"));
+            let word = u16::from_le_bytes([out[0], out[1]]);
+            (word, i16::from_le_bytes([out[7], out[8]]), long(3), long(7))
+        })
+        .collect();
+    let pushed = cycles
+        .iter()
+        .rposition(|c| c.1 == 50)
+        .expect("a torque of 5 %");
+    let ended = pushed
+        + cycles[pushed..]
+            .iter()
+            .position(|c| c.1 == 0)
+            .expect("it ends");
+    let quick = ended
+        + cycles[ended..]
+            .iter()
+            .position(|c| c.0 != 0x000f)
+            .expect("a stop");
+    assert_eq!(cycles[quick].0, 0x0002);
+    // 100 % in 0.1 s.
+    assert!(
+        (4..=6).contains(&(ended - pushed)),
+        "{} cycles",
+        ended - pushed
+    );
+    let [coasts, last] = [cycles[quick - 1], cycles[cycles.len() - 1]];
+    let turns = f64::from(coasts.3) / 60.0;
+    assert!(turns > 5.0, "it coasts at {turns} turns/s");
+    // Speed ÷ acceleration, acceleration ÷ jerk, and 1 s.
+    let time_s = (quick - pushed) as f64 * CYCLE_S;
+    let most = turns / ACCELERATION + 0.025 + 1.0;
+    assert!(
+        (1.0..most + 0.05).contains(&time_s),
+        "{time_s} s, at most {most} s"
+    );
+    let stands = cycles[quick + 1000];
+    assert_eq!((stands.0, stands.3), (0x0002, 0), "at rest, with power");
+    assert!(stands.2.abs_diff(last.2) <= 1, "{} to {}", stands.2, last.2);
+    assert_eq!(last.0, 0x0000);
 }
 
 #[test]
@@ -379,26 +561,28 @@ fn an_emergency_stop_removes_power_and_requires_a_reset() {
     }
 }
 
+/// An EPOS4 with these extra objects (in addition to Controlword, Statusword and modes) and axis keys.
+fn epos4(rx: &str, tx: &str, keys: &str) -> String {
+    format!(
+        "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"\nposition = 0\nmode = \"csp\"\n\
+         pdo.rx = [\"0x6040\", \"0x6060\", {rx}]\npdo.tx = [\"0x6041\", \"0x6061\", {tx}]\n\
+         [device.axis]\nunit = \"turn\"\nencoder = 2000\n{keys}"
+    )
+}
+
 /// An axis that supports homing and a switch to CSV.
-const VERSATILE: &str = r#"
-[bus]
-nic = "sim"
-cycle = "1ms"
-[[device]]
-name = "x"
-esi = "esi/EPOS4.xml"
-position = 0
-mode = "csp"
-pdo.rx = ["0x6040", "0x6060", "0x607A", "0x60FF"]
-pdo.tx = ["0x6041", "0x6061", "0x6064", "0x606C"]
-[device.axis]
-unit = "turn"
-encoder = 2000
+fn versatile() -> String {
+    epos4(
+        r#""0x607A", "0x60FF""#,
+        r#""0x6064", "0x606C""#,
+        r#"
 limits = { velocity = 50.0, acceleration = 500.0, following_error = 0.5 }
 homing = { method = 17, search = 5.0, zero = 0.5, acceleration = 100.0, position = 3.0 }
 [device.sim]
 track = { negative_limit = -6.0, positive_limit = 6.0, home = [2.0, 2.5], index = 0.25 }
-"#;
+"#,
+    )
+}
 
 #[test]
 fn jog_homes_an_axis_and_switches_its_mode() {
@@ -420,7 +604,7 @@ fn jog_homes_an_axis_and_switches_its_mode() {
     ];
     let mut next = plan.into_iter();
     let (outcome, seen) = by_hand(
-        machine(VERSATILE),
+        machine(&versatile()),
         virtual_time(),
         once_enabled(move |view, since| {
             assert!(since < 20.0, "{:?}", view.hands);
@@ -439,7 +623,7 @@ fn jog_homes_an_axis_and_switches_its_mode() {
     let done: Vec<String> = done.iter().map(ToString::to_string).collect();
     assert_eq!(done, ["enabled", "homed", "is there", "in CSV", "stopped"]);
     let last = &seen.last().expect("seen").axes[0];
-    assert!(last.homed && last.mode == Mode::Csv);
+    assert!(last.homed() && last.mode == Mode::Csv);
     // 2 turns/s for 0.3 s, plus acceleration and deceleration.
     assert!((5.5..6.0).contains(&last.position), "{}", last.position);
 }
@@ -447,7 +631,7 @@ fn jog_homes_an_axis_and_switches_its_mode() {
 #[test]
 fn homing_ends_without_an_operator() {
     let (outcome, seen) = by_hand(
-        machine(VERSATILE),
+        machine(&versatile()),
         virtual_time(),
         once_enabled(|_, since| {
             let mut turn = match since {
@@ -470,12 +654,15 @@ fn homing_ends_without_an_operator() {
     let searched = seen.iter().filter(|s| s.axes[0].velocity.abs() > 1.0);
     let last = searched.map(|s| s.time_s).next_back().expect("it searches") - ready;
     assert!((0.4..0.7).contains(&last), "searches until {last} s");
-    assert!(!seen.last().expect("seen").axes[0].homed);
+    assert!(!seen.last().expect("seen").axes[0].homed());
 }
 
+/// Random requests, with a fault of the second drive in half of the runs: in a group that stops
+/// alone, it ends no motion of the first axis.
 #[test]
 fn random_requests_stay_within_the_limits() {
-    for seed in 1..=12_u64 {
+    for seed in 1..=24_u64 {
+        let groups = seed > 12;
         // xorshift
         let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
         let mut dice = move |sides: u64| {
@@ -486,7 +673,38 @@ fn random_requests_stay_within_the_limits() {
         };
         let mut last_jog = [0.0_f64; 2];
         let mut away = false;
-        let (outcome, seen) = by_hand(machine(&axes(2)), virtual_time(), move |view, now| {
+        // The number of requests, and the last one that may end a motion of `X`: a motion, or not.
+        let (mut count, mut last) = (0, (0, false));
+        let at = 1 + dice(6000);
+        let script = format!(
+            "[[fault]]\nkind = \"drive-fault\"\ncode = 0x8611\ndevice = 1\nat = \"{at}ms\"\n"
+        );
+        let options = faults(if groups { &script } else { "" });
+        let text = format!("{}{}", axes(2), if groups { GROUPS } else { "" });
+        let (outcome, seen) = by_hand(machine(&text), options, move |view, now| {
+            let first = &view.snapshot.axes[X];
+            for event in view.news.iter().filter(|event| event.axis() == Some(X)) {
+                let ended = match event {
+                    // A fault of its own stops its group.
+                    RequestEvent::Failed { why, .. } => {
+                        !why.contains("not reached") && !why.contains("its group has been stopped")
+                    }
+                    RequestEvent::Done { what, .. } => *what == Activity::Stopping,
+                    _ => false,
+                };
+                let unasked = last == (event.request(), true);
+                let healthy = first.trip.is_none() && first.fault.is_none() && !away;
+                assert!(
+                    !(ended && unasked && healthy),
+                    "seed {seed}, {now} s: {event:?}"
+                );
+                // It brakes.
+                let brakes = matches!(
+                    event,
+                    RequestEvent::LetGo { .. } | RequestEvent::Refused { .. }
+                );
+                last.1 &= !brakes;
+            }
             if now > 8.0 {
                 return operator::gone();
             }
@@ -535,6 +753,16 @@ fn random_requests_stay_within_the_limits() {
                     33 => Request::Enable { axis: AxisIndex(7) },
                     _ => continue,
                 };
+                count += 1;
+                let moves = match again {
+                    Request::Jog { velocity, .. } => velocity != 0.0,
+                    Request::MoveBy { .. } | Request::MoveTo { .. } => true,
+                    _ => false,
+                };
+                let stops_all = matches!(again, Request::StopAll | Request::EmergencyStop);
+                if axis == X || stops_all {
+                    last = (count, moves);
+                }
                 turn.requests.push(again);
             }
             turn

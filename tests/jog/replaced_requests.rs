@@ -8,7 +8,7 @@ use ecaxis_master::supervise::operator::{
 };
 
 use super::operator::{Seen, by_hand, gone, here, request};
-use super::{LET_GO_S, VERSATILE, X, Y, once_enabled, within_limits};
+use super::{LET_GO_S, X, Y, once_enabled, versatile, within_limits};
 use ecaxis_test_support::{axes, faults, machine, virtual_time};
 
 /// Jogs for a quarter of a second, sends one other request, then sends no requests.
@@ -65,12 +65,13 @@ fn a_request_that_replaces_a_jog_keeps_the_dead_man_rule_active() {
         Request::Home { axis: X },
     ];
     // The second machine has a range but no homing and no other mode, so it rejects each request.
-    for file in [VERSATILE, &axes(1)] {
+    let versatile = versatile();
+    for file in [&versatile, &axes(1)] {
         for instead in others {
             for presence in [Presence::Here, Presence::Away] {
                 // The versatile machine has no range, so it accepts these moves.
                 let goes = matches!(instead, Request::MoveBy { .. } | Request::MoveTo { .. });
-                if goes && file == VERSATILE && presence == Presence::Here {
+                if goes && *file == versatile && presence == Presence::Here {
                     continue;
                 }
                 let (stands, _) = replaced_by(file, instead, presence);
@@ -161,10 +162,11 @@ fn every_rejection_is_reported() {
 /// A rejected homing counts as finished, so that no caller waits for it.
 #[test]
 fn rejected_homing_counts_as_finished() {
-    let second = VERSATILE.replace(r#"name = "x""#, r#"name = "y""#);
+    let first = versatile();
+    let second = first.replace(r#"name = "x""#, r#"name = "y""#);
     let second = second.replace("position = 0\n", "position = 1\n");
     let (_, second) = second.split_once("[[device]]").expect("a device");
-    let file = format!("{VERSATILE}[[device]]{second}");
+    let file = format!("{first}[[device]]{second}");
     let mut asked = false;
     let (outcome, seen) = by_hand(
         machine(&file),

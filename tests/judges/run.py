@@ -22,7 +22,7 @@ import rig
 from report import Report
 from watch import retry_if_host_stalled
 
-SECTIONS = ["bringup", "overlap", "mailbox", "parameters", "operation", "oddities", "faults", "chain", "ring", "kickcat", "gateway", "ethercrab", "eeproms", "recordings", "page", "reports", "monitoring", "service", "rights", "viewers"]
+SECTIONS = ["bringup", "overlap", "mailbox", "parameters", "operation", "oddities", "quirks", "faults", "chain", "ring", "kickcat", "gateway", "ethercrab", "eeproms", "recordings", "page", "reports", "monitoring", "service", "rights", "viewers"]
 
 
 def main():

@@ -22,6 +22,8 @@ class Pdo:
     sm: int | None
     # (index, sub, bits, name)
     entries: list
+    # The samples of a cycle (ETG.2000, `OSFac`), unless an OpMode says otherwise. An EEPROM describes one.
+    samples: int = 1
 
     @property
     def bits(self):
@@ -108,6 +110,7 @@ def pdos(owner, tag, shift=0, object_shift=0):
             text(element, "Name"),
             int(sm) if sm is not None and sm.strip() else None,
             entries,
+            number(element.get("OSFac") or "1"),
         )
         excluded = {number(e.text) for e in element.findall("Exclude")}
         found.append((pdo, excluded, flag(element, "OverwrittenByModule"), flag(element, "Mandatory")))

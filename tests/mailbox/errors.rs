@@ -105,6 +105,57 @@ fn abort_with_reserved_bits_ends_uploads_and_downloads_with_its_code() {
     }
 }
 
+fn abort_of(index: u16) -> Vec<u8> {
+    abort_at(index, 0)
+}
+
+fn abort_at(index: u16, sub: u8) -> Vec<u8> {
+    let [low, high] = index.to_le_bytes();
+    vec![
+        10, 0, 0, 0, 0, 0x13, 0, 0x20, 0x80, low, high, sub, 0x11, 0, 0x09, 0x06,
+    ]
+}
+
+/// Slave stacks with 16-bit access to the mailbox write the command as a word: the low byte of the
+/// index is lost.
+#[test]
+fn abort_without_the_low_byte_of_the_index_ends_the_transfer() {
+    let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, abort_of(0x6000))]);
+    assert_eq!(error, sdo_error(0x6041, CoeCause::Abort(0x0609_0011)));
+    let (error, _) = download_error(0x2000, LONG, &[Mischief::Replace(1, abort_of(0x2000))]);
+    assert_eq!(error, sdo_error(0x2000, CoeCause::Abort(0x0609_0011)));
+}
+
+#[test]
+fn abort_with_any_index_answers_the_only_request() {
+    let server = server(&[Mischief::Replace(2, abort_of(0x1018))]);
+    let mut client = client();
+    block_on(client.upload(&server, 0x1000, 0, false)).unwrap();
+    let error = block_on(client.upload(&server, 0x6041, 0, false)).unwrap_err();
+    assert_eq!(error, sdo_error(0x6041, CoeCause::Abort(0x0609_0011)));
+}
+
+#[test]
+fn abort_of_an_earlier_request_does_not_answer_the_next() {
+    let server = server(&[Mischief::Skip(1), Mischief::Before(2, abort_of(0x1000))]);
+    let mut client = client();
+    block_on(client.upload(&server, 0x1000, 0, false)).unwrap_err();
+    let value = block_on(client.upload(&server, 0x6041, 0, false)).unwrap();
+    assert_eq!(value, [0x37, 0x02]);
+}
+
+/// A late abort of another subindex is not the answer, also to the first request of a client: an
+/// earlier program may have asked.
+#[test]
+fn abort_of_another_subindex_does_not_answer_while_an_answer_is_late() {
+    for (index, sub) in [(0x6041, 1), (0x6000, 1), (0x6100, 0)] {
+        let server = server(&[Mischief::Before(1, abort_at(index, sub))]);
+        let mut client = client();
+        let value = block_on(client.upload(&server, 0x6041, 0, false)).unwrap();
+        assert_eq!(value, [0x37, 0x02], "{index:#x}:{sub}");
+    }
+}
+
 #[test]
 fn abort_among_segments_ends_the_transfer_at_any_address() {
     let abort = [

@@ -1,6 +1,7 @@
 //! Start-up SDOs: skipped, written, verified.
 
-use ecaxis_esi::StartupSdo;
+use ecaxis_esi::model::{Access, Object, ObjectItem, Writable};
+use ecaxis_esi::{Dictionary, StartupSdo};
 use ecaxis_master::acyclic::DeviceRef;
 use ecaxis_master::bringup::{SdoOutcome, write_startup_sdo};
 use ecaxis_master::config::StartupOptions;
@@ -45,7 +46,10 @@ fn done(
         station: STATION,
     };
     let way = StartupOptions { verify, skip_equal };
-    let done = block_on(write_startup_sdo(&server, &at, &mut client(), sdo, way));
+    let dictionary = Dictionary::default();
+    let mut client = client();
+    let written = write_startup_sdo(&server, &at, &mut client, sdo, way, &dictionary);
+    let done = block_on(written);
     (done.map_err(|error| error.to_string()), server.log().len())
 }
 
@@ -100,4 +104,83 @@ fn errors_name_the_object() {
         reported.contains("0x607d:02 Max position limit"),
         "{reported}"
     );
+}
+
+/// A record of two settings, as the ESI describes it.
+fn record(index: u16) -> Dictionary {
+    let item = |sub, bit_offset, bit_len, write| ObjectItem {
+        sub,
+        bit_offset,
+        bit_len,
+        access: Access { read: true, write },
+        ..ObjectItem::default()
+    };
+    let items = vec![
+        item(0, 0, 8, Writable::Never),
+        item(1, 16, 16, Writable::Always),
+        item(2, 32, 32, Writable::Always),
+    ];
+    let object = Object {
+        index,
+        items,
+        ..Object::default()
+    };
+    Dictionary {
+        objects: vec![object],
+    }
+}
+
+/// Some firmware declares complete access in its ESI and refuses it, with any code.
+#[test]
+fn refused_complete_access_is_written_by_subindices() {
+    let whole = |index: u16, data: &[u8]| StartupSdo {
+        complete_access: true,
+        ..sdo((index, 0), data, "")
+    };
+    let list: &[(u16, u8, &[u8])] = &[
+        (0x1c12, 0, &[1]),
+        (0x1c12, 1, &[0x05, 0x16]),
+        (0x1c12, 2, &[0, 0]),
+        (0x2010, 0, &[2]),
+        (0x2010, 1, &[0, 0]),
+        (0x2010, 2, &[0; 4]),
+    ];
+    for code in [0x0601_0000, 0x0601_0004, 0x0504_0001, 0x0800_0000] {
+        for (sdo, written) in [
+            (
+                whole(0x1c12, &[2, 0, 0x00, 0x16, 0x01, 0x16]),
+                vec![(0, vec![2]), (1, vec![0x00, 0x16]), (2, vec![0x01, 0x16])],
+            ),
+            (whole(0x1c12, &[0, 0]), vec![(0, vec![0])]),
+            (
+                whole(0x2010, &[2, 0, 1, 2, 3, 4, 5, 6]),
+                vec![(0, vec![2]), (1, vec![1, 2]), (2, vec![3, 4, 5, 6])],
+            ),
+        ] {
+            let server = Server::new(48, list, &[Mischief::NoCompleteAccess(code)]);
+            let at = DeviceRef {
+                name: "x".to_owned(),
+                position: 0,
+                station: STATION,
+            };
+            let mut client = client();
+            let way = StartupOptions {
+                verify: true,
+                skip_equal: false,
+            };
+            let dictionary = record(0x2010);
+            let outcome = write_startup_sdo(&server, &at, &mut client, &sdo, way, &dictionary);
+            let outcome = block_on(outcome).map_err(|error| error.to_string());
+            assert_eq!(outcome, Ok(SdoOutcome::BySubindex(code)), "{sdo:?}");
+            for (sub, data) in written {
+                let held = block_on(client.upload(&server, sdo.index, sub, false));
+                assert_eq!(held.ok(), Some(data), "0x{:04x}:{sub:02x}", sdo.index);
+            }
+        }
+    }
+    // Without a description, the device's own refusal is reported.
+    let unknown = whole(0x2011, &[1, 0, 9]);
+    let (reported, requests) = done(&unknown, false, false, &[Mischief::NoCompleteAccess(1)]);
+    assert!(reported.is_err());
+    assert_eq!(requests, 1);
 }

@@ -7,7 +7,7 @@ use ecaxis_master::config::Machine;
 use ecaxis_master::session::Options;
 use ecaxis_test_support::recordings::{Frame, frames, process_images};
 use ecaxis_test_support::{
-    axes, faults, machine, recorded, run, run_badly, run_well, virtual_time,
+    assert_contains, axes, faults, machine, recorded, run, run_badly, run_well, virtual_time,
 };
 
 /// Counts per turn. STEP is the largest set-point change in a cycle of 1 ms at 50 turns/s.
@@ -87,6 +87,38 @@ fn no_set_point_jumps_after_a_burst_of_lost_frames() {
                 .iter()
                 .all(|a| a.final_error_counts.is_some_and(|e| e.abs() <= 1))
         );
+    }
+}
+
+/// A frame that comes back without the answer of one device brings the others their targets: they
+/// decelerate within their limits, also if frames are lost as the device goes.
+#[test]
+fn a_lost_device_makes_no_other_set_point_step() {
+    let exchanges = ["same-cycle", "pipelined"];
+    for (at_us, exchange) in (0..10).flat_map(|n| exchanges.map(|of| (1_500_000 + n * 100, of))) {
+        let folder = tempfile::tempdir().expect("a folder");
+        let script = format!("[[fault]]\nkind = \"power-off\"\nat = \"{at_us}us\"\ndevice = 1\n");
+        let (options, path) = recorded(faults(&script), folder.path());
+        let keys = format!("lost_frames = 3\nexchange = \"{exchange}\"\ncycle =");
+        let text = axes(2).replacen("cycle =", &keys, 1);
+        let (error, _) = run_badly(machine(&text), options);
+        assert_contains(&error, &["`a1`", "no longer answers"]);
+        let sent = frames(&path).into_iter().filter(|frame| frame.sent);
+        let images: Vec<Vec<u8>> = sent.filter_map(|frame| frame.image()).collect();
+        let targets: Vec<i64> = images
+            .iter()
+            .filter(|data| data[0] == OPERATION_ENABLED as u8)
+            .map(|data| i64::from(i32::from_le_bytes([data[2], data[3], data[4], data[5]])))
+            .collect();
+        assert!(targets.len() > 500, "{} cycles", targets.len());
+        for (cycle, three) in targets.windows(3).enumerate() {
+            let change = three[2] - 2 * three[1] + three[0];
+            assert!(
+                change.abs() <= 2,
+                "{exchange}, {at_us} µs: cycle {cycle} of {}, {three:?}",
+                targets.len()
+            );
+        }
     }
 }
 

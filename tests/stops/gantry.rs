@@ -311,6 +311,162 @@ fn homing_does_not_rack_the_gantry() {
     assert!((3.8..4.1).contains(&way), "{way}");
 }
 
+/// Homed halves out of square stay where they are while the machine is held, and are squared
+/// afterwards. The program waits meanwhile.
+#[test]
+fn a_held_gantry_is_not_squared() {
+    let head = "[signals]\nheld = \"io.Input 1\"\n[override]\nhold = { held = true }\n[sim]\ninputs = [\n\
+        { at = \"0s\", set = { held = true } },\n{ at = \"12s\", set = { held = false } },\n]\n";
+    let io = "[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 2\n";
+    let half = |start: f64| {
+        format!(
+            "absolute = true\n[device.sim]\ntrack = {{ start = {start}, negative_limit = -90.0 }}\n"
+        )
+    };
+    let steps = "[[step]]\nenable = true\n[[step]]\nmove = { x1 = 2.0 }\n";
+    let text = gantry(&USUAL, [&half(1.0), &half(1.5)], &format!("{io}{steps}"));
+    let folder = tempfile::tempdir().expect("a folder");
+    let (options, path) = recorded(faults(""), folder.path());
+    let summary = run_well(machine(&format!("{head}{text}")), options);
+    assert!(summary.machine_seconds > 12.0);
+    let seen = halves(&path);
+    let powered = |s: &&[Seen; 2]| {
+        s.iter()
+            .all(|half| half.controlword == 0x0f && half.has_power())
+    };
+    let targets: Vec<_> = seen
+        .iter()
+        .filter(powered)
+        .map(|s| s.map(|half| half.target))
+        .collect();
+    assert!(
+        targets[..10_000].iter().all(|both| *both == targets[0]),
+        "moves while held"
+    );
+    assert_eq!(targets[0], [2000, 3000]);
+    assert_eq!(targets.last(), Some(&[4000, 4000]));
+}
+
+/// A half that loses Statusword bit 12 trips, at rest as well, and the run fails. Both halves receive
+/// the same stop.
+#[test]
+fn a_half_that_no_longer_follows_at_rest_stops_the_gantry() {
+    for lost in [0, 1] {
+        let mut keys = [String::new(), String::new()];
+        keys[lost] = "[device.sim]\nquirks = { bit12_lost_at_rest = \"300ms\" }\n".to_owned();
+        let steps =
+            "[[step]]\nenable = true\n[[step]]\nmove = { x1 = 3.0 }\n[[step]]\ndwell = \"5s\"\n";
+        let folder = tempfile::tempdir().expect("a folder");
+        let (options, path) = recorded(faults(""), folder.path());
+        let text = gantry(&USUAL, [&keys[0], &keys[1]], steps);
+        let (error, _) = run_badly(machine(&text), options);
+        assert_contains(&error, &[&format!("`x{}`", lost + 1)]);
+        let seen = halves(&path);
+        let last = seen.last().expect("cycles");
+        assert!(last.iter().all(|half| !half.has_power()), "{last:?}");
+        // Positions differ by less than the limit of the skew at all times.
+        for [a, b] in &seen {
+            assert!(a.actual.abs_diff(b.actual) < 100, "{a:?} {b:?}");
+        }
+    }
+}
+
+/// A few Statuswords of one half that CiA 402 does not list stop nothing. Words that remain stop both
+/// halves alike.
+#[test]
+fn strange_statuswords_of_one_half_leave_both_alike() {
+    /// Consecutive words without a reaction (`docs/stops.md`).
+    const TOLERATED: u32 = 5;
+    for (half, word, at) in [
+        (0, "0x0056", 800),
+        (1, "0x0056", 800),
+        (0, "0x0000", 1021),
+        (1, "0x0000", 1480),
+    ] {
+        for count in [1, TOLERATED, 300] {
+            let what = format!("{count} words {word} of half {half} at {at} ms");
+            let script = format!(
+                "[[fault]]\nkind = \"statusword\"\ndevice = {half}\nvalue = {word}\ncount = {count}\n\
+                 at = \"{at}ms\"\n"
+            );
+            let folder = tempfile::tempdir().expect("a folder");
+            let (options, path) = recorded(faults(&script), folder.path());
+            let (outcome, _) = run(machine(&gantry(&USUAL, ["", ""], MOVES)), options);
+            let seen = halves(&path);
+            let strange = |s: &&[Seen; 2]| matches!(s[half].statusword & 0x6f, 0x00 | 0x46);
+            assert!(
+                seen.iter().filter(strange).count() > 0,
+                "{what}: in no cycle"
+            );
+            match outcome.result {
+                Ok(()) => assert!(count <= TOLERATED, "{what}: no stop"),
+                Err(error) => {
+                    let error = error.to_string();
+                    assert!(count > TOLERATED, "{what}: {error}");
+                    assert_contains(&error, &[&format!("`x{}`", half + 1), word]);
+                }
+            }
+            let mut before = seen[0];
+            for (cycle, [a, b]) in seen.iter().enumerate() {
+                let way = |half: usize| seen[cycle][half].actual.abs_diff(before[half].actual);
+                // At rest, the stop of the half with strange words lasts longer.
+                let moves = way(0).max(way(1)) > 1;
+                assert!(
+                    a.controlword == b.controlword || !moves,
+                    "{what}, cycle {cycle}: {a:?} {b:?}"
+                );
+                before = seen[cycle];
+                let skew = a.actual.abs_diff(b.actual);
+                let strange = seen[cycle][half].statusword & 0x6f;
+                assert!(
+                    skew <= 4 || strange == 0,
+                    "{what}, cycle {cycle}: {skew} counts"
+                );
+                if a.controlword == 0x000f {
+                    assert_eq!(a.target, b.target, "{what}, cycle {cycle}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn the_half_that_is_not_ready_is_named() {
+    for late in [0, 1] {
+        let mut keys = [String::new(), String::new()];
+        keys[late] = "[device.sim]\nquirks = { bit12_never = true }\n".to_owned();
+        let text = gantry(&USUAL, [&keys[0], &keys[1]], MOVES);
+        let (error, _) = run_badly(machine(&text), virtual_time());
+        let named = format!("`x{}`", late + 1);
+        assert_contains(&error, &[&named, "bit 12 is not set"]);
+    }
+}
+
+/// A half without frames holds its last target at once, so the other half waits as well: braking it
+/// within its limits would skew the gantry.
+#[test]
+fn a_lost_half_makes_both_set_points_wait() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let script = "[[fault]]\nkind = \"absent\"\ndevice = 1\nat = \"700ms\"\nfor = \"50ms\"\n";
+    let (options, path) = recorded(faults(script), folder.path());
+    let text = gantry(&USUAL, ["", ""], MOVES);
+    let text = text.replacen("cycle = \"1ms\"\n", "cycle = \"1ms\"\nlost_frames = 6\n", 1);
+    let (error, _) = run_badly(machine(&text), options);
+    assert_contains(&error, &["`x2`", "no longer answers"]);
+    let seen = halves(&path);
+    same_targets(&seen);
+    let powered = |[first, _]: &&[Seen; 2]| first.controlword & 0x0f == 0x0f;
+    let targets: Vec<i32> = seen.iter().filter(powered).map(|[a, _]| a.target).collect();
+    let last = targets[targets.len() - 1];
+    let held = targets.iter().rev().take_while(|target| **target == last);
+    let held = held.count();
+    let moving = targets[targets.len() - 10].abs_diff(last);
+    assert!(
+        (3..=6).contains(&held) && moving > 20,
+        "held {held}, before {moving}"
+    );
+}
+
 /// Halves that were not homed keep their distance.
 #[test]
 fn decoupled_halves_move_alone_and_couple_where_they_are() {

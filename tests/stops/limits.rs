@@ -70,6 +70,122 @@ fn an_axis_has_a_watchdog_with_any_esi() {
     assert!(expired.contains(&1), "expirations in 0x0442: {expired:?}");
 }
 
+/// A drive whose firmware compares the ControlByte with that of its ESI, without the watchdog trigger.
+fn exact_control_byte(key: &str) -> (Bench, String) {
+    let bench = Bench::new();
+    bench.change("esi/SV1.xml", |text| {
+        text.replace("ControlByte=\"#x64\"", "ControlByte=\"#x24\"")
+    });
+    let axis = format!(
+        "mode = \"csv\"\n{key}\n[device.sim]\nquirks = {{ exact_control_byte = true }}\n[device.axis]"
+    );
+    let text = SV1_CSV.replace("mode = \"csv\"\n[device.axis]", &axis);
+    (bench, text.replace("dwell = \"3s\"", "dwell = \"200ms\""))
+}
+
+/// Returns the ControlBytes of the outputs that were written.
+fn control_bytes(path: &Path) -> Vec<u8> {
+    let all = datagrams(path);
+    let written = all.iter().filter(|d| d.sent && d.command == FPWR);
+    let outputs = written.filter(|d| d.register() == 0x0810);
+    outputs.map(|d| d.data[4]).collect()
+}
+
+#[test]
+fn a_drive_that_compares_its_control_byte_gets_that_of_its_esi() {
+    let (bench, text) = exact_control_byte("");
+    let (options, path) = recorded(faults(""), bench.path());
+    let (outcome, heard) = run(bench.machine(&text), options);
+    outcome.result.expect("the axis moved");
+    assert_eq!(control_bytes(&path), [0x64, 0x24]);
+    let warnings = heard.warnings();
+    let about = warnings.iter().filter(|w| w.contains("watchdog"));
+    let [warning] = about.collect::<Vec<_>>()[..] else {
+        panic!("one warning: {warnings:?}");
+    };
+    assert_contains(warning, &["`z`", "0x001d", "watchdog_trigger = \"esi\""]);
+}
+
+/// The watchdog is not given up for a refusal that has another reason.
+#[test]
+fn a_refusal_that_the_control_byte_does_not_explain_is_an_error_without_advice() {
+    let (bench, text) = exact_control_byte("");
+    let text = text.replace("exact_control_byte = true", "mailbox_slow = \"1ms\"");
+    let refuse =
+        "[[fault]]\nkind = \"refuse-state\"\ndevice = 0\nstate = \"safe-op\"\ncode = 0x1d\n";
+    let (outcome, heard) = run(bench.machine(&text), faults(refuse));
+    let error = outcome.result.expect_err("it refuses SafeOp").to_string();
+    assert_contains(&error, &["`z`", "0x001d"]);
+    let warnings = heard.warnings();
+    assert!(
+        !warnings.iter().any(|w| w.contains("watchdog")),
+        "{warnings:?}"
+    );
+}
+
+/// Another drive in the place of one without the trigger may have it.
+#[test]
+fn an_exchanged_drive_is_asked_for_the_watchdog_trigger_again() {
+    let (bench, text) = exact_control_byte("");
+    let (bus, _) = text.split_once("[[step]]").expect("steps");
+    let text = format!(
+        "{bus}[[device]]\nname = \"first\"\nesi = \"esi/EPOS4.xml\"\nposition = 1\nmode = \"csp\"\n\
+         [device.axis]\nencoder = 2000\nlimits = {{ velocity = 10.0, acceleration = 100.0 }}\n\
+         [[stop.group]]\nname = \"gz\"\naxes = [\"z\"]\noutside = \"continue\"\n[[step]]\ndwell = \"4s\"\n"
+    );
+    // The drive is behind another one with SYNC0, so that it can return.
+    let text = text.replacen("position = 0", "position = 9", 1);
+    let text = text.replacen("position = 1", "position = 0", 1);
+    let text = text.replacen("position = 9", "position = 1", 1);
+    let script = "[[fault]]\nkind = \"power-off\"\ndevice = 1\nat = \"1s\"\nfor = \"500ms\"\n\
+        [[fault]]\nkind = \"swap\"\ndevice = 1\nat = \"1200ms\"\nserial = 777\n";
+    let (options, path) = recorded(faults(script), bench.path());
+    let (_, heard) = run(bench.machine(&text), options);
+    // The first one is that of the other drive.
+    assert_eq!(control_bytes(&path), [0x64, 0x64, 0x24, 0x64, 0x24]);
+    let warnings = heard.warnings();
+    let named = warnings.iter().filter(|w| w.contains("watchdog trigger"));
+    assert_eq!(named.count(), 2, "{warnings:?}");
+}
+
+/// Some devices set the AL status code of a refusal, and not the error bit.
+#[test]
+fn an_al_status_code_without_the_error_bit_is_read_at_the_time_out() {
+    for (key, fails) in [("", false), ("watchdog_trigger = \"required\"", true)] {
+        let (bench, text) = exact_control_byte(key);
+        let quirks = "exact_control_byte = true, error_bit_missing = true";
+        let text = text.replace("exact_control_byte = true", quirks);
+        let (outcome, _) = run(bench.machine(&text), virtual_time());
+        let error = outcome.result.err().map(|error| error.to_string());
+        assert_eq!(error.is_some(), fails, "{error:?}");
+        if let Some(error) = error {
+            let parts = [
+                "SafeOp",
+                "0x001d (invalid output configuration)",
+                "without the error bit",
+            ];
+            assert_contains(&error, &parts);
+        }
+    }
+}
+
+#[test]
+fn the_watchdog_trigger_is_required_or_left_to_the_esi_by_a_key() {
+    let (bench, text) = exact_control_byte("watchdog_trigger = \"required\"");
+    let (options, path) = recorded(faults(""), bench.path());
+    let (outcome, _) = run(bench.machine(&text), options);
+    let error = outcome.result.expect_err("it refuses SafeOp").to_string();
+    assert_contains(&error, &["`z`", "SafeOp", "0x001d"]);
+    assert_eq!(control_bytes(&path), [0x64]);
+
+    let (bench, text) = exact_control_byte("watchdog_trigger = \"esi\"");
+    let (options, path) = recorded(faults(""), bench.path());
+    let (outcome, heard) = run(bench.machine(&text), options);
+    outcome.result.expect("the axis moved");
+    assert_eq!(control_bytes(&path), [0x24]);
+    assert!(!heard.warnings().iter().any(|w| w.contains("0x001d")));
+}
+
 /// Returns an axis of 2000 counts per turn on `configs/esi/EPOS4.xml`, with additional keys of its
 /// device.
 fn epos4(device: &str, limits: &str) -> String {

@@ -4,12 +4,14 @@ use std::sync::{Arc, Mutex};
 
 use ecaxis_axis::{Command, State};
 use ecaxis_master::cancel::CancelToken;
-use ecaxis_master::config::{AxisRef, Machine};
+use ecaxis_master::config::{AxisRef, Machine, OutputRef};
 use ecaxis_master::link::sim::SimLink;
 use ecaxis_master::rt::controller::{Controller, CycleContext};
 use ecaxis_master::session::{
     Attachments, Options, Progress, run_attached, run_with, simulated_bus,
 };
+use ecaxis_sim::Segment;
+use ecaxis_test_support::wire::{WatchedBus, Watcher};
 use ecaxis_test_support::{Heard, axes, faults, machine, run, virtual_time};
 
 /// Drives in a line, each in a group of its own that the others survive.
@@ -159,23 +161,142 @@ fn exchanged_device_is_driven_only_if_it_is_of_the_same_kind() {
     assert!(warned(&heard, "4711"), "{:?}", heard.warnings());
 }
 
-/// An output terminal would switch its outputs on as soon as it is in Op.
-#[test]
-fn terminal_with_outputs_of_the_program_does_not_return_by_itself() {
-    let io = "\n[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 2\n";
-    let off = "[[fault]]\nkind = \"power-off\"\ndevice = 2\nat = \"1.5s\"\nfor = \"500ms\"\n";
-    let set = "\n[[step]]\nset = { io.\"Output 1\" = true }\n";
-    let on = "\n[[step]]\nenable = true\n\n[[step]]\nmove = { a0 = 80.0 }\n\n[[step]]\nmove = { a0 = -80.0 }\n";
-    for (steps, returns) in [(format!("{set}{on}"), 0), (on.to_owned(), 1)] {
-        let text = line_text(2, &format!("{io}{steps}"));
-        let text = text.replace("axes = [\"a1\"]\n", "axes = [\"a1\"]\ndevices = [\"io\"]\n");
-        let (outcome, heard) = run(machine(&text), faults(off));
-        outcome.result.expect("the drives run");
-        assert_eq!(returned(&heard).len(), returns, "{:?}", heard.warnings());
-        let warning = "would be switched on without a command";
-        let warned = heard.warnings().iter().any(|w| w.contains(warning));
-        assert_eq!(warned, returns == 0, "{:?}", heard.warnings());
+/// The first output of the terminal in each frame.
+struct FirstOutput(Arc<Mutex<Vec<bool>>>);
+
+impl Watcher for FirstOutput {
+    fn after(&mut self, segment: &mut Segment) {
+        let outputs = segment.device_mut(3).map(|device| device.outputs());
+        let on = outputs.is_some_and(|bytes| bytes.first().is_some_and(|byte| byte & 1 != 0));
+        self.0.lock().expect("no panic").push(on);
     }
+}
+
+/// Returns the moments in ms at which the first output of the terminal switches, first on. `owner`: the
+/// text of the machine file that writes it.
+fn switching(owner: &str, by_controller: bool) -> Vec<usize> {
+    let off = "[[fault]]\nkind = \"power-off\"\ndevice = 3\nat = \"2s\"\nfor = \"500ms\"\n";
+    let terminal = |name: &str, position: usize| {
+        format!("\n[[device]]\nname = \"{name}\"\nesi = \"esi/IO8.xml\"\nposition = {position}\n")
+    };
+    // The other one is nearer: it remains.
+    let rest = terminal("in", 2) + &terminal("io", 3) + owner;
+    let text = line_text(2, &rest);
+    let text = text.replace("axes = [\"a1\"]\n", "axes = [\"a1\"]\ndevices = [\"io\"]\n");
+    let (mut machine, options) = (machine(&text), faults(off));
+    let controller = by_controller.then(|| {
+        let output = machine.output("io", "Output 1").expect("free");
+        let axes = ["a0", "a1"].map(|name| machine.axis(name).expect("an axis"));
+        let cycles = 0;
+        Box::new(Sets {
+            output,
+            axes,
+            cycles,
+        }) as Box<dyn Controller>
+    });
+    let seen = Arc::new(Mutex::new(vec![false]));
+    let link = WatchedBus::new(&machine, &options, FirstOutput(Arc::clone(&seen)));
+    let (mut heard, stop) = (Heard::default(), Arc::<CancelToken>::default());
+    let attachments = Attachments {
+        controller,
+        link: Some(Box::new(link)),
+        ..Attachments::default()
+    };
+    let outcome = run_attached(machine, options, stop, &mut heard, attachments);
+    outcome
+        .result
+        .unwrap_or_else(|error| panic!("{owner}: {error}"));
+    assert_eq!(returned(&heard).len(), 1, "{owner}: {:?}", heard.warnings());
+    let seen = seen.lock().expect("no panic");
+    let pairs = seen.windows(2).enumerate();
+    let changes = pairs.filter(|(_, pair)| pair[0] != pair[1]);
+    changes.map(|(cycle, _)| cycle + 1).collect()
+}
+
+/// Sets the output in every cycle, and resets the group 6 s after the first motion.
+struct Sets {
+    output: OutputRef,
+    axes: [AxisRef; 2],
+    cycles: usize,
+}
+
+impl Controller for Sets {
+    fn cycle(&mut self, machine: &mut CycleContext<'_>) {
+        if machine.stopping() || (self.cycles == 0 && !machine.axis(self.axes[0]).ready) {
+            return;
+        }
+        self.cycles += 1;
+        machine.set(self.output, 1.0);
+        if self.cycles == 6000 {
+            machine
+                .command(self.axes[1], Command::ResetFault)
+                .expect("it may be reset");
+        }
+        if self.cycles == 8000 {
+            machine.finish();
+        }
+    }
+}
+
+/// A terminal of a stopped group came back with the outputs of positions and copies on, and did not
+/// come back with outputs of steps.
+#[test]
+fn outputs_of_a_returned_terminal_are_off_until_the_reset() {
+    let steps = |first: &str, last: &str| {
+        format!(
+            "\n[[step]]\nenable = true\n{first}\n[[step]]\nmove = {{ a0 = 80.0 }}\nspeed = 0.2\n\
+             \n[[step]]\nreset = [\"a1\"]\n\n[[step]]\ndwell = \"300ms\"\n{last}\n[[step]]\ndwell = \"300ms\"\n"
+        )
+    };
+    let set = "\n[[step]]\nset = { io.\"Output 1\" = true }\n";
+    let position =
+        "[[position_output]]\noutput = \"io.Output 1\"\naxis = \"a0\"\nranges = [[1.0, 100.0]]\n";
+    let copy = "[[sim.inputs]]\nat = \"100ms\"\nset = { in.\"Input 1\" = true }\n\
+                [[copy]]\nfrom = \"in.Input 1\"\nto = \"io.Output 1\"\n";
+    let safety = format!("{copy}fsoe = true\n");
+    // The bytes of the terminal are those of its last frame until it has power again.
+    // The end of the move, and the return, in ms.
+    const RESET: usize = 8000;
+    for (owner, again) in [
+        (position.to_owned() + &steps("", ""), RESET..9500),
+        (copy.to_owned() + &steps("", ""), RESET..9500),
+        // Only the second step switches it on.
+        (steps(set, set), RESET + 300..10_000),
+        // Frames of a safety connection pass.
+        (safety + &steps("", ""), 1500..4500),
+    ] {
+        let changes = switching(&owner, false);
+        let [on, off, back, ..] = changes[..] else {
+            panic!("{owner}: {changes:?}")
+        };
+        assert!(
+            on < 2000 && (1000..2600).contains(&off),
+            "{owner}: {changes:?}"
+        );
+        assert!(again.contains(&back), "{owner}: {changes:?}");
+    }
+    // A step in between fails, and names the group.
+    let early = format!("\n[[step]]\ndwell = \"3s\"\n{set}");
+    let text = line_text(
+        2,
+        &format!("\n[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 2\n{early}"),
+    );
+    let text = text.replace("axes = [\"a1\"]\n", "axes = [\"a1\"]\ndevices = [\"io\"]\n");
+    let off = "[[fault]]\nkind = \"power-off\"\ndevice = 2\nat = \"1.5s\"\nfor = \"500ms\"\n";
+    let (outcome, _) = run(machine(&text), faults(off));
+    let error = outcome.result.expect_err("the outputs are off").to_string();
+    assert!(error.contains("g1"), "{error}");
+}
+
+/// The same for a controller, which sets its output in every cycle.
+#[test]
+fn output_of_a_controller_is_off_until_the_reset() {
+    let changes = switching("", true);
+    let [on, off, back, ..] = changes[..] else {
+        panic!("{changes:?}")
+    };
+    assert!(on < 2000 && (1000..2600).contains(&off), "{changes:?}");
+    assert!((on + 5990..on + 6100).contains(&back), "{changes:?}");
 }
 
 /// Panics once all axes can move.
@@ -408,4 +529,59 @@ fn drives_come_and_go_without_any_effect_on_the_others() {
         late <= returns / 100,
         "{late} of {returns} later than 3 s after their link"
     );
+}
+
+/// I/O and a drive with SYNC0, whose pulses no other device has.
+fn io_and_drive([io, drive]: [u8; 2], more: &str) -> Machine {
+    machine(&format!(
+        "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n\
+         [[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = {io}\n\
+         [[device]]\nname = \"a\"\nesi = \"esi/EPOS4.xml\"\nposition = {drive}\nmode = \"csp\"\n\
+         [device.axis]\nencoder = 2000\nlimits = {{ velocity = 50.0, acceleration = 500.0 }}\n\
+         {more}"
+    ))
+}
+
+/// A lost device that must not return was reported as one that the file does not have, and its port
+/// was closed.
+#[test]
+fn device_that_must_not_return_is_no_unknown_device() {
+    let machine = io_and_drive(
+        [0, 1],
+        "[[stop.group]]\nname = \"g\"\naxes = [\"a\"]\noutside = \"continue\"\n\
+         [[step]]\ndwell = \"3s\"\n",
+    );
+    let off = "[[fault]]\nkind = \"power-off\"\ndevice = 1\nat = \"500ms\"\nfor = \"300ms\"\n";
+    let (_, heard) = run(machine, faults(off));
+    let warnings = heard.warnings();
+    let refused = |w: &&String| w.contains("no other device in Op has SYNC0");
+    assert_eq!(warnings.iter().filter(refused).count(), 1, "{warnings:?}");
+    let unknown = |heard: &Heard| {
+        let mut all = heard.0.iter();
+        all.any(|progress| matches!(progress, Progress::UnknownDevice(_)))
+    };
+    assert!(!unknown(&heard), "{warnings:?}");
+}
+
+/// A group of I/O devices alone has no axis that a step could reset.
+#[test]
+fn group_without_axes_returns_by_itself() {
+    let machine = io_and_drive(
+        [1, 0],
+        "[[stop.group]]\nname = \"g\"\ndevices = [\"io\"]\noutside = \"continue\"\n\
+         [[step]]\nset = { io.\"Output 1\" = true }\n\
+         [[step]]\nmove = { a = 60.0 }\n\
+         [[step]]\nset = { io.\"Output 2\" = true }\n\
+         [[step]]\nmove = { a = 0.0 }\n",
+    );
+    let off = "[[fault]]\nkind = \"power-off\"\ndevice = 1\nat = \"500ms\"\nfor = \"200ms\"\n";
+    let (outcome, heard) = run(machine, faults(off));
+    let warnings = heard.warnings();
+    outcome
+        .result
+        .unwrap_or_else(|error| panic!("{error}; {warnings:?}"));
+    let names: Vec<_> = returned(&heard).into_iter().map(|found| found.0).collect();
+    assert_eq!(names, ["io"], "{warnings:?}");
+    let released = |progress: &Progress| matches!(progress, Progress::GroupReleased { .. });
+    assert_eq!(heard.0.iter().filter(|p| released(p)).count(), 1);
 }

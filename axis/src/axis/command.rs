@@ -2,10 +2,11 @@
 
 use super::stop::{PowerGoal, Resets};
 use super::{Axis, ControlledQuantity, Plan};
+use crate::HomingError;
 use crate::cia402::{Mode, State};
 use crate::profile_mode::Goal;
 use crate::setpoint::{self, Ramp, Trapezoid};
-use crate::status::CommandError;
+use crate::status::{CommandError, PowerLossCause};
 use crate::supervision::StopMethod;
 use crate::touch_probe::{Edge, Probe, Source};
 use crate::units::{Counts, UserUnits};
@@ -22,6 +23,8 @@ pub enum Command {
     /// Decelerates with the limit acceleration and holds; the axis stays enabled. In CST without a
     /// position loop: reduces the torque to zero.
     Stop,
+    /// As [`Command::Stop`], for a hold: a search for home fails with [`HomingError::Held`].
+    HoldHoming,
     /// Triggers the drive's quick stop. The drive stays in Quick stop active if its option code
     /// (0x605A) says so.
     QuickStop,
@@ -100,19 +103,30 @@ impl Axis {
         match command {
             Command::Enable => self.enable(),
             Command::Disable => {
-                self.stop_by(StopMethod::Ramp);
+                self.stop_with(PowerLossCause::Command, StopMethod::Ramp, false);
                 Ok(())
             }
             Command::ResetFault => {
                 self.reset_fault();
                 Ok(())
             }
+            Command::HoldHoming => {
+                self.home.abort(HomingError::Held);
+                // Without power for a change of mode, the axis does not move, and power returns with
+                // the mode.
+                match self.mode_cycle {
+                    Some(_) => Ok(()),
+                    None => self.take(Command::Stop),
+                }
+            }
             Command::Stop => {
+                // Power must not return after a stop.
+                self.cancel_mode_cycle();
                 self.stop();
                 Ok(())
             }
             Command::DisableVoltage => {
-                self.stop_by(StopMethod::DisableVoltage);
+                self.stop_with(PowerLossCause::Command, StopMethod::DisableVoltage, false);
                 Ok(())
             }
             Command::EmergencyStop => {
@@ -138,7 +152,7 @@ impl Axis {
             Command::SetMode(mode) => self.set_mode(mode),
             Command::Home { timeout_s } => self.home(timeout_s),
             Command::QuickStop => {
-                self.begin_stop(StopMethod::QuickStop, true);
+                self.stop_with(PowerLossCause::Command, StopMethod::QuickStop, true);
                 Ok(())
             }
             Command::MoveTo {
@@ -159,7 +173,7 @@ impl Axis {
         }
     }
 
-    fn enable(&mut self) -> Result<(), CommandError> {
+    pub(super) fn enable(&mut self) -> Result<(), CommandError> {
         if let Some(trip) = self.trip {
             return Err(CommandError::Tripped(trip));
         }
@@ -171,7 +185,7 @@ impl Axis {
         match self.goal {
             PowerGoal::Stopping(stop) if stop.removes_power() => {
                 // Otherwise the drive's confirmation would look like a loss of power.
-                if self.active {
+                if self.has_control() {
                     return Err(CommandError::Stopping);
                 }
             }
@@ -187,8 +201,23 @@ impl Axis {
             }
             PowerGoal::Off | PowerGoal::On => {}
         }
+        if !self.has_control() {
+            self.check_coasting()?;
+            self.power_loss_cause = None;
+        }
         self.goal = PowerGoal::On;
         Ok(())
+    }
+
+    /// Rejects the power of an axis that moves: its drive would brake it with a step of the target.
+    fn check_coasting(&self) -> Result<(), CommandError> {
+        if self.at_standstill() {
+            Ok(())
+        } else {
+            Err(CommandError::StillMoving {
+                velocity: self.actual.velocity(),
+            })
+        }
     }
 
     fn reset_fault(&mut self) {
@@ -213,8 +242,8 @@ impl Axis {
         if self.home.running() {
             return Err(CommandError::Homing);
         }
-        if let Some(switch) = self.switch {
-            return Err(CommandError::Switching { to: switch.to });
+        if let Some(to) = self.switching() {
+            return Err(CommandError::Switching { to });
         }
         if matches!(self.state, State::SwitchedOn | State::OperationEnabled)
             && let Some(display) = self.mode_display
@@ -225,7 +254,7 @@ impl Axis {
                 display: Mode::from_code(display),
             });
         }
-        if !self.active {
+        if !self.follows() {
             return Err(CommandError::NotEnabled { state: self.state });
         }
         if self.goal != PowerGoal::On {
@@ -260,12 +289,13 @@ impl Axis {
         if !possible || !(self.config.modes.contains(to) || to == self.config.mode) {
             return Err(CommandError::ModeNotOffered { mode: to });
         }
-        if !self.active {
+        if !self.has_control() {
             self.mode = to;
             self.switch_failed = None;
+            self.redirect_mode_cycle(to);
             return Ok(());
         }
-        if self.switch.is_some_and(|switch| switch.to == to) {
+        if self.switching() == Some(to) {
             return Ok(());
         }
         self.check_switch(to)?;
@@ -317,6 +347,7 @@ impl Axis {
                     high: high.max(low),
                 });
             }
+            self.commanded_target = Some(position);
             self.profile.go_to(Goal {
                 target: position,
                 velocity: limits.velocity * speed,
@@ -329,6 +360,7 @@ impl Axis {
             let plan = self.jerk_limited(goal, limits.velocity * speed, ramp)?;
             self.engage();
             self.plan = Plan::Jerk(plan);
+            self.commanded_target = Some(position);
             return Ok(());
         }
         self.engage();
@@ -344,6 +376,7 @@ impl Axis {
             acceleration,
             braking: acceleration,
         };
+        self.commanded_target = Some(position);
         self.plan =
             Plan::Move(trapezoid.taking_over(self.motion, earlier, limits.acceleration, self.dt_s));
         Ok(())
@@ -366,6 +399,7 @@ impl Axis {
             });
         }
         self.check_ready()?;
+        self.forget_target();
         if self.mode == Mode::Pv {
             self.profile.run_at(Goal {
                 target: velocity,
@@ -443,6 +477,7 @@ impl Axis {
         }
         self.external_setpoint = Some(before.then(position, velocity, self.dt_s));
         self.plan = Plan::External;
+        self.forget_target();
         Ok(())
     }
 
@@ -472,6 +507,8 @@ impl Axis {
             target: percent,
             slope,
         });
+        self.forget_target();
+        self.permit_motion();
         Ok(())
     }
 }

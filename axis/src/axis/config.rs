@@ -38,6 +38,13 @@ pub struct AxisConfig {
     pub answers_late: u8,
     /// Time in seconds within which 0x6061 must show the commanded mode.
     pub mode_time_s: f64,
+    /// True if the drive shows the commanded mode in 0x6061 in Operation enabled only. Then it gets
+    /// its power first, and has `mode_time_s` to show the mode; targets follow actual values until
+    /// then.
+    pub mode_display_enabled: bool,
+    /// True if the drive changes its mode only without power. Then a mode switch needs standstill,
+    /// and passes through Switch on disabled.
+    pub mode_change_unpowered: bool,
     /// The drive's 0x605A, if known. Without transition 16 the axis is enabled again via Switch on
     /// disabled.
     pub quick_stop: Option<QuickStopOption>,
@@ -58,11 +65,28 @@ pub struct AxisConfig {
     pub follows_bit: bool,
     /// True if the drive keeps home without power: an absolute encoder.
     pub absolute: bool,
+    /// False if the position at a start does not determine where an absolute encoder is: the drive's 32
+    /// bits may have wrapped. Home is then kept over a return of the drive only.
+    pub absolute_start: bool,
     /// True if no profile values (0x6081, 0x6083, 0x6084) are in the process data: a move in PP
     /// runs with those that the drive has, and takes no other speed or ramp.
     pub profile_fixed: bool,
     /// The second encoder at the load.
     pub second_encoder: Option<SecondEncoder>,
+    /// What a completed homing shows, if known.
+    pub home: Option<HomeReference>,
+}
+
+/// What a completed homing shows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HomeReference {
+    /// The position in 0x6064 after homing, user units. `None`: the drive's own setting.
+    pub position: Option<f64>,
+    /// Distance from it at which the drive may stand: it may stop beyond its switch or index.
+    pub window: f64,
+    /// False for methods without motion (35, 37). They may end before the axis has seen Statusword
+    /// bit 12 low.
+    pub moves: bool,
 }
 
 impl AxisConfig {
@@ -86,6 +110,8 @@ impl AxisConfig {
             dead_time_s: 0.0,
             answers_late: 0,
             mode_time_s: 1.0,
+            mode_display_enabled: false,
+            mode_change_unpowered: false,
             quick_stop: None,
             quick_stop_ends: false,
             supervision: Supervision::default(),
@@ -94,8 +120,10 @@ impl AxisConfig {
             stop_timeout_s: None,
             follows_bit: true,
             absolute: false,
+            absolute_start: true,
             profile_fixed: false,
             second_encoder: None,
+            home: None,
         }
     }
 

@@ -256,7 +256,7 @@ impl Axis {
             profile_acceleration: self.derived.acceleration,
             ..Outputs::default()
         };
-        if !self.active {
+        if !self.follows() {
             return out;
         }
         if self.mode_command_counts() {

@@ -10,7 +10,7 @@
 use super::stop::PowerGoal;
 use super::{Axis, ControlledQuantity, Plan};
 use crate::setpoint::{
-    Goal, Hold, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint, Trapezoid,
+    Goal, Hold, JerkLimited, Motion, MotionLimits, MoveRequest, Rate, Setpoint, Trapezoid,
 };
 use crate::units::{Counts, UserUnits};
 
@@ -149,7 +149,7 @@ impl Axis {
             Plan::Velocity(ramp) => ramp.target == 0.0,
             _ => false,
         };
-        self.active && self.goal == PowerGoal::On && self.switch.is_none() && !held && !stops
+        self.follows() && self.goal == PowerGoal::On && self.switch.is_none() && !held && !stops
     }
 
     /// Returns the velocity of the motion as it is asked for, which the play does not exceed.
@@ -219,7 +219,7 @@ impl Axis {
             };
             self.correction.plan = plan.ok();
             if let Some(plan) = &mut self.correction.plan {
-                return plan.advance(play, dt_s);
+                return plan.advance(play, Rate::WHOLE, dt_s);
             }
         }
         let acceleration = limits.acceleration;
@@ -230,8 +230,8 @@ impl Axis {
                 acceleration,
                 braking: acceleration,
             }
-            .advance(play, dt_s),
-            Goal::Velocity(_) => Hold { acceleration }.advance(play, dt_s),
+            .advance(play, Rate::WHOLE, dt_s),
+            Goal::Velocity(_) => Hold { acceleration }.brake(play, dt_s),
         }
     }
 

@@ -18,6 +18,12 @@ pub(super) struct Actual {
     play: f64,
     ratio: f64,
     velocity: f64,
+    /// The velocity of the reported positions, and the reported velocity with the same filter.
+    derived: f64,
+    filtered: f64,
+    /// The last change of the drive's position, and the time that it took in seconds.
+    step: f64,
+    step_s: f64,
     acceleration: f64,
     torque: f64,
     /// Time since the last reading, in seconds.
@@ -45,6 +51,9 @@ impl Actual {
         fastest: f64,
     ) {
         let before = *self;
+        self.step = 0.0;
+        self.step_s = self.elapsed_s;
+        let weight = self.weight();
         if let Some(raw) = inputs.position {
             let counts = self
                 .counts
@@ -52,22 +61,27 @@ impl Actual {
             self.counts = Some(counts);
             self.drive = scale.position_to_user(counts).0;
             if before.counts.is_some() {
+                self.step = self.drive - before.drive;
                 self.move_load(before.drive - before.play, compensation);
             } else {
                 self.place_load(compensation);
             }
         }
+        if before.counts.is_some() && self.elapsed_s > 0.0 {
+            let velocity = self.step / (self.elapsed_s * self.ratio);
+            if velocity.abs() <= fastest {
+                self.derived += (velocity - self.derived) * weight;
+            }
+        }
         if let Some(raw) = inputs.velocity {
             self.velocity = scale.velocity_to_user(RawVelocity(raw)).0 / self.ratio;
-        } else if before.counts.is_some() && self.elapsed_s > 0.0 {
-            let velocity = (self.drive - before.drive) / (self.elapsed_s * self.ratio);
-            if velocity.abs() <= fastest {
-                self.velocity += (velocity - self.velocity) * self.weight();
-            }
+            self.filtered += (self.velocity - self.filtered) * weight;
+        } else {
+            self.velocity = self.derived;
         }
         if self.wants_acceleration && self.elapsed_s > 0.0 {
             let acceleration = (self.velocity - before.velocity) / self.elapsed_s;
-            self.acceleration += (acceleration - self.acceleration) * self.weight();
+            self.acceleration += (acceleration - self.acceleration) * weight;
         }
         if let Some(raw) = inputs.torque {
             self.torque = scale.torque_to_user(PerMille(raw)).0;
@@ -81,10 +95,45 @@ impl Actual {
         self.elapsed_s / (self.elapsed_s + FILTER_S)
     }
 
-    /// Takes the reported position as it is, after the drive has shifted its origin.
-    pub(super) fn start_over(&mut self, scale: &Scale, compensation: &Compensation) {
+    /// Returns the drive's position with an origin that the drive has just set: that of its 32 bits,
+    /// without the turns counted before.
+    pub(super) fn restarted(&self, scale: &Scale) -> Option<f64> {
+        let counts = self.counts?;
+        Some(
+            scale
+                .position_to_user(Counts(i64::from(counts.wrapped())))
+                .0,
+        )
+    }
+
+    /// Returns the last change of the drive's position, and its time in seconds.
+    pub(super) const fn step(&self) -> (f64, f64) {
+        (self.step, self.step_s)
+    }
+
+    /// Returns the velocity of the reported positions, filtered over 10 ms.
+    pub(super) const fn derived_velocity(&self) -> f64 {
+        self.derived
+    }
+
+    /// Returns the reported velocity with the same filter.
+    pub(super) const fn filtered_velocity(&self) -> f64 {
+        self.filtered
+    }
+
+    /// Takes the reported position as it is, after the drive has shifted its origin. `keeps_wraps`:
+    /// the drive has not; it may have wrapped before.
+    pub(super) fn start_over(
+        &mut self,
+        scale: &Scale,
+        compensation: &Compensation,
+        keeps_wraps: bool,
+    ) {
         if let Some(counts) = self.counts {
-            let counts = Counts(i64::from(counts.wrapped()));
+            let counts = match keeps_wraps {
+                true => counts,
+                false => Counts(i64::from(counts.wrapped())),
+            };
             self.counts = Some(counts);
             self.drive = scale.position_to_user(counts).0;
             self.place_load(compensation);

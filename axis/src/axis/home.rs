@@ -3,21 +3,27 @@
 use super::{Axis, AxisConfig, ControlledQuantity};
 use crate::cia402::{Mode, ModeCommand, ModeStatus};
 use crate::homing::{HomingError, HomingInputs, HomingOutputs, Outcome, Sequence};
-use crate::status::{CommandError, HomingStatus};
+use crate::status::{CommandError, HomingStatus, PositionValidity};
 
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct HomingRun {
     sequence: Option<Sequence>,
     order: Option<HomingOutputs>,
     pub(super) status: HomingStatus,
-    /// True if home is known: by an absolute encoder, or found and no homing has started since.
-    pub(super) homed: bool,
+    pub(super) validity: PositionValidity,
 }
 
 impl HomingRun {
     pub(super) fn of(config: &AxisConfig) -> Self {
+        let validity = if config.absolute && config.absolute_start {
+            PositionValidity::Absolute
+        } else if config.home.is_some() {
+            PositionValidity::Unknown
+        } else {
+            PositionValidity::Unreferenced
+        };
         Self {
-            homed: config.absolute,
+            validity,
             ..Self::default()
         }
     }
@@ -26,9 +32,10 @@ impl HomingRun {
         self.sequence.is_some()
     }
 
-    pub(super) fn abort(&mut self) {
+    /// Ends a search with an error. The first one remains.
+    pub(super) fn abort(&mut self, error: HomingError) {
         if let Some(sequence) = &mut self.sequence {
-            sequence.abort();
+            sequence.abort(error);
         }
     }
 
@@ -40,7 +47,22 @@ impl HomingRun {
             })
     }
 
+    /// Returns true while the drive is commanded to halt (Controlword bit 8).
+    pub(super) fn is_halted(&self) -> bool {
+        self.order.is_some_and(|order| order.halt)
+    }
+
+    /// Notes that home is no longer where it was.
+    pub(super) fn invalidate(&mut self) {
+        if self.validity.is_homed() {
+            self.validity = PositionValidity::Unknown;
+        }
+    }
+
     fn end(&mut self, status: HomingStatus) {
+        if self.validity == PositionValidity::Homing {
+            self.validity = PositionValidity::Unknown;
+        }
         self.sequence = None;
         self.order = None;
         self.status = status;
@@ -51,9 +73,13 @@ impl Axis {
     /// Takes the position of a drive that has restarted as it is. `same`: it is the drive that was
     /// there before. Home is kept only by the absolute encoder of the same drive.
     pub fn restarted(&mut self, same: bool) {
-        self.home.homed &= same && self.config.absolute;
+        let kept = same && self.config.absolute;
+        if !kept {
+            self.home.invalidate();
+        }
+        self.cancel_mode_cycle();
         self.actual
-            .start_over(&self.config.scale, &self.compensation);
+            .start_over(&self.config.scale, &self.compensation, kept);
         self.restart_second_encoder();
     }
 
@@ -72,25 +98,38 @@ impl Axis {
         }
         self.check_switch(Mode::Hm)?;
         self.switch_failed = None;
+        self.forget_target();
         self.home_second_encoder();
         self.home = HomingRun {
             sequence: Some(Sequence::new(self.mode, timeout_s)),
             order: None,
             status: HomingStatus::Running,
-            homed: false,
+            validity: PositionValidity::Homing,
         };
         Ok(())
     }
 
+    /// Returns the reported and the configured home position if the drive does not stand there.
+    fn home_elsewhere(&self) -> Option<[f64; 2]> {
+        let home = self.config.home?;
+        let expected = home.position?;
+        let reported = self.actual.restarted(&self.config.scale)?;
+        let off = (reported - expected).abs() > home.window;
+        off.then_some([reported, expected])
+    }
+
     /// Advances the homing sequence, once per cycle and after the mode switch.
     pub(super) fn settle_homing(&mut self, fresh: bool, dt_s: f64) {
-        let Some(sequence) = self.home.sequence else {
+        let Some(sequence) = self.home.sequence.filter(|_| self.mode_cycle.is_none()) else {
             return;
         };
-        if !self.active {
+        if !self.follows() {
+            let refused = self.switch_failed == Some(Mode::Hm);
             self.mode = sequence.back();
             let error = if sequence.attained() {
                 None
+            } else if refused {
+                Some(HomingError::ModeRefused)
             } else {
                 Some(HomingError::PowerLost)
             };
@@ -109,6 +148,8 @@ impl Axis {
                 && self.switch_failed == ordered,
             state,
             standing: self.at_standstill(),
+            moves: self.config.home.is_none_or(|home| home.moves),
+            elsewhere: self.home_elsewhere(),
             fresh,
         };
         let before = sequence.attained();
@@ -116,16 +157,18 @@ impl Axis {
         self.home.sequence = Some(sequence);
         self.home.order = Some(order);
         if sequence.attained() && !before {
-            self.home.homed = true;
+            self.home.validity = if self.config.absolute {
+                PositionValidity::Absolute
+            } else {
+                PositionValidity::Homed
+            };
             self.actual.reference();
             self.actual
-                .start_over(&self.config.scale, &self.compensation);
+                .start_over(&self.config.scale, &self.compensation, false);
         }
         match outcome {
             Outcome::Running if order.mode != self.mode => {
-                if self.switch.map(|switch| switch.to) != Some(order.mode)
-                    && self.switch_failed != Some(order.mode)
-                {
+                if self.switching() != Some(order.mode) && self.switch_failed != Some(order.mode) {
                     self.begin_switch_late(order.mode);
                 }
             }
@@ -152,7 +195,7 @@ impl Axis {
             return Err(CommandError::NoPosition { mode: to });
         }
         // The deceleration is unknown in these modes.
-        let rest = matches!(to, Mode::Pp | Mode::Hm);
+        let rest = matches!(to, Mode::Pp | Mode::Hm) || self.config.mode_change_unpowered;
         if rest && !(self.setpoint_at_rest() && self.at_standstill()) {
             return Err(CommandError::StillMoving {
                 velocity: self.actual.velocity(),

@@ -7,7 +7,7 @@
 use super::{Axis, ControlledQuantity, Plan};
 use crate::cia402::Mode;
 use crate::setpoint::Motion;
-use crate::status::Trip;
+use crate::status::{PowerLossCause, Trip};
 use crate::supervision::StopMethod;
 
 /// The lost frames of an axis, for the axis that is coupled to it.
@@ -33,10 +33,12 @@ impl Axis {
     /// apply. Call it between [`Axis::observe`] and [`Axis::act`]. RT: O(1).
     pub fn follow(&mut self, motion: Motion, takes_up: bool) {
         let position = self.controlled_quantity() == ControlledQuantity::Position;
-        let possible = self.active && position && self.mode == Mode::Csp && self.switch.is_none();
+        let possible =
+            self.follows() && position && self.mode == Mode::Csp && self.switch.is_none();
         if possible && !self.setpoint_frozen() && motion.check().is_ok() {
             self.external_setpoint = Some(motion);
             self.plan = Plan::External;
+            self.forget_target();
             self.led = true;
             self.correction.led = takes_up;
         }
@@ -62,6 +64,6 @@ impl Axis {
     /// remains. RT: O(1).
     pub fn trip_by(&mut self, trip: Trip, method: StopMethod) {
         self.trip.get_or_insert(trip);
-        self.stop_by(method);
+        self.stop_with(PowerLossCause::Trip, method, false);
     }
 }

@@ -42,7 +42,7 @@ impl Axis {
             // Answers still expected are from before the gap.
             self.stale_answers = self.config.answers_late;
             self.revert_pending_mode();
-            if self.active {
+            if self.follows() {
                 if heard {
                     self.restore_last_sent();
                 }
@@ -89,7 +89,7 @@ impl Axis {
                 let hold = Hold {
                     acceleration: self.config.limits.acceleration,
                 };
-                self.motion = hold.advance(before, dt_s);
+                self.motion = hold.brake(before, dt_s);
             }
             ControlledQuantity::Torque => {
                 let ramp = Ramp {

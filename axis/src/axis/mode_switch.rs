@@ -9,14 +9,19 @@
 //! with CSP has arrived. A drive that received both modes in turn may show either mode for some
 //! cycles.
 
+use super::stop::PowerGoal;
 use super::supervision::SupervisionState;
 use super::{Axis, Plan};
 use crate::cia402::{Mode, State};
 use crate::profile_mode::{Goal, Profile};
 use crate::setpoint::Ramp;
+use crate::status::Trip;
 
 /// Fresh cycles that must show the new mode, if the drive received both modes in turn.
 const MODE_CONFIRM_CYCLES: u8 = 10;
+
+/// Fresh cycles after a withdrawn request before the next one.
+const WITHDRAWN_CYCLES: u8 = 5;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Switch {
@@ -31,6 +36,9 @@ pub(super) struct Switch {
     /// Consecutive fresh cycles that have shown the new mode, and the required number of them.
     shown: u8,
     certain: u8,
+    /// Consecutive fresh cycles until the new mode is requested again after a withdrawal. Frames that
+    /// are lost in the meantime would change the mode of the drive once more.
+    pause: u8,
 }
 
 impl Axis {
@@ -53,7 +61,34 @@ impl Axis {
         })
     }
 
+    /// Returns the mode of a pending switch.
+    pub(super) fn switching(&self) -> Option<Mode> {
+        let cycle = self.mode_cycle.map(|cycle| cycle.to);
+        self.switch.map(|switch| switch.to).or(cycle)
+    }
+
+    /// Returns the trip of a drive with power that should show its mode by now. Until then targets
+    /// follow actual values.
+    pub(super) fn check_late_mode(&self) -> Option<Trip> {
+        let display = Mode::from_code(self.mode_display?);
+        let time_s = self.config.mode_time_s;
+        let waits = self.config.mode_display_enabled
+            && self.goal == PowerGoal::On
+            && self.state == State::OperationEnabled
+            && !self.follows()
+            && !self.mode_confirmed();
+        (waits && self.memory.in_state_s() > time_s).then_some(Trip::ModeNotShown {
+            expected: self.mode,
+            display,
+            time_s,
+        })
+    }
+
     pub(super) fn begin_switch(&mut self, to: Mode) {
+        if self.config.mode_change_unpowered {
+            self.begin_mode_cycle(to);
+            return;
+        }
         if self.config.control(to) == super::ControlledQuantity::Position
             && self.controlled_quantity() == super::ControlledQuantity::Velocity
         {
@@ -68,6 +103,7 @@ impl Axis {
             reached: false,
             shown: 0,
             certain: 1,
+            pause: 0,
         });
         self.switch_failed = None;
     }
@@ -87,6 +123,11 @@ impl Axis {
             return;
         };
         let shows = self.shows(switch.to);
+        switch.pause = match fresh {
+            true => switch.pause.saturating_sub(1),
+            false if switch.pause > 0 => WITHDRAWN_CYCLES,
+            false => 0,
+        };
         if fresh {
             // The answered frame requested the new mode, and all frames since have done so.
             let answered = switch.asked > self.config.answers_late;
@@ -122,11 +163,11 @@ impl Axis {
         }
     }
 
-    /// True if the previous mode must be requested: too many consecutive frames were lost, and the
-    /// drive may move in that mode. After homing the drive stands, and bit 4 could start another
+    /// True if the previous mode must be requested: too many consecutive frames were lost a few cycles
+    /// ago, and the drive may move in that mode. After homing the drive stands, and bit 4 could start another
     /// homing.
     fn is_held_back(&self, switch: &Switch) -> bool {
-        self.setpoint_frozen()
+        (self.setpoint_frozen() || switch.pause > 0)
             && !switch.reached
             && switch.to == Mode::Csp
             && !matches!(self.mode, Mode::Hm | Mode::Csp)
@@ -138,6 +179,9 @@ impl Axis {
         {
             // The next answers belong to frames that requested the previous mode.
             (switch.asked, switch.certain) = (0, MODE_CONFIRM_CYCLES);
+            if self.setpoint_frozen() {
+                switch.pause = WITHDRAWN_CYCLES;
+            }
             self.switch = Some(switch);
         }
     }
@@ -179,6 +223,7 @@ impl Axis {
         self.transfer_setpoint(from);
         if !self.plan.fits(self.config.control(to)) {
             self.plan = Plan::braking(&self.config, to);
+            self.forget_target();
         }
     }
 

@@ -1,11 +1,13 @@
 //! The plan of an axis: it advances the set-point.
 
+use super::stop::PowerGoal;
 use super::{Axis, AxisConfig, ControlledQuantity};
+use crate::HomingError;
 use crate::cia402::{Mode, ModeStatus};
 use crate::position_loop::bounded;
 use crate::setpoint::{
-    Goal, Hold, JerkLimited, Motion, MotionLimits, MoveRequest, Ramp, Setpoint, SetpointError,
-    Source, Trapezoid,
+    Goal, Hold, JerkLimited, Motion, MotionLimits, MoveRequest, Ramp, Rate, Setpoint,
+    SetpointError, Source, Trapezoid, braking_velocity,
 };
 use crate::status::CommandError;
 
@@ -157,7 +159,7 @@ impl Axis {
     /// Prepares a position or velocity command after a torque: starts from the actual motion and
     /// torque.
     pub(super) fn engage(&mut self) {
-        if self.active && self.controlled_quantity() == ControlledQuantity::Torque {
+        if self.follows() && self.controlled_quantity() == ControlledQuantity::Torque {
             self.motion = self.motion_at_actual(self.held_velocity());
             self.track_play();
             self.loop_state.take_over();
@@ -203,7 +205,9 @@ impl Axis {
 
     /// Decelerates to rest, with any active plan.
     pub(super) fn brake(&mut self) {
-        self.home.abort();
+        self.home.abort(HomingError::Aborted);
+        self.forget_target();
+        self.demand_rest();
         self.correction.completes = false;
         let braking = Plan::braking(&self.config, self.mode);
         if braking == Plan::DriveProfile {
@@ -224,30 +228,34 @@ impl Axis {
         let grip = self.controlled_quantity();
         self.held_by_range &= matches!(self.plan, Plan::Velocity(_) | Plan::DriveProfile);
         match self.plan {
-            // The drive shows the new mode but does not follow in it yet.
+            // The drive shows the new mode but does not follow in it yet. A stop keeps its set-point.
             _ if grip == ControlledQuantity::Position
+                && self.goal == PowerGoal::On
                 && self.switch.is_some()
                 && !self.follows_now() =>
             {
                 self.motion = self.following();
                 self.track_play();
             }
-            Plan::Hold(hold) => self.motion = hold.advance(before, dt_s),
+            Plan::Hold(hold) => self.motion = hold.brake(before, dt_s),
             Plan::Jerk(ref mut source) => {
-                source.set_rate(self.rate, before, dt_s);
-                self.motion = source.advance(before, dt_s);
+                self.motion = source.advance(before, Rate::new(self.rate), dt_s);
             }
             Plan::Move(trapezoid) => {
                 let velocity = bounded(trapezoid.velocity * self.rate, self.config.limits.velocity);
-                let trapezoid = Trapezoid {
+                let mut trapezoid = Trapezoid {
                     velocity,
                     ..trapezoid
                 };
-                self.motion = trapezoid.advance(before, dt_s);
+                // `velocity` has the override.
+                self.motion = trapezoid.advance(before, Rate::WHOLE, dt_s);
             }
             Plan::Velocity(ramp) => self.motion = self.run(ramp, before, dt_s),
             Plan::Torque(ramp) => {
                 let before = self.loop_state.limited_torque();
+                // A held machine is not driven.
+                let target = if self.rate == 0.0 { 0.0 } else { ramp.target };
+                let ramp = Ramp { target, ..ramp };
                 self.loop_state.torque = ramp.advance(self.loop_state.torque, dt_s);
                 self.keep_speed(before, fresh, dt_s);
                 self.motion = self.uncommanded();
@@ -277,7 +285,7 @@ impl Axis {
                         acceleration: self.config.limits.acceleration,
                     };
                     self.plan = Plan::Hold(hold);
-                    self.motion = hold.advance(before, dt_s);
+                    self.motion = hold.brake(before, dt_s);
                 }
             },
         }
@@ -335,8 +343,18 @@ impl Axis {
         let commands_position = self.controlled_quantity() == ControlledQuantity::Position;
         let smooth = self.config.jerk_limited && (commands_position || nominal.target != 0.0);
         let asked = if smooth {
-            let (velocity, acceleration) = (before.velocity, before.acceleration);
-            let asked = ramp.advance_smoothly(velocity, acceleration, limits.jerk(), dt_s);
+            let velocity = before.velocity;
+            let slope = if self.held_by_range {
+                // The range decelerates more steeply than the ramp. Continued, this deceleration
+                // would pass the target, and turn the axis.
+                let left = ramp.target - velocity;
+                let most = braking_velocity(left.abs(), limits.jerk(), dt_s);
+                let towards = before.acceleration * left.signum();
+                towards.max(0.0).min(most) * left.signum()
+            } else {
+                before.acceleration
+            };
+            let asked = ramp.advance_smoothly(velocity, slope, limits.jerk(), dt_s);
             // A motion taken over with a steep slope would pass the limit.
             bounded(asked, limits.velocity)
         } else {
@@ -362,7 +380,7 @@ impl Axis {
     fn profile_arrived(&self) -> bool {
         match (self.mode, self.profile.goal()) {
             (Mode::Pp, Some(_)) => !self.profile.pending(),
-            (Mode::Pp, None) if self.profile.pending() => false,
+            (Mode::Pp, None) if self.profile.pending() || self.profile.not_taken() => false,
             (Mode::Pv, Some(goal)) => {
                 !self.holds(goal.target)
                     && self.velocity_reached(self.profile_velocity(goal.target))
@@ -376,7 +394,10 @@ impl Axis {
             Plan::Torque(_) => {
                 self.loop_state.torque == 0.0 && self.loop_state.limited_torque() == 0.0
             }
-            Plan::DriveProfile => !self.home.running() && self.at_standstill(),
+            Plan::DriveProfile => {
+                let homes = self.home.running() && self.mode_cycle.is_none();
+                !homes && self.at_standstill()
+            }
             _ => self.motion.velocity == 0.0 && self.play_rests(),
         }
     }

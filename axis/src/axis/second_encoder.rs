@@ -52,7 +52,8 @@ impl Axis {
             .counts
             .map_or_else(|| encoder.first(raw), |counts| counts.unwrap_next(raw));
         second.counts = Some(counts);
-        if second.waits_for_home || !self.home.homed || self.actual.counts().is_none() {
+        if second.waits_for_home || !self.home.validity.is_homed() || self.actual.counts().is_none()
+        {
             second.offset = None;
             return;
         }

@@ -9,14 +9,15 @@
 //! jerk. The timer also runs while frames are lost, so power is removed in bounded time even
 //! without any further answer.
 
-use super::{Axis, ControlledQuantity, Plan};
+use super::{Axis, AxisConfig, ControlledQuantity, Plan};
+use crate::HomingError;
 use crate::cia402::{Power, State};
 use crate::setpoint::{Goal, JerkLimited, Motion, MotionLimits, MoveRequest};
-use crate::status::{StopPhase, StopStatus, Trip};
+use crate::status::{PowerLossCause, StopPhase, StopStatus, Trip};
 use crate::supervision::{FaultReset, StopMethod};
 
 /// Time in seconds that an axis stands before its power is removed: its following error settles.
-const SETTLE_S: f64 = 0.1;
+pub(super) const SETTLE_S: f64 = 0.1;
 /// After the time-out, an axis that has not slowed down for this long is not decelerating.
 const UNSLOWED_S: f64 = 1.0;
 /// A drive whose quick stop ends by itself has this time for its brake (S-0-0207); then its voltage
@@ -44,13 +45,52 @@ pub(super) struct Stop {
     /// True: the drive stays in Quick stop active and keeps its power.
     pub(super) stays: bool,
     removing_power: bool,
-    elapsed_s: f64,
-    timeout_s: f64,
+    deceleration: Deceleration,
     /// Time in seconds for which the axis has been standing.
     standing_s: f64,
+}
+
+/// The progress of a deceleration against its time-out.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Deceleration {
+    elapsed_s: f64,
+    timeout_s: f64,
     /// Lowest reported speed, and the time in seconds since it last fell.
     slowest: f64,
     unslowed_s: f64,
+}
+
+impl Deceleration {
+    pub(super) const fn new(speed: f64, timeout_s: f64) -> Self {
+        Self {
+            elapsed_s: 0.0,
+            timeout_s,
+            slowest: speed,
+            unslowed_s: 0.0,
+        }
+    }
+
+    pub(super) const fn elapsed_s(&self) -> f64 {
+        self.elapsed_s
+    }
+
+    pub(super) fn pass(&mut self, dt_s: f64) {
+        self.elapsed_s = (self.elapsed_s + dt_s).min(LONGEST_S);
+        self.unslowed_s = (self.unslowed_s + dt_s).min(LONGEST_S);
+    }
+
+    /// Notes a fresh speed. `window`: what counts as slower.
+    pub(super) fn note(&mut self, speed: f64, window: f64) {
+        if speed < self.slowest - window {
+            (self.slowest, self.unslowed_s) = (speed, 0.0);
+        }
+    }
+
+    /// True at the time-out. Without a configured one, an axis that still slows down gets more time.
+    pub(super) fn is_late(&self, config: &AxisConfig) -> bool {
+        let slows = config.stop_timeout_s.is_none() && self.unslowed_s <= UNSLOWED_S;
+        self.elapsed_s > self.timeout_s && !slows
+    }
 }
 
 impl Stop {
@@ -70,7 +110,12 @@ impl Stop {
 
     /// True if the time to remove the power has passed and the axis does not slow down.
     fn is_over(&self) -> bool {
-        self.removing_power && self.elapsed_s > POWER_OFF_S && self.unslowed_s > POWER_OFF_S
+        let Deceleration {
+            elapsed_s,
+            unslowed_s,
+            ..
+        } = self.deceleration;
+        self.removing_power && elapsed_s > POWER_OFF_S && unslowed_s > POWER_OFF_S
     }
 }
 
@@ -92,16 +137,24 @@ pub(super) struct Resets {
 }
 
 impl Axis {
-    /// Stops the axis and removes its power. An active stop only becomes harder. RT: O(1).
+    /// Stops the axis and removes its power, for a cause outside of it. An active stop only becomes
+    /// harder. RT: O(1).
     pub fn stop_by(&mut self, method: StopMethod) {
-        self.begin_stop(method, false);
+        self.stop_with(PowerLossCause::Outside, method, false);
     }
 
-    pub(super) fn begin_stop(&mut self, method: StopMethod, stays: bool) {
+    /// The only entry to a stop that ends without power. The first cause since the axis was enabled
+    /// remains.
+    pub(super) fn stop_with(&mut self, cause: PowerLossCause, method: StopMethod, stays: bool) {
+        if self.goal != PowerGoal::Off {
+            self.power_loss_cause.get_or_insert(cause);
+        }
+        self.cancel_mode_cycle();
         let method = match method {
             StopMethod::Ramp if !self.follows_set_points() => StopMethod::QuickStop,
             method => method,
         };
+        let may_move = self.state.has_power() || self.has_control();
         match &mut self.goal {
             PowerGoal::Off => return,
             // While the power is removed, only its immediate removal is harder.
@@ -113,7 +166,7 @@ impl Axis {
                 return;
             }
             // Without power the drive cannot move.
-            PowerGoal::On if !self.state.has_power() && !self.active => {
+            PowerGoal::On if !may_move => {
                 self.goal = PowerGoal::Off;
                 return;
             }
@@ -131,10 +184,17 @@ impl Axis {
         }
     }
 
+    /// Removes the power of an axis at rest, to switch its mode.
+    pub(super) fn remove_power_at_rest(&mut self) {
+        self.power_loss_cause.get_or_insert(PowerLossCause::Command);
+        self.forget_target();
+        self.goal = PowerGoal::Stopping(self.new_stop(StopMethod::Ramp));
+    }
+
     /// True if the drive follows set-points: it has power, shows the mode and sets Statusword bit
     /// 12.
     pub(super) fn follows_set_points(&self) -> bool {
-        self.active
+        self.follows()
             && self.state == State::OperationEnabled
             && self.mode_confirmed()
             && self.reported_to_follow()
@@ -147,12 +207,16 @@ impl Axis {
             method,
             stays: false,
             removing_power: method == StopMethod::DisableVoltage,
-            elapsed_s: 0.0,
-            timeout_s: self.config.stop_time_s(self.mode, fastest),
+            deceleration: Deceleration::new(speed, self.stop_time_s(fastest)),
             standing_s: 0.0,
-            slowest: speed,
-            unslowed_s: 0.0,
         }
+    }
+
+    /// Returns the time in seconds after which a stop from `speed` becomes harder. A speed above the
+    /// limit may be reported in a wrong unit and gives no more time.
+    pub(super) fn stop_time_s(&self, speed: f64) -> f64 {
+        let most = self.config.limits.velocity * super::supervision::OVER_VELOCITY;
+        self.config.stop_time_s(self.mode, speed.min(most))
     }
 
     /// Advances a stop by one cycle, also while frames are lost.
@@ -161,24 +225,28 @@ impl Axis {
         let mut stop = match self.goal {
             PowerGoal::Stopping(stop) => stop,
             // The drive became enabled after the request to remove its power.
-            PowerGoal::Off if fresh && self.state == State::OperationEnabled => Stop {
-                removing_power: true,
-                ..self.new_stop(StopMethod::QuickStop)
-            },
+            PowerGoal::Off if fresh && self.state == State::OperationEnabled => {
+                self.power_loss_cause
+                    .get_or_insert(PowerLossCause::Unrequested);
+                Stop {
+                    removing_power: true,
+                    ..self.new_stop(StopMethod::QuickStop)
+                }
+            }
             _ => return,
         };
         if fresh && !self.state.has_power() {
             self.goal = PowerGoal::Off;
             return;
         }
-        stop.elapsed_s = (stop.elapsed_s + dt_s).min(LONGEST_S);
-        stop.unslowed_s = (stop.unslowed_s + dt_s).min(LONGEST_S);
-        let speed = self.actual.velocity().abs();
-        if fresh && speed < stop.slowest - self.standstill_window() {
-            (stop.slowest, stop.unslowed_s) = (speed, 0.0);
+        stop.deceleration.pass(dt_s);
+        if fresh {
+            let speed = self.actual.velocity().abs();
+            stop.deceleration.note(speed, self.standstill_window());
         }
         if stop.removing_power {
-            let late = stop.elapsed_s.min(stop.unslowed_s) > DRIVE_OFF_S;
+            let slowing = stop.deceleration;
+            let late = slowing.elapsed_s.min(slowing.unslowed_s) > DRIVE_OFF_S;
             if self.config.quick_stop_ends && !self.state.is_fault() && late {
                 stop.method = StopMethod::DisableVoltage;
             }
@@ -199,16 +267,14 @@ impl Axis {
             0.0
         };
         let standing = stop.standing_s >= SETTLE_S;
-        let timeout_set = self.config.stop_timeout_s.is_some();
-        let late = stop.elapsed_s > stop.timeout_s && (timeout_set || stop.unslowed_s > UNSLOWED_S);
         if standing && !stop.stays {
             if self.brake_state.open {
                 self.brake_state = BrakeState::default();
             }
             if self.brake_state.since_s >= self.config.brake.engage_s {
-                (stop.removing_power, stop.elapsed_s) = (true, 0.0);
+                (stop.removing_power, stop.deceleration.elapsed_s) = (true, 0.0);
             }
-        } else if !standing && late {
+        } else if !standing && stop.deceleration.is_late(&self.config) {
             stop = self.harder(stop);
         }
         self.goal = PowerGoal::Stopping(stop);
@@ -222,7 +288,7 @@ impl Axis {
         if !expected && self.stale_cycles == 0 && !self.at_standstill() {
             self.trip.get_or_insert(Trip::NotStopped {
                 velocity: self.actual.velocity(),
-                time_s: stop.elapsed_s,
+                time_s: stop.deceleration.elapsed_s,
                 method: stop.method,
             });
         }
@@ -243,6 +309,7 @@ impl Axis {
         {
             return;
         }
+        self.power_loss_cause.get_or_insert(PowerLossCause::Fault);
         self.goal = if self.state.has_power() {
             let stop = self.new_stop(StopMethod::QuickStop);
             PowerGoal::Stopping(Stop {
@@ -278,8 +345,8 @@ impl Axis {
         Some(StopStatus {
             method: stop.method,
             phase,
-            elapsed_s: stop.elapsed_s,
-            timeout_s: stop.timeout_s,
+            elapsed_s: stop.deceleration.elapsed_s,
+            timeout_s: stop.deceleration.timeout_s,
         })
     }
 
@@ -293,7 +360,8 @@ impl Axis {
             && self.controlled_quantity() == ControlledQuantity::Position
             && let Some(plan) = self.jerk_limited_stop()
         {
-            self.home.abort();
+            self.forget_target();
+            self.home.abort(HomingError::Aborted);
             self.plan = Plan::Jerk(plan);
             return;
         }
@@ -308,8 +376,9 @@ impl Axis {
             range,
             ..self.stop_request()
         };
-        let adds = motion.acceleration * motion.velocity >= 0.0;
-        if let (Plan::Jerk(source), false) = (&self.plan, adds) {
+        if let Plan::Jerk(source) = &self.plan
+            && source.can_rest_before_turning()
+        {
             return source.redirect(order, motion, self.dt_s).ok();
         }
         self.stop_from(order, motion)
@@ -330,7 +399,7 @@ impl Axis {
 
     fn stop_from(&self, order: MoveRequest, motion: Motion) -> Option<JerkLimited> {
         let start = Motion {
-            acceleration: taken_over(motion, order.ceiling),
+            acceleration: taken_over(motion, order.ceiling, self.dt_s),
             ..motion
         };
         JerkLimited::new(order, start, self.dt_s).ok()
@@ -340,7 +409,7 @@ impl Axis {
     /// without power.
     pub(super) fn settle_brake(&mut self) {
         let powered = matches!(self.state, State::OperationEnabled | State::QuickStopActive);
-        if self.active && self.goal == PowerGoal::On && !self.brake_state.open {
+        if self.follows() && self.goal == PowerGoal::On && !self.brake_state.open {
             self.brake_state = BrakeState {
                 open: true,
                 since_s: 0.0,
@@ -360,7 +429,7 @@ impl Axis {
         let FaultReset::Automatic { tries, delay_s } = self.config.fault_reset else {
             return;
         };
-        if self.active {
+        if self.follows() {
             self.auto_reset.healthy_s += dt_s;
             if self.auto_reset.healthy_s > AUTO_RESET_FORGET_S {
                 self.auto_reset.tried = 0;
@@ -384,10 +453,13 @@ impl Axis {
 
 /// Returns the initial deceleration of a stop. An acceleration that increases the speed becomes 0.
 /// A deceleration is bounded so that the jerk limit can end it before the axis reverses.
-fn taken_over(motion: Motion, limits: MotionLimits) -> f64 {
+fn taken_over(motion: Motion, limits: MotionLimits, dt_s: f64) -> f64 {
     if motion.acceleration * motion.velocity >= 0.0 {
         return 0.0;
     }
-    let most = (2.0 * limits.jerk * motion.velocity.abs()).sqrt();
+    // The velocity of a motion is the mean of its cycle: half a cycle of deceleration follows.
+    let half = dt_s / 2.0;
+    let speed = motion.velocity.abs();
+    let most = limits.jerk * ((half * half + 2.0 * speed / limits.jerk).sqrt() - half);
     motion.acceleration.max(-most).min(most)
 }

@@ -2,7 +2,7 @@
 
 use super::stop::PowerGoal;
 use super::{Axis, ControlledQuantity};
-use crate::cia402::{Mode, ModeStatus, State};
+use crate::cia402::{Mode, ModeStatus, State, Statusword};
 use crate::limits::Limits;
 use crate::position_loop::bounded;
 use crate::setpoint::{Motion, braking_velocity};
@@ -10,11 +10,29 @@ use crate::status::{DriveFault, Trip};
 use crate::units::Counts;
 
 /// Factor on the velocity limit, and consecutive fresh cycles above it until the axis trips.
-const OVER_VELOCITY: f64 = 1.2;
+pub(super) const OVER_VELOCITY: f64 = 1.2;
 const OVER_VELOCITY_CYCLES: u8 = 5;
 
 /// Consecutive fresh cycles without Statusword bit 12 until the axis counts as not following.
 const FOLLOW_CYCLES: u8 = 10;
+
+/// A plausible change of the reported position: the cycles by which its age may differ, the time
+/// after which a drive with a slow position loop reports a new one, and counts.
+const JUMP_CYCLES: f64 = 3.0;
+const JUMP_S: f64 = 0.002;
+const JUMP_COUNTS: f64 = 8.0;
+
+/// Time in seconds for which a reported velocity may contradict the positions: filters of drives
+/// delay it.
+const CONTRADICTION_S: f64 = 0.05;
+/// Fraction of the velocity limit up to which velocities are not compared.
+const CONTRADICTION_FLOOR: f64 = 0.05;
+
+/// Consecutive cycles with a Statusword that a drive with power cannot show, in which the last
+/// command holds.
+const UNLISTED_CYCLES: u8 = 5;
+/// The longest time in seconds for which such words delay enabling.
+const UNLISTED_S: f64 = 1.0;
 
 /// Fresh cycles after a lost frame until the drive has the newest target and reports it.
 const CATCH_UP_CYCLES: u8 = 2;
@@ -40,6 +58,8 @@ pub(super) struct SupervisionState {
     pub(super) max_following_error: f64,
     over_velocity_cycles: u8,
     over_acceleration_cycles: u8,
+    /// Time in seconds for which reported velocity and positions have contradicted each other.
+    contradiction_s: f64,
     /// Time in seconds for which the torque has exceeded its limit.
     over_torque_s: f64,
     /// The last target that the drive surely has, and the consecutive fresh cycles since.
@@ -66,6 +86,7 @@ impl SupervisionState {
             self.last_received_target = Some(sent);
         }
         self.fresh_cycles = 0;
+        self.contradiction_s = 0.0;
     }
 
     fn narrow(&mut self, position: f64, limits: &Limits) {
@@ -101,7 +122,15 @@ impl Axis {
             self.reset = false;
             self.fault = None;
         }
-        if !self.active {
+        let jump = self.position_jump();
+        if jump.is_some() && self.goal == PowerGoal::On {
+            self.home.invalidate();
+        }
+        if let Some(trip) = self.check_late_mode() {
+            self.trip(trip);
+            return;
+        }
+        if !self.has_control() {
             return;
         }
         if self.state != State::OperationEnabled {
@@ -111,6 +140,7 @@ impl Axis {
             return;
         }
         if let Some(display) = self.mode_display
+            && self.follows()
             && !self.mode_confirmed()
         {
             self.trip(Trip::ModeLost {
@@ -119,12 +149,14 @@ impl Axis {
             });
             return;
         }
-        // At standstill, targets follow actual values again. In motion the axis has lost control.
-        if !self.reported_to_follow() && !self.setpoint_at_rest() {
+        // Also at rest: a drive that does not follow holds no load. At rest a mode switch may take
+        // its time, which is limited.
+        let switches = self.switch.is_some() && self.setpoint_at_rest();
+        if self.follows() && !self.reported_to_follow() && !switches {
             self.trip(Trip::NotFollowing { mode: self.mode });
             return;
         }
-        if let Some(trip) = self.check_limits() {
+        if let Some(trip) = jump.or_else(|| self.check_limits()) {
             self.trip(trip);
         }
     }
@@ -133,7 +165,7 @@ impl Axis {
     /// Afterwards the bit may be missing for a few cycles. A drive that catches up after a lost
     /// frame may limit the step and clear the bit.
     pub(super) fn reported_to_follow(&self) -> bool {
-        let most = if self.active { FOLLOW_CYCLES } else { 1 };
+        let most = if self.follows() { FOLLOW_CYCLES } else { 1 };
         self.unfollowed_cycles < most
     }
 
@@ -150,13 +182,51 @@ impl Axis {
 
     /// Trips the axis. The first cause remains.
     fn trip(&mut self, trip: Trip) {
-        self.trip.get_or_insert(trip);
-        self.stop_by(self.config.supervision.reaction);
+        self.trip_by(trip, self.config.supervision.reaction);
     }
 
     pub(super) fn emergency_stop(&mut self) {
-        self.trip.get_or_insert(Trip::EmergencyStop);
-        self.stop_by(self.config.supervision.emergency);
+        self.trip_by(Trip::EmergencyStop, self.config.supervision.emergency);
+    }
+
+    /// Returns true for a Statusword that the drive cannot show now: one that the table does not list,
+    /// or Not ready to switch on, which is left once after the start (transition 1). While an axis is
+    /// being enabled, such words last at most a second: a new command would take the drive back.
+    pub(super) fn is_unlisted(&self, word: u16) -> bool {
+        let state = State::from_statusword(Statusword::from_bits_retain(word));
+        let powered = self.state.has_power() || self.unlisted_cycles > 0;
+        (powered || self.is_being_enabled() && self.unlisted_s < UNLISTED_S)
+            && matches!(state, State::Unknown(_) | State::NotReadyToSwitchOn)
+    }
+
+    fn is_being_enabled(&self) -> bool {
+        // The drive may have left the last listed state.
+        let passing = matches!(
+            self.state,
+            State::SwitchOnDisabled | State::ReadyToSwitchOn | State::SwitchedOn
+        );
+        self.goal == PowerGoal::On && passing
+    }
+
+    /// Counts a cycle whose inputs are not believed. The last command holds for some of them; then
+    /// the axis trips.
+    pub(super) fn count_unlisted(&mut self, word: u16) {
+        if self.is_being_enabled() {
+            self.unlisted_s += self.dt_s;
+            return;
+        }
+        // While the power is removed, the time of the stop decides.
+        if matches!(self.goal, PowerGoal::Stopping(stop) if stop.removes_power()) {
+            return;
+        }
+        self.unlisted_cycles = self.unlisted_cycles.saturating_add(1);
+        if self.unlisted_cycles > UNLISTED_CYCLES && !matches!(self.state, State::Unknown(_)) {
+            self.state = State::Unknown(word);
+            self.statusword = Statusword::from_bits_retain(word);
+            if self.goal != PowerGoal::Off {
+                self.trip(Trip::UnlistedStatusword { word });
+            }
+        }
     }
 
     fn check_limits(&mut self) -> Option<Trip> {
@@ -165,7 +235,8 @@ impl Axis {
         let mut cause = None;
         // A motion of the drive without a set-point is not a following error.
         let unknown = self.interrupted && (self.mode != Mode::Csp || self.left_csp());
-        if self.controlled_quantity() == ControlledQuantity::Position && !unknown {
+        let commands = self.follows() && !unknown;
+        if self.controlled_quantity() == ControlledQuantity::Position && commands {
             let scale = &self.config.scale;
             // This set-point is already one cycle old.
             let commanded = self.expected(self.config.dead_time_s - self.dt_s);
@@ -197,7 +268,9 @@ impl Axis {
         }
         let elsewhere = self.check_second_encoder();
         // Where the load is, is known again after homing.
-        self.home.homed &= elsewhere.is_none();
+        if elsewhere.is_some() {
+            self.home.invalidate();
+        }
         cause = cause.or(elsewhere);
         if self.mode == Mode::Pp && self.profile.not_taken() {
             cause = Some(Trip::SetPointNotTaken);
@@ -219,7 +292,13 @@ impl Axis {
         }
         let velocity = self.actual.velocity();
         let slack = self.velocity_slack();
-        let fast = velocity.abs() > limits.velocity * OVER_VELOCITY + slack;
+        // A wrong unit of 0x606C, or a drive that runs away, shows in the positions.
+        let derived = self.actual.derived_velocity();
+        let most = limits.velocity * OVER_VELOCITY;
+        let shifts = self.mode == Mode::Hm || self.actual.counts().is_none();
+        let runs = !shifts && derived.abs() > most + self.derived.slack[1];
+        let fast = velocity.abs() > most + slack || runs;
+        cause = cause.or_else(|| self.velocity_contradiction(shifts));
         if let Some(watch) = self.config.supervision.torque {
             let torque = self.actual.torque();
             self.supervision.over_torque_s = if torque.abs() > watch.percent {
@@ -255,12 +334,50 @@ impl Axis {
             0
         };
         if self.supervision.over_velocity_cycles >= OVER_VELOCITY_CYCLES {
+            let velocity = if runs { derived } else { velocity };
             cause = cause.or(Some(Trip::OverVelocity {
                 velocity,
                 limit: limits.velocity,
             }));
         }
         cause
+    }
+
+    /// Returns the trip for a reported position that the axis cannot have reached. Homing shifts the
+    /// origin.
+    fn position_jump(&self) -> Option<Trip> {
+        let homes = self.other_mode() == Some(Mode::Hm) && self.next_mode_displayed();
+        if self.mode == Mode::Hm || homes {
+            return None;
+        }
+        let (step, step_s) = self.actual.step();
+        let velocity = self
+            .compensation
+            .drive_velocity(self.config.limits.velocity);
+        let time_s = step_s + (JUMP_CYCLES * self.dt_s).max(JUMP_S);
+        let slack = self.config.scale.units_of_counts(JUMP_COUNTS);
+        let most = velocity * OVER_VELOCITY * time_s + slack;
+        (step.abs() > most).then_some(Trip::PositionJump { step, most })
+    }
+
+    /// Returns the trip for a reported velocity that contradicts the reported positions, by a factor
+    /// of two or by its sign.
+    fn velocity_contradiction(&mut self, shifts: bool) -> Option<Trip> {
+        let reported = self.actual.filtered_velocity();
+        let derived = self.actual.derived_velocity();
+        let larger = reported.abs().max(derived.abs());
+        let floor = (self.config.limits.velocity * CONTRADICTION_FLOOR)
+            .max(self.standstill_window())
+            .max(self.derived.slack[1] * 4.0);
+        let agrees = reported * derived >= larger * larger * 0.5;
+        let measured = self.actual.velocity_is_measured() && !shifts;
+        if !measured || larger <= floor || agrees {
+            self.supervision.contradiction_s = 0.0;
+            return None;
+        }
+        self.supervision.contradiction_s += self.dt_s;
+        (self.supervision.contradiction_s > CONTRADICTION_S)
+            .then_some(Trip::VelocityContradiction { reported, derived })
     }
 
     /// Returns the error from the resolution of the velocity, user units per second.

@@ -5,7 +5,8 @@
 //! limits keep every axis within its own limits.
 
 use crate::setpoint::{
-    Goal, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint, SetpointError,
+    Goal, HoldResponse, JerkLimited, Motion, MotionLimits, MoveRequest, Rate, Setpoint,
+    SetpointError,
 };
 
 /// The part of one axis in a line.
@@ -168,12 +169,6 @@ impl LinePath {
         self.path.used().acceleration * (self.target - self.start).abs()
     }
 
-    /// Multiplies the velocity on the line by `rate`, within the limits of the axes; 0 stops on the
-    /// line. Call it for all axes in the same cycle. RT: O(1).
-    pub fn set_rate(&mut self, rate: f64, dt_s: f64) {
-        self.path.set_rate(rate, self.at, dt_s);
-    }
-
     /// Restarts from `motion` after an interruption. The other axes of the line were interrupted as
     /// well and compute the same.
     fn take_up(&mut self, motion: Motion) {
@@ -190,15 +185,16 @@ impl LinePath {
 }
 
 impl Setpoint for LinePath {
-    /// RT: O(1).
-    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
+    /// Multiplies the velocity on the line by `rate`, within the limits of the axes; 0 stops on the
+    /// line. All axes of the line need the same rate. RT: O(1).
+    fn advance(&mut self, motion: Motion, rate: Rate, dt_s: f64) -> Motion {
         if dt_s.is_nan() || dt_s <= 0.0 {
             return motion;
         }
         if (motion.position, motion.velocity) != (self.last.position, self.last.velocity) {
             self.take_up(motion);
         }
-        self.at = self.path.advance(self.at, dt_s);
+        self.at = self.path.advance(self.at, rate, dt_s);
         let way = self.target - self.start;
         let position = if self.at.position == 1.0 {
             self.target
@@ -207,6 +203,10 @@ impl Setpoint for LinePath {
         };
         self.last = motion.then(position, way * self.at.velocity, dt_s);
         self.last
+    }
+
+    fn at_hold(&self) -> HoldResponse {
+        HoldResponse::Waits
     }
 
     /// True at the target.

@@ -41,6 +41,7 @@ struct Follower {
     axis: LineAxis,
     source: LinePath,
     motion: Motion,
+    rate: Rate,
     differences: Motion,
 }
 
@@ -50,12 +51,13 @@ impl Follower {
             source: line.along(&axis),
             axis,
             motion: axis.from,
+            rate: Rate::WHOLE,
             differences: axis.from,
         }
     }
 
     fn cycle(&mut self) -> Result<(), TestCaseError> {
-        let next = self.source.advance(self.motion, DT);
+        let next = self.source.advance(self.motion, self.rate, DT);
         let velocity = (next.position - self.motion.position) / DT;
         let acceleration = (velocity - self.differences.velocity) / DT;
         let jerk = (acceleration - self.differences.acceleration) / DT;
@@ -151,7 +153,7 @@ fn line_of_zero_length_is_finished() {
         for axis in axes {
             let mut source = line.along(axis);
             assert!(source.finished(axis.from));
-            assert_eq!(source.advance(axis.from, DT), axis.from);
+            assert_eq!(source.advance(axis.from, Rate::WHOLE, DT), axis.from);
         }
     }
 }
@@ -182,7 +184,7 @@ proptest! {
         for (event, cycles) in events.into_iter().chain([(Event::Rate(1.0), 10_000)]) {
             for f in &mut followers {
                 match event {
-                                        Event::Rate(rate) => f.source.set_rate(rate, DT),
+                    Event::Rate(rate) => f.rate = Rate::new(rate),
                     Event::Freeze => {
                         f.motion.velocity = 0.0;
                         f.differences.velocity = 0.0;

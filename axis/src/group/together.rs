@@ -43,7 +43,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::setpoint::{Goal, Motion, MotionLimits, MoveRequest, Setpoint};
+    use crate::setpoint::{Goal, Motion, MotionLimits, MoveRequest, Rate, Setpoint};
 
     const DT: f64 = 0.001;
 
@@ -77,7 +77,7 @@ mod tests {
             let mut arrived = vec![None; axes.len()];
             for cycle in 0..=(duration / DT) as u32 + 2 {
                 for (index, (source, motion)) in moves.iter_mut().zip(&mut at).enumerate() {
-                    let next = source.advance(*motion, DT);
+                    let next = source.advance(*motion, Rate::WHOLE, DT);
                     let limits = axes[index].0;
                     let change = (next.velocity - motion.velocity).abs();
                     prop_assert!(change <= limits.acceleration * DT + 1e-9);

@@ -1,5 +1,6 @@
 //! Homing parameters: method, speeds and offsets, and the objects that contain them.
 
+use crate::axis::{AxisConfig, HomeReference};
 use crate::limits::Limits;
 use crate::scale::Scale;
 use crate::units::{UserAcceleration, UserUnits, UserVelocity};
@@ -124,6 +125,10 @@ pub fn method(code: i8) -> Option<&'static Method> {
     METHODS.get(at)
 }
 
+/// Time in seconds by which a report may be late, and counts by which a drive may miss home.
+const REPORT_S: f64 = 0.01;
+const HOME_COUNTS: f64 = 10.0;
+
 /// Homing parameters in user units. `None`: the drive keeps its own setting.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Homing {
@@ -141,6 +146,9 @@ pub struct Homing {
     pub position: Option<f64>,
     /// Current threshold that detects a mechanical stop, milliamperes, maxon's 0x30B2.
     pub threshold_ma: Option<u16>,
+    /// True if the negative methods are maxon's. Otherwise they are the vendor's, and their
+    /// meaning is unknown.
+    pub maxon_methods: bool,
 }
 
 /// One start-up SDO.
@@ -162,7 +170,7 @@ pub struct HomingObject {
 #[non_exhaustive]
 pub enum ParameterError {
     /// The method is unknown.
-    #[error("homing method {0} is not one of CiA 402 or maxon")]
+    #[error("homing method {0} is none of CiA 402, nor of the vendor")]
     Method(i8),
     /// A velocity or acceleration is out of range.
     #[error("{what} is {value}: it must be above zero and within the limit of {limit}")]
@@ -207,12 +215,23 @@ impl Homing {
             distance: None,
             position: None,
             threshold_ma: None,
+            maxon_methods: true,
         }
+    }
+
+    /// Returns the method, if its meaning is known.
+    #[must_use]
+    pub fn known_method(&self) -> Option<&'static Method> {
+        method(self.method).filter(|known| self.maxon_methods || known.code >= 0)
     }
 
     /// Checks the parameters against scale and limits of the axis.
     pub fn check(&self, scale: &Scale, limits: &Limits) -> Result<(), ParameterError> {
-        let method = method(self.method).ok_or(ParameterError::Method(self.method))?;
+        let method = self.known_method();
+        let vendor_specific = !self.maxon_methods && self.method < 0;
+        if method.is_none() && !vendor_specific {
+            return Err(ParameterError::Method(self.method));
+        }
         let resolution = scale.velocity_resolution();
         for (what, value, limit) in [
             ("search velocity", self.search_velocity, limits.velocity),
@@ -242,10 +261,31 @@ impl Homing {
                 return Err(ParameterError::Counts { what, value });
             }
         }
-        if method.needs.obstacle && self.threshold_ma.is_none() {
+        let needs_obstacle = method.is_some_and(|method| method.needs.obstacle);
+        if needs_obstacle && self.threshold_ma.is_none() {
             return Err(ParameterError::NoThreshold(self.method));
         }
         Ok(())
+    }
+
+    /// Returns what a completed homing shows. A drive may stop beyond its switch or index, by its
+    /// braking distance; with speeds of its own, by at most a turn of the motor.
+    #[must_use]
+    pub fn reference(&self, config: &AxisConfig) -> HomeReference {
+        let limits = &config.limits;
+        let fastest = [self.search_velocity, self.zero_velocity]
+            .into_iter()
+            .flatten()
+            .reduce(f64::max);
+        let braking = fastest.map_or(config.scale.units_per_turn().abs(), |velocity| {
+            let acceleration = self.acceleration.unwrap_or(limits.acceleration);
+            velocity * velocity / (2.0 * acceleration) + velocity * REPORT_S
+        });
+        HomeReference {
+            position: self.position,
+            window: config.target_window + config.scale.units_of_counts(HOME_COUNTS) + braking,
+            moves: !matches!(self.method, 35 | 37),
+        }
     }
 
     /// Returns the objects to write before the first homing. `maxon`: writes 0x30B0 instead of
@@ -410,5 +450,19 @@ mod tests {
             ..Homing::by(-3)
         };
         assert_eq!(end.check(&scale(), &LIMITS), Ok(()));
+        // Another vendor's methods have no known needs.
+        for method in [-1, -17, i8::MIN] {
+            let vendor = Homing {
+                maxon_methods: false,
+                ..Homing::by(method)
+            };
+            assert_eq!(vendor.check(&scale(), &LIMITS), Ok(()));
+            assert_eq!(vendor.known_method(), None);
+        }
+        let reserved = Homing {
+            maxon_methods: false,
+            ..Homing::by(15)
+        };
+        assert!(reserved.check(&scale(), &LIMITS).is_err());
     }
 }

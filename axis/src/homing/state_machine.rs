@@ -6,12 +6,16 @@
 
 use crate::cia402::{HomingState, Mode};
 
-/// Longest time in seconds after the start in which "attained" or "error" may refer to the previous
-/// homing.
+/// Longest time in seconds after the start in which an error may refer to the previous homing.
+/// "Attained" counts only after the drive has cleared it: an old one would end the search at once.
 const STALE_S: f64 = 0.1;
 
-/// Time in seconds after a halt or an error until the sequence ends even if the axis still moves.
-const HALT_S: f64 = 2.0;
+/// Time in seconds for which an axis with "attained" stands, without "target reached" (bit 10),
+/// until its homing has ended.
+const SETTLE_S: f64 = 0.1;
+
+/// Time in seconds that the drive has to show the new origin in 0x6064.
+const ORIGIN_S: f64 = 0.5;
 
 /// Time in seconds that an axis must stand before the mode changes back. A mode that takes over
 /// earlier would end the deceleration at that position, perhaps with a last step further onto a
@@ -27,12 +31,31 @@ pub enum HomingError {
         /// The time limit in seconds.
         timeout_s: f64,
     },
+    /// Statusword bit 12 (homing attained) was set from the start on.
+    #[error(
+        "the drive has shown \"homing attained\" (Statusword bit 12) since before the search: it may \
+         be that of an earlier homing"
+    )]
+    NeverCleared,
+    /// The drive reports home, and another position.
+    #[error(
+        "the drive reports home, and a position (0x6064) of {reported:.4} instead of {expected:.4}"
+    )]
+    Elsewhere {
+        /// The reported position.
+        reported: f64,
+        /// The configured home position.
+        expected: f64,
+    },
     /// The drive reports an error (Statusword bit 13).
     #[error("the drive reports a homing error")]
     Drive,
     /// A command ended homing.
     #[error("homing was aborted")]
     Aborted,
+    /// A hold ended homing.
+    #[error("a hold ended homing")]
+    Held,
     /// 0x6061 did not show mode 6.
     #[error("the drive did not change to homing mode")]
     ModeRefused,
@@ -51,6 +74,10 @@ pub struct HomingInputs {
     /// Bits 13, 12 and 10; only valid in homing mode.
     pub state: HomingState,
     pub standing: bool,
+    /// False if the method sets home where the axis is.
+    pub moves: bool,
+    /// The reported and the configured home position, if the drive does not stand there.
+    pub elsewhere: Option<[f64; 2]>,
     /// False after a lost frame: the inputs are old.
     pub fresh: bool,
 }
@@ -81,14 +108,15 @@ enum Phase {
     /// Homing mode with bit 4 low.
     Prepare,
     Search {
-        /// The drive still shows its state from before the start.
-        stale: bool,
+        /// The drive has shown that it searches: neither "attained" nor "error".
+        cleared: bool,
         elapsed_s: f64,
+        /// Time in seconds for which the axis has been standing with "attained".
+        attained_s: f64,
     },
     /// Halted because of `error`.
     Halt {
         error: HomingError,
-        elapsed_s: f64,
         stood_s: f64,
     },
     Leave {
@@ -133,8 +161,7 @@ impl Sequence {
     }
 
     /// Halts the axis and switches back. Has no effect after the end of the search.
-    pub fn abort(&mut self) {
-        let error = HomingError::Aborted;
+    pub fn abort(&mut self, error: HomingError) {
         self.phase = match self.phase {
             Phase::Enter | Phase::Prepare => Phase::Leave { result: Err(error) },
             Phase::Search { .. } => Phase::halt(error),
@@ -176,42 +203,58 @@ impl Phase {
             },
             Self::Enter if seen.fresh && seen.mode == Mode::Hm => Self::Prepare,
             Self::Prepare if seen.fresh => Self::Search {
-                stale: seen.state.is_attained() || seen.state.is_error(),
+                cleared: !(seen.state.is_attained() || seen.state.is_error()),
                 elapsed_s: 0.0,
+                attained_s: 0.0,
             },
-            Self::Search { stale, elapsed_s } => {
+            Self::Search {
+                cleared,
+                elapsed_s,
+                attained_s,
+            } => {
                 let elapsed_s = elapsed_s + dt_s;
-                let said = seen.state.is_attained() || seen.state.is_error();
-                let stale = stale && (!seen.fresh || said) && elapsed_s < STALE_S;
-                let news = seen.fresh && !stale;
-                if news && seen.state.is_error() {
+                let (attained, error) = (seen.state.is_attained(), seen.state.is_error());
+                let cleared = cleared || seen.fresh && !attained && !error;
+                let evident = attained && seen.standing && (cleared || !seen.moves);
+                let attained_s = match (seen.fresh, evident) {
+                    (false, _) => attained_s,
+                    (true, true) => attained_s + dt_s,
+                    (true, false) => 0.0,
+                };
+                let ended = seen.state == HomingState::Completed || attained_s >= SETTLE_S;
+                if seen.fresh && error && (cleared || elapsed_s >= STALE_S) {
                     Self::halt(HomingError::Drive)
-                } else if news && seen.state.is_attained() && seen.standing {
+                } else if seen.fresh && evident && ended && seen.elsewhere.is_none() {
                     Self::Leave { result: Ok(()) }
+                } else if let Some([reported, expected]) = seen.elsewhere
+                    && attained_s > ORIGIN_S
+                {
+                    Self::halt(HomingError::Elsewhere { reported, expected })
                 } else if elapsed_s > timeout_s {
-                    Self::halt(HomingError::Timeout { timeout_s })
+                    Self::halt(if cleared || !attained {
+                        HomingError::Timeout { timeout_s }
+                    } else {
+                        HomingError::NeverCleared
+                    })
                 } else {
-                    Self::Search { stale, elapsed_s }
+                    Self::Search {
+                        cleared,
+                        elapsed_s,
+                        attained_s,
+                    }
                 }
             }
-            Self::Halt {
-                error,
-                elapsed_s,
-                stood_s,
-            } => {
+            Self::Halt { error, stood_s } => {
                 let stood_s = match (seen.fresh, seen.standing) {
                     (false, _) => stood_s,
                     (true, true) => stood_s + dt_s,
                     (true, false) => 0.0,
                 };
-                if stood_s > REST_S || elapsed_s > HALT_S {
+                // A drive that ignores the halt is stopped by the supervision of the axis.
+                if stood_s > REST_S {
                     Self::Leave { result: Err(error) }
                 } else {
-                    Self::Halt {
-                        error,
-                        elapsed_s: elapsed_s + dt_s,
-                        stood_s,
-                    }
+                    Self::Halt { error, stood_s }
                 }
             }
             Self::Leave { result } if seen.mode == back || seen.mode_failed => {
@@ -224,7 +267,6 @@ impl Phase {
     const fn halt(error: HomingError) -> Self {
         Self::Halt {
             error,
-            elapsed_s: 0.0,
             stood_s: 0.0,
         }
     }
@@ -242,6 +284,8 @@ mod tests {
             mode_failed: false,
             state,
             standing,
+            moves: true,
+            elsewhere: None,
             fresh: true,
         }
     }
@@ -363,8 +407,23 @@ mod tests {
             );
             assert_eq!(order.mode, CSP);
         }
-        // A method that ends at once may never show "in progress".
-        let (sequence, _, _) = run(new(), &[(HM, Completed, true, 150)]);
+        // Never cleared: it may be that of an earlier homing.
+        let (mut sequence, order, _) = run(new(), &[(HM, Completed, true, 5010)]);
+        assert!(order.halt && !sequence.attained());
+        for _ in 0..60 {
+            (sequence, _, _) = sequence.step(&seen(HM, Completed, true), DT);
+        }
+        let (_, _, outcome) = sequence.step(&seen(CSP, NotStarted, true), DT);
+        assert_eq!(outcome, Outcome::Failed(HomingError::NeverCleared));
+        // A method without motion may end before the first answer.
+        let mut sequence = new();
+        for _ in 0..3 {
+            let there = HomingInputs {
+                moves: false,
+                ..seen(HM, Completed, true)
+            };
+            (sequence, _, _) = sequence.step(&there, DT);
+        }
         assert!(sequence.attained());
     }
 
@@ -383,10 +442,12 @@ mod tests {
         // Home is never found, and the axis never stands.
         let (sequence, order, _) = run(new(), &[start, (HM, InProgress, false, 5010)]);
         assert!(order.halt);
-        let (_, _, outcome) = run(
-            sequence,
-            &[(HM, InProgress, false, 2100), (CSP, NotStarted, false, 1)],
-        );
+        let rest = [
+            (HM, InProgress, false, 2100),
+            (HM, NotStarted, true, 60),
+            (CSP, NotStarted, true, 1),
+        ];
+        let (_, _, outcome) = run(sequence, &rest);
         let timeout = HomingError::Timeout { timeout_s: 5.0 };
         assert_eq!(outcome, Outcome::Failed(timeout));
         assert_eq!(timeout.to_string(), "home was not found within 5 s");
@@ -400,7 +461,7 @@ mod tests {
             &[start, search],
         ] {
             let (mut sequence, _, _) = run(new(), rows);
-            sequence.abort();
+            sequence.abort(HomingError::Aborted);
             let rest = [(HM, NotStarted, true, 60), (CSP, NotStarted, true, 1)];
             let (_, order, outcome) = run(sequence, &rest);
             assert_eq!(outcome, Outcome::Failed(HomingError::Aborted));
@@ -424,7 +485,7 @@ mod tests {
                 (HM, HomingState::Completed, true, 1),
             ],
         );
-        sequence.abort();
+        sequence.abort(HomingError::Aborted);
         let (_, _, outcome) = run(sequence, &[(CSP, HomingState::NotStarted, true, 1)]);
         assert_eq!(outcome, Outcome::Attained);
     }

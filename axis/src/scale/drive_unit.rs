@@ -117,15 +117,67 @@ impl Default for VelocityUnit {
     }
 }
 
+/// The text is not a power of ten times `rpm`, `counts/s` or `turns/s`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "a unit of velocity is `rpm`, `mrpm`, `counts/s` or `turns/s`, with a power of ten before it"
+)]
+pub struct UnknownVelocityUnit;
+
+/// The names of the base units.
+const VELOCITY_BASES: [(&str, VelocityBase); 3] = [
+    ("counts/s", VelocityBase::CountsPerSecond),
+    ("turns/s", VelocityBase::TurnsPerSecond),
+    ("rpm", VelocityBase::TurnsPerMinute),
+];
+
+/// Parses a power of ten: `0.1`, `100` or `10^-5`. An empty text is 1.
+fn power_of_ten(text: &str) -> Option<i8> {
+    let mut prefixes = PREFIXES;
+    let prefix = match text.strip_prefix("10^") {
+        Some(exponent) => exponent.parse().ok()?,
+        None if text.is_empty() => 0,
+        None => prefixes.find(|prefix| factor(*prefix) == text)?,
+    };
+    PREFIXES.contains(&prefix).then_some(prefix)
+}
+
+/// Returns the decimal digits of a power of ten.
+fn factor(prefix: i8) -> String {
+    let zeros = usize::from(prefix.unsigned_abs());
+    match prefix {
+        ..0 => format!("0.{}1", "0".repeat(zeros - 1)),
+        _ => format!("1{}", "0".repeat(zeros)),
+    }
+}
+
+impl core::str::FromStr for VelocityUnit {
+    type Err = UnknownVelocityUnit;
+
+    /// Parses `rpm`, `mrpm`, `0.1rpm`, `10^-5 turns/s`. Allocates: do not call in the cycle.
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        if text == "mrpm" {
+            return Ok(Self::MILLI_RPM);
+        }
+        let mut bases = VELOCITY_BASES.into_iter();
+        let unit = bases.find_map(|(name, base)| {
+            let prefix = power_of_ten(text.strip_suffix(name)?.trim_end())?;
+            Some(Self { base, prefix })
+        });
+        unit.ok_or(UnknownVelocityUnit)
+    }
+}
+
 impl fmt::Display for VelocityUnit {
+    /// Writes a text that [`VelocityUnit::from_str`](core::str::FromStr) parses.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let base = match self.base {
-            VelocityBase::CountsPerSecond => "counts/s",
-            VelocityBase::TurnsPerSecond => "turns/s",
-            VelocityBase::TurnsPerMinute => "rpm",
-        };
+        let mut bases = VELOCITY_BASES.iter();
+        let base = bases.find(|(_, base)| *base == self.base);
+        let base = base.map_or("", |(name, _)| name);
         match (self.prefix, self.base) {
             (0, _) => f.write_str(base),
+            (-1, _) => write!(f, "0.1 {base}"),
+            (-2, _) => write!(f, "0.01 {base}"),
             (-3, VelocityBase::TurnsPerMinute) => f.write_str("mrpm"),
             (prefix, _) => write!(f, "10^{prefix} {base}"),
         }

@@ -24,7 +24,7 @@ pub struct DriveUnits {
     pub rated_torque: Option<u32>,
     /// maxon's 0x3001:05, µNm/A.
     pub torque_constant: Option<u32>,
-    /// 0x607E: bit 7 position, bit 6 velocity.
+    /// 0x607E: bit 7 position, bit 6 velocity, bit 5 torque (not of CiA 402-2; several vendors).
     pub polarity: Option<u8>,
 }
 
@@ -50,6 +50,13 @@ pub enum UnitMismatch {
         expected: f64,
         /// The value of the drive.
         found: f64,
+    },
+    /// 0x6091 scales the counts of an encoder that the drive does not report (no 0x608F, 0x6092).
+    GearAlone {
+        /// Motor turns, driving shaft turns.
+        gear: [u32; 2],
+        /// The configured counts per motor turn.
+        expected: f64,
     },
     /// 0x60A8.
     PositionUnit {
@@ -85,7 +92,7 @@ pub enum UnitMismatch {
         /// The value of the drive.
         found: u32,
     },
-    /// 0x607E: the drive inverts position, velocity or both.
+    /// 0x607E: the drive inverts position, velocity or torque.
     Polarity {
         /// The value of the drive.
         found: u8,
@@ -105,7 +112,8 @@ pub fn same_motor(expected: u32, found: u32) -> bool {
     (expected - found).abs() <= expected * SAME_TORQUE
 }
 
-const POLARITIES: u8 = 0xC0;
+/// The bits of 0x607E that turn values: position, velocity, torque.
+const POLARITIES: u8 = 0xE0;
 
 impl DriveUnits {
     /// Returns position units per motor turn, computed from 0x608F, 0x6091 and 0x6092, and the
@@ -142,7 +150,12 @@ impl DriveUnits {
         let encoder = ratio(0x608F, self.encoder_resolution, &mut found);
         let gear = ratio(0x6091, self.gear_ratio, &mut found);
         let feed = ratio(0x6092, self.feed_constant, &mut found);
-        found.extend(counts_per_turn(encoder, gear, feed, scale));
+        found.extend(match (encoder, feed.filter(|&feed| feed != 1.0), gear) {
+            (None, None, Some(_)) => self
+                .gear_ratio
+                .and_then(|gear| gear_alone(gear, scale.counts_per_turn())),
+            _ => counts_per_turn(encoder, gear, feed, scale),
+        });
         if let Some(code) = self.position_unit
             && code != INCREMENTS
         {
@@ -198,6 +211,29 @@ fn said(encoder: Option<f64>, gear: Option<f64>, feed: Option<f64>) -> Option<(u
     }
 }
 
+/// Returns the counts of a motor turn before the gear.
+fn counts_before([motor, shaft]: [u32; 2], counts: f64) -> f64 {
+    counts * f64::from(motor) / f64::from(shaft)
+}
+
+/// Returns true if an encoder can have this resolution: a whole number of counts, and a power of
+/// two as absolute encoders have it.
+fn is_absolute_resolution(counts: f64) -> bool {
+    let whole = counts.round();
+    (counts - whole).abs() <= counts * SAME
+        && (2.0..=f64::from(u32::MAX)).contains(&whole)
+        && (whole as u64).is_power_of_two()
+}
+
+/// Checks a gear of a drive that reports neither its encoder nor a feed constant. Users write the
+/// encoder's resolution and the counts that they want: then the denominator is the configured
+/// figure.
+fn gear_alone(gear: [u32; 2], expected: f64) -> Option<UnitMismatch> {
+    let [motor, shaft] = gear;
+    let is_usual = (f64::from(shaft) - expected).abs() <= expected * SAME;
+    (motor != shaft && !is_usual).then_some(UnitMismatch::GearAlone { gear, expected })
+}
+
 fn counts_per_turn(
     encoder: Option<f64>,
     gear: Option<f64>,
@@ -205,12 +241,7 @@ fn counts_per_turn(
     scale: &Scale,
 ) -> Option<UnitMismatch> {
     let expected = scale.counts_per_turn();
-    let (index, found) = match (said(encoder, gear, feed), gear) {
-        (Some(said), _) => said,
-        // Without both, a gear still scales the configured counts of the encoder.
-        (None, Some(gear)) if gear != 1.0 => (0x6091, expected / gear),
-        (None, _) => return None,
-    };
+    let (index, found) = said(encoder, gear, feed)?;
     let same = (found - expected).abs() <= expected * SAME;
     (!same).then_some(UnitMismatch::CountsPerTurn {
         index,
@@ -220,12 +251,25 @@ fn counts_per_turn(
 }
 
 impl UnitMismatch {
+    /// Returns true if a gear without 0x608F cannot belong to the configured counts per turn: no
+    /// encoder has the resolution that follows.
+    #[must_use]
+    pub fn is_impossible_gear(&self) -> bool {
+        match *self {
+            Self::GearAlone { gear, expected } => {
+                !is_absolute_resolution(counts_before(gear, expected))
+            }
+            _ => false,
+        }
+    }
+
     /// Returns index and subindex of the contradicting object.
     #[must_use]
     pub const fn object(&self) -> (u16, u8) {
         match *self {
             Self::Ratio { index, below, .. } => (index, if below == 0 { 2 } else { 1 }),
             Self::CountsPerTurn { index, .. } => (index, 1),
+            Self::GearAlone { .. } => (0x6091, 1),
             Self::PositionUnit { .. } => (0x60A8, 0),
             Self::VelocityUnit { .. } => (0x60A9, 0),
             Self::AccelerationUnit { .. } => (0x60AA, 0),
@@ -247,6 +291,9 @@ impl UnitMismatch {
                 "set the drive's gear ratio to 1:1 and its feed constant to the encoder's counts per turn, and describe the gear in \
                  the machine file; or give in the machine file what the drive counts per motor turn"
             }
+            Self::GearAlone { .. } => {
+                "write the drive's counts per motor turn, after 0x6091, as the encoder of the machine file"
+            }
             Self::PositionUnit { .. } => "set 0x60A8 to 0x00B50000, encoder increments",
             Self::VelocityUnit { .. } => {
                 "write the expected unit to 0x60A9 at start-up, or name the drive's unit in the machine file"
@@ -264,7 +311,7 @@ impl UnitMismatch {
                 "correct the motor's torque constant in the machine file, or the drive's motor data"
             }
             Self::Polarity { .. } => {
-                "set 0x607E to 0 and turn the axis round in the machine file, so that only one of them does"
+                "set 0x607E to 0 and invert the axis in the machine file (`invert`): drives differ in what 0x607E turns"
             }
         }
     }
@@ -291,6 +338,16 @@ impl fmt::Display for UnitMismatch {
                 f,
                 "makes {found} counts per motor turn, expected {expected}"
             ),
+            Self::GearAlone { gear, expected } => {
+                let [motor, shaft] = gear;
+                write!(
+                    f,
+                    "and :02 are {motor}:{shaft}: {expected} counts per motor turn need an encoder of {}; \
+                     an encoder of {expected} makes {} counts",
+                    counts_before(gear, expected),
+                    counts_before([shaft, motor], expected),
+                )
+            }
             Self::PositionUnit { found } => {
                 write!(f, "is 0x{found:08X}, expected encoder increments")
             }

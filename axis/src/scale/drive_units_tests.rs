@@ -67,7 +67,7 @@ fn contradictions_are_reported() {
                 ..good
             },
             (0x6091, 1),
-            "8000 counts",
+            "are 1:4: 2000 counts per motor turn need an encoder of 500; an encoder of 2000 makes 8000 counts",
         ),
         (
             DriveUnits {
@@ -149,6 +149,14 @@ fn contradictions_are_reported() {
             (0x607E, 0),
             "0x40",
         ),
+        (
+            DriveUnits {
+                polarity: Some(0x20),
+                ..good
+            },
+            (0x607E, 0),
+            "0x20",
+        ),
     ] {
         let found = offered.contradictions(&scale, torque);
         let [one] = found.as_slice() else {
@@ -161,7 +169,7 @@ fn contradictions_are_reported() {
     }
     // Other bits of the polarity and a feed constant of 1 are ignored.
     let unused = DriveUnits {
-        polarity: Some(0x3F),
+        polarity: Some(0x1F),
         feed_constant: Some([1, 1]),
         ..good
     };
@@ -214,4 +222,58 @@ fn acceleration_unit_other_than_velocity_unit_is_reported() {
             .0,
         1000
     );
+}
+
+/// Drives with 0x6091 but neither 0x608F nor 0x6092: the encoder's resolution is not reported.
+#[test]
+fn a_gear_alone_is_compared_with_resolutions_that_encoders_have() {
+    let found = |gear, counts| {
+        let offered = DriveUnits {
+            gear_ratio: Some(gear),
+            ..DriveUnits::default()
+        };
+        let scale = Scale::new(counts, 1.0).unwrap();
+        offered.contradictions(&scale, None)
+    };
+    // 23 bits, of which 10,000 counts are made.
+    assert_eq!(found([8_388_608, 10_000], 10_000.0), []);
+    assert_eq!(found([10_000, 2_500], 2_500.0), []);
+    assert_eq!(found([7, 7], 10_000.0), []);
+    for (gear, counts, impossible) in [
+        // The same ratio, reduced.
+        ([524_288, 625], 10_000.0, false),
+        // 24 bits, or 23 bits and half the counts.
+        ([2, 1], 8_388_608.0, false),
+        ([8_388_608, 10_000], 8_388_608.0, true),
+        ([3, 1], 2_000.0, true),
+    ] {
+        let [one] = found(gear, counts)[..] else {
+            panic!("{gear:?} {counts}")
+        };
+        assert_eq!(one.object(), (0x6091, 1));
+        assert_eq!(one.is_impossible_gear(), impossible, "{one}");
+    }
+}
+
+#[test]
+fn velocity_units_parse_as_they_are_written() {
+    let rpm = |code: u32| VelocityUnit::from_si_code(code).unwrap();
+    for (text, code) in [
+        ("rpm", 0x00B4_4700),
+        ("mrpm", 0xFDB4_4700),
+        ("0.1rpm", 0xFFB4_4700),
+        ("0.1 rpm", 0xFFB4_4700),
+        ("0.01rpm", 0xFEB4_4700),
+        ("0.00001 rpm", 0xFBB4_4700),
+        ("10^-5 rpm", 0xFBB4_4700),
+        ("10 counts/s", 0x01B5_0300),
+        ("0.001turns/s", 0xFDB4_0300),
+    ] {
+        let unit: VelocityUnit = text.parse().unwrap();
+        assert_eq!(unit, rpm(code), "{text}");
+        assert_eq!(unit.to_string().parse(), Ok(unit), "{unit}");
+    }
+    for text in ["", "0.2rpm", "10^12 rpm", "1.0rpm", "rps", "0.1", "x rpm"] {
+        assert!(text.parse::<VelocityUnit>().is_err(), "{text}");
+    }
 }

@@ -20,7 +20,7 @@ fn velocity_units_follow_the_si_codes() {
     }
     assert_eq!(
         VelocityUnit::from_si_code(0xFEB4_4700).unwrap().to_string(),
-        "10^-2 rpm"
+        "0.01 rpm"
     );
     // An acceleration, a position, invalid codes.
     for code in [0x00C0_0300, 0x00B5_0000, 0, u32::MAX, 0x80B4_4700] {

@@ -8,7 +8,8 @@
 
 use super::error::{position, usable};
 use super::{
-    Goal, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint, SetpointError, braking_velocity,
+    Goal, Hold, HoldResponse, JerkLimited, Motion, MotionLimits, MoveRequest, Rate, Setpoint,
+    SetpointError, braking_velocity,
 };
 
 /// Fraction of the acceleration used to plan braking. The rest covers rounding.
@@ -160,13 +161,6 @@ impl Gear {
         Ok(())
     }
 
-    /// Sets the override of shifts. 0 holds a shift on its way. RT: O(1).
-    pub fn set_rate(&mut self, rate: f64, dt_s: f64) {
-        if let Some((plan, done)) = &mut self.shift {
-            plan.set_rate(rate, *done, dt_s);
-        }
-    }
-
     /// Returns the motion of the shift in progress.
     fn shifted(&self) -> Motion {
         self.shift
@@ -174,11 +168,11 @@ impl Gear {
             .map_or(Motion::default(), |(_, done)| *done)
     }
 
-    fn advance_shift(&mut self, dt_s: f64) {
+    fn advance_shift(&mut self, rate: Rate, dt_s: f64) {
         let Some((plan, done)) = &mut self.shift else {
             return;
         };
-        *done = plan.advance(*done, dt_s);
+        *done = plan.advance(*done, rate, dt_s);
         if plan.finished(*done) {
             self.offset += done.position;
             self.shift = None;
@@ -191,21 +185,25 @@ impl Gear {
         self.slips
     }
 
-    /// Advances one cycle from `motion`. `master` is the master's motion at the end of the cycle. A
-    /// value that is not finite leaves the master unchanged. RT: O(1).
-    #[must_use]
-    pub fn advance(&mut self, master: Motion, motion: Motion, dt_s: f64) -> Motion {
-        if dt_s.is_nan() || dt_s <= 0.0 {
-            return motion;
-        }
+    /// Returns the source of set-points that follows `master` in this cycle.
+    pub const fn with_master(&mut self, master: Master) -> FollowingGear<'_> {
+        FollowingGear { gear: self, master }
+    }
+
+    fn follow(&mut self, master: Master, motion: Motion, rate: Rate, dt_s: f64) -> Motion {
         let before = self.ideal;
-        if master.check().is_ok() {
-            self.track(master, dt_s);
+        if master.motion.check().is_ok() {
+            self.track(master.motion, dt_s);
         }
-        self.advance_shift(dt_s);
+        self.advance_shift(rate.min(Rate::WHOLE), dt_s);
         let ideal = self.ratio * self.master.position + self.offset();
         if position("gear position", ideal).is_ok() {
             self.ideal = ideal;
+        }
+        if rate.is_held() && !(self.engaged && master.comes_to_rest) {
+            self.engaged = false;
+            let acceleration = self.limits.acceleration;
+            return Hold { acceleration }.brake(motion, dt_s);
         }
         let [slowest, fastest] = self.possible(motion, dt_s);
         let was_engaged = self.engaged;
@@ -297,6 +295,42 @@ impl Gear {
             }
         }
         [slowest, fastest]
+    }
+}
+
+/// What a gear follows in one cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Master {
+    /// The master's motion at the end of the cycle. The master stays as it was if a value is not
+    /// finite.
+    pub motion: Motion,
+    /// The hold of the follower holds the master as well and brings this motion to rest.
+    pub comes_to_rest: bool,
+}
+
+/// A [`Gear`] with its master of one cycle.
+#[derive(Debug)]
+pub struct FollowingGear<'g> {
+    gear: &'g mut Gear,
+    master: Master,
+}
+
+impl Setpoint for FollowingGear<'_> {
+    /// The rate slows only a shift: the motion is that of the master. RT: O(1).
+    fn advance(&mut self, motion: Motion, rate: Rate, dt_s: f64) -> Motion {
+        if dt_s.is_nan() || dt_s <= 0.0 {
+            return motion;
+        }
+        self.gear.follow(self.master, motion, rate, dt_s)
+    }
+
+    fn at_hold(&self) -> HoldResponse {
+        HoldResponse::FollowsToRest
+    }
+
+    /// A gear ends by a command only.
+    fn finished(&self, _: Motion) -> bool {
+        false
     }
 }
 

@@ -4,6 +4,15 @@ use super::super::test_support::Sequence;
 use super::super::{Goal, JerkLimited, MoveRequest, Setpoint};
 use super::*;
 
+/// Advances a gear whose axis is not held.
+fn follow(gear: &mut Gear, motion: Motion, from: Motion, dt_s: f64) -> Motion {
+    let master = Master {
+        motion,
+        comes_to_rest: false,
+    };
+    gear.with_master(master).advance(from, Rate::WHOLE, dt_s)
+}
+
 const DT: f64 = 0.001;
 
 const LIMITS: MotionLimits = MotionLimits {
@@ -36,7 +45,7 @@ fn gear_engages_with_a_moving_master() {
         let mut engaged_at = None;
         for cycle in 0..4000 {
             master.position += master.velocity * DT;
-            let next = gear.advance(master, sequence.motion, DT);
+            let next = follow(&mut gear, master, sequence.motion, DT);
             sequence.then(next).unwrap();
             if gear.engaged() {
                 engaged_at.get_or_insert(cycle);
@@ -71,14 +80,14 @@ fn gear_catches_up_after_a_jump_of_the_master() {
     for cycle in 0..1000 {
         let master = Motion::at(if cycle < 10 { 0.0 } else { 20.0 });
         sequence
-            .then(gear.advance(master, sequence.motion, DT))
+            .then(follow(&mut gear, master, sequence.motion, DT))
             .unwrap();
         assert!(sequence.motion.position <= 20.0 + 1e-9);
     }
     assert!(gear.engaged() && sequence.motion.stands_at(20.0));
     assert_eq!(gear.lag_cycles(), 1);
     // A NaN does not move the follower.
-    let next = gear.advance(Motion::at(f64::NAN), sequence.motion, DT);
+    let next = follow(&mut gear, Motion::at(f64::NAN), sequence.motion, DT);
     assert!(next.stands_at(20.0));
 }
 
@@ -103,7 +112,7 @@ fn gear_smooths_a_reported_master() {
         let position = f64::from(cycle) * DT * 33.3;
         let reported = Motion::at((position / 0.0025).round() * 0.0025);
         sequence
-            .then(gear.advance(reported, sequence.motion, DT))
+            .then(follow(&mut gear, reported, sequence.motion, DT))
             .unwrap();
         if cycle > 500 {
             worst = worst.max((sequence.motion.position - position).abs());
@@ -142,7 +151,7 @@ fn gear_follows_a_master_sampled_by_its_own_loop() {
             for cycle in 1..4000 {
                 let time = f64::from(cycle) * DT;
                 let sampled = (time / SAMPLE).floor() * SAMPLE * velocity;
-                let next = gear.advance(Motion::at(sampled), sequence.motion, DT);
+                let next = follow(&mut gear, Motion::at(sampled), sequence.motion, DT);
                 sequence.then(next).unwrap();
                 if cycle > 500 {
                     apart += u32::from(!gear.engaged());
@@ -170,7 +179,7 @@ fn gear_stops_at_the_end_of_the_range() {
             // To 90 and back without a pause, with velocity steps to catch up with.
             let master = f64::from((cycle - 1000i32).abs().min(900)) * -0.1 + 90.0;
             sequence
-                .then(gear.advance(Motion::at(master), sequence.motion, DT))
+                .then(follow(&mut gear, Motion::at(master), sequence.motion, DT))
                 .unwrap();
             assert!(sequence.motion.position.abs() <= 10.0, "{cycle}");
             if cycle == 1000 {
@@ -233,8 +242,8 @@ proptest! {
             }
             source = source.redirect(MoveRequest::within(Goal::Position(target), LIMITS), master, DT).unwrap();
             for _ in 0..cycles {
-                master = source.advance(master, DT);
-                sequence.then(gear.advance(master, sequence.motion, DT))?;
+                master = source.advance(master, Rate::WHOLE, DT);
+                sequence.then(follow(&mut gear, master, sequence.motion, DT))?;
                 if ranged {
                     prop_assert!(sequence.motion.position.abs() <= 60.0 + 1e-9, "{:?}", sequence.motion);
                 }
@@ -264,7 +273,7 @@ proptest! {
             total += distance;
             for _ in 0..cycles {
                 cycle += 1;
-                let next = gear.advance(master(cycle), motion, DT);
+                let next = follow(&mut gear, master(cycle), motion, DT);
                 let jerk = (next.acceleration - motion.acceleration) / DT;
                 prop_assert!(next.velocity.abs() <= LIMITS.velocity * (1.0 + 1e-9));
                 prop_assert!(next.acceleration.abs() <= LIMITS.acceleration * 0.5 * (1.0 + 1e-6));
@@ -290,9 +299,65 @@ proptest! {
             let _ = gear.shift(distance, DT);
             for (position, velocity, dt) in cycles {
                 let master = Motion { position, velocity, acceleration: 0.0 };
-                motion = gear.advance(master, motion, dt.abs().min(0.1));
+                motion = follow(&mut gear, master, motion, dt.abs().min(0.1));
                 prop_assert!(motion.position.is_finite() && motion.velocity.is_finite());
             }
         }
+    }
+}
+
+/// Held with its master, a follower is exactly at its ideal position until both stand. Held alone,
+/// or while it catches up, it decelerates and waits; then it catches up.
+#[test]
+fn a_held_follower_rests() {
+    for (together, engaged) in [(true, true), (false, true), (true, false)] {
+        let config = GearConfig {
+            ratio: 0.5,
+            engage: if engaged {
+                GearInMode::Here
+            } else {
+                GearInMode::At { offset: 90.0 }
+            },
+            smoothing_s: 0.0,
+            limits: LIMITS,
+            range: None,
+        };
+        let mut gear = Gear::new(config, Motion::at(0.0), Motion::at(0.0)).unwrap();
+        let goal = MoveRequest::within(Goal::Velocity(LIMITS.velocity), LIMITS);
+        let mut source = JerkLimited::new(goal, Motion::at(0.0), DT).unwrap();
+        let (mut master, mut at) = (Motion::at(0.0), Motion::at(0.0));
+        let mut cycle = |gear: &mut Gear, held: bool| {
+            let rate = |held| if held { Rate::HELD } else { Rate::WHOLE };
+            master = source.advance(master, rate(held && together), DT);
+            let next = Master {
+                motion: master,
+                comes_to_rest: together,
+            };
+            let before = at;
+            at = gear.with_master(next).advance(at, rate(held), DT);
+            let change = (at.velocity - before.velocity).abs();
+            assert!(change <= LIMITS.acceleration * DT * (1.0 + 1e-9));
+            (master, at)
+        };
+        let begun = if engaged { 1000 } else { 300 };
+        for _ in 0..begun {
+            cycle(&mut gear, false);
+        }
+        assert_eq!(gear.engaged(), engaged);
+        for _ in 0..1000 {
+            let (master, at) = cycle(&mut gear, true);
+            if together && engaged {
+                assert!((at.position - master.position * 0.5).abs() < 1e-9);
+            }
+        }
+        let (_, resting) = cycle(&mut gear, true);
+        assert_eq!(resting.velocity, 0.0, "{together} {engaged}");
+        for _ in 0..20_000 {
+            cycle(&mut gear, false);
+        }
+        let (master, at) = cycle(&mut gear, false);
+        assert!(gear.engaged(), "{together} {engaged}");
+        let offset = if engaged { 0.0 } else { 90.0 };
+        assert!((at.position - master.position * 0.5 - offset).abs() < 1e-9);
     }
 }

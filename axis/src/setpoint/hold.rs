@@ -1,6 +1,6 @@
 //! Standstill; a moving axis brakes first.
 
-use super::{Motion, Ramp, Setpoint};
+use super::{HoldResponse, Motion, Ramp, Rate, Setpoint};
 
 /// Brakes to standstill and holds the position.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -10,9 +10,9 @@ pub struct Hold {
 }
 
 impl Hold {
-    /// Advances one cycle. RT: O(1).
+    /// Advances one cycle. No override delays a stop. RT: O(1).
     #[must_use]
-    pub fn advance(self, motion: Motion, dt_s: f64) -> Motion {
+    pub fn brake(self, motion: Motion, dt_s: f64) -> Motion {
         let velocity = Ramp {
             target: 0.0,
             slope: self.acceleration,
@@ -29,8 +29,12 @@ impl Hold {
 }
 
 impl Setpoint for Hold {
-    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
-        Self::advance(*self, motion, dt_s)
+    fn advance(&mut self, motion: Motion, _: Rate, dt_s: f64) -> Motion {
+        self.brake(motion, dt_s)
+    }
+
+    fn at_hold(&self) -> HoldResponse {
+        HoldResponse::Waits
     }
 
     fn finished(&self, motion: Motion) -> bool {
@@ -53,7 +57,7 @@ mod tests {
             acceleration: 0.0,
         };
         for _ in 0..1000 {
-            let next = hold.advance(motion, 0.001);
+            let next = hold.brake(motion, 0.001);
             assert!((next.velocity - motion.velocity).abs() <= 0.1 + 1e-12);
             let change = next.velocity - motion.velocity;
             assert!((next.acceleration * 0.001 - change).abs() <= 1e-12);

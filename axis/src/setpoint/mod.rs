@@ -1,6 +1,7 @@
 //! Set-points, advanced one cycle at a time, in user units.
 //!
-//! A [`Motion`] is the present set-point; a [`Setpoint`] advances it:
+//! A [`Motion`] is the present set-point; a [`Setpoint`] advances it, with the override of the cycle
+//! as its [`Rate`]:
 //!
 //! | source | motion |
 //! |---|---|
@@ -25,14 +26,14 @@
 //! exactly the velocity and acceleration of the positions sent to the drive.
 //!
 //! ```
-//! use ecaxis_axis::setpoint::{Goal, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint};
+//! use ecaxis_axis::setpoint::{Goal, JerkLimited, Motion, MotionLimits, MoveRequest, Rate, Setpoint};
 //!
 //! let limits = MotionLimits { velocity: 100.0, acceleration: 1000.0, jerk: 20_000.0 };
 //! let mut motion = Motion::default();
 //! let request = MoveRequest::within(Goal::Position(10.0), limits);
 //! let mut plan = JerkLimited::new(request, motion, 0.001)?;
 //! while !plan.finished(motion) {
-//!     motion = plan.advance(motion, 0.001);
+//!     motion = plan.advance(motion, Rate::WHOLE, 0.001);
 //!     assert!(motion.velocity <= limits.velocity * (1.0 + 1e-9));
 //! }
 //! assert_eq!(motion.position, 10.0);
@@ -59,18 +60,18 @@ mod wave;
 pub use cam::{Cam, CamError, CamLaw, CamPeak, CamPoint};
 pub use error::SetpointError;
 pub(crate) use error::position as check_position;
-pub use gear::{Gear, GearConfig, GearInMode};
+pub use gear::{FollowingGear, Gear, GearConfig, GearInMode, Master};
 pub use hold::Hold;
 pub use jerk::{Goal, JerkLimited, MoveRequest};
 pub use line_shaft::{
     LineShaft, LineShaftConfig, LineShaftEnd, LineShaftPoint, LineShaftPointError, LineShaftState,
 };
 pub use ramp::Ramp;
-pub use rate::{RateCourse, TableRate};
+pub use rate::{Rate, RateCourse, TableRate};
 pub use source::Source;
 pub use spline::{Interpolation, Knot};
 pub use stream::{Stream, StreamConfig, StreamState};
-pub use table::{Playback, Table, TableError, TablePoint, TableProblem};
+pub use table::{Playback, Table, TableError, TablePlayback, TablePoint, TableProblem};
 pub use trapezoid::Trapezoid;
 pub(crate) use trapezoid::braking_velocity;
 pub use wave::{PositionWave, Shape, Wave};
@@ -143,11 +144,29 @@ impl MotionLimits {
     }
 }
 
-/// A source of set-points.
+/// What a source does while its axis is held ([`Rate::HELD`]). Its set-point comes to rest in each
+/// case: a held axis does not move.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum HoldResponse {
+    /// It decelerates within its limits, waits and continues.
+    Waits,
+    /// It follows a master that the same hold brings to rest. From any other master it decelerates
+    /// within its limits, waits, and catches up afterwards.
+    FollowsToRest,
+    /// It decelerates within its limits and ends.
+    Ends,
+}
+
+/// A source of set-points. Every source takes the override of each cycle and states its response to
+/// a hold: there are no defaults.
 pub trait Setpoint {
-    /// Advances one cycle of `dt_s` seconds from `motion`. `motion` is the result of the previous
-    /// cycle, or the caller's modification of it; a source then continues from there. RT: O(1).
-    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion;
+    /// Advances one cycle of `dt_s` seconds from `motion`, with the override `rate`. `motion` is the
+    /// result of the previous cycle, or the caller's modification of it; a source then continues from
+    /// there. RT: O(1).
+    fn advance(&mut self, motion: Motion, rate: Rate, dt_s: f64) -> Motion;
+
+    /// Returns what the source does at [`Rate::HELD`].
+    fn at_hold(&self) -> HoldResponse;
 
     /// Returns true if further cycles would change neither position nor velocity.
     fn finished(&self, motion: Motion) -> bool;

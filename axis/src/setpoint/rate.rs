@@ -1,4 +1,4 @@
-//! The rate at which the time of waves and tables passes.
+//! The override of an axis, and the rate at which the time of waves and tables passes.
 //!
 //! The rate of tables is searched cycle by cycle: [`TableRate`].
 //!
@@ -12,20 +12,59 @@
 //! h is the highest rate until the rate is constant again.
 
 use super::{MotionLimits, braking_velocity};
+use crate::{MAX_RATE, MIN_RATE};
+
+/// The override of an axis in one cycle: a factor on its velocities, or on the time of its motion.
+/// 0 holds the axis.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+pub struct Rate(f64);
+
+impl Rate {
+    /// No override.
+    pub const WHOLE: Self = Self(1.0);
+    /// The axis is held.
+    pub const HELD: Self = Self(0.0);
+
+    /// Returns a rate up to [`MAX_RATE`]. An invalid one, or one below [`MIN_RATE`], holds the axis.
+    #[must_use]
+    pub const fn new(value: f64) -> Self {
+        // Written so that NaN is rejected, too.
+        let valid = value >= MIN_RATE && value <= MAX_RATE;
+        Self(if valid { value } else { 0.0 })
+    }
+
+    /// Returns the factor.
+    #[must_use]
+    pub const fn value(self) -> f64 {
+        self.0
+    }
+
+    /// Returns true if the axis is held.
+    #[must_use]
+    pub const fn is_held(self) -> bool {
+        self.0 == 0.0
+    }
+
+    /// Returns the lower of two rates.
+    #[must_use]
+    pub const fn min(self, other: Self) -> Self {
+        Self(self.0.min(other.0))
+    }
+}
 
 /// Share of the limits that a changing rate uses; the rest covers differences of cycles.
 const USED: f64 = 0.99;
 
-/// A rate from 0 to 1 that changes within the limits of an axis.
+/// The rate of a wave, from 0 to 1. It changes within the limits of an axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Rate {
+pub(super) struct WaveRate {
     value: f64,
     slope: f64,
     /// The highest rate until the slope is 0.
     highest: f64,
 }
 
-impl Rate {
+impl WaveRate {
     pub(super) const WHOLE: Self = Self {
         value: 1.0,
         slope: 0.0,
@@ -36,12 +75,12 @@ impl Rate {
     /// velocity, acceleration and jerk at rate 1. RT: O(1).
     pub(super) fn advance(
         &mut self,
-        wanted: f64,
+        wanted: Rate,
         slopes: [f64; 3],
         limits: &MotionLimits,
         dt_s: f64,
     ) -> f64 {
-        let left = wanted.clamp(0.0, 1.0) - self.value;
+        let left = wanted.min(Rate::WHOLE).0 - self.value;
         if left == 0.0 && self.slope == 0.0 {
             return self.value;
         }
@@ -109,14 +148,15 @@ impl TableRate {
 
     /// Returns the rate of this cycle.
     #[must_use]
-    pub const fn value(&self) -> f64 {
-        self.value
+    pub const fn value(&self) -> Rate {
+        // A changing rate passes all values, so the lowest override does not apply.
+        Rate(self.value)
     }
 
     /// Sets a constant rate while no table plays.
-    pub const fn set(&mut self, value: f64) {
+    pub const fn set(&mut self, rate: Rate) {
         *self = Self {
-            value,
+            value: rate.min(Rate::WHOLE).0,
             ..Self::WHOLE
         };
     }
@@ -128,17 +168,22 @@ impl TableRate {
         self.slope != 0.0
     }
 
-    /// Advances one cycle towards `wanted`, from 0 to 1. `keeps`: true if every table keeps its
-    /// limits on a course. RT: five calls of `keeps` at most.
+    /// Advances one cycle towards `wanted`, which counts as 1 if it is higher. `keeps`: true if
+    /// every table keeps its limits on a course. RT: five calls of `keeps` at most.
     pub fn advance(
         &mut self,
-        wanted: f64,
+        wanted: Rate,
         dt_s: f64,
-        mut keeps: impl FnMut(RateCourse) -> bool,
-    ) -> f64 {
+        keeps: impl FnMut(RateCourse) -> bool,
+    ) -> Rate {
+        self.change(wanted.min(Rate::WHOLE).0, dt_s, keeps);
+        self.value()
+    }
+
+    fn change(&mut self, wanted: f64, dt_s: f64, mut keeps: impl FnMut(RateCourse) -> bool) {
         let left = wanted - self.value;
         if left == 0.0 && self.slope == 0.0 {
-            return self.value;
+            return;
         }
         // First a new slope, then the present one. A bend that the limits do not permit is halved,
         // and doubled again as soon as they do.
@@ -176,7 +221,7 @@ impl TableRate {
                 } else {
                     (self.value + step).clamp(0.0, 1.0)
                 };
-                return self.value;
+                return;
             }
         }
         if self.slope == 0.0 {
@@ -185,7 +230,6 @@ impl TableRate {
         }
         self.slope = towards_zero(self.slope, self.bend);
         self.value = (self.value + self.slope * dt_s).clamp(0.0, 1.0);
-        self.value
     }
 }
 

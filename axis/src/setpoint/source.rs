@@ -1,6 +1,8 @@
 //! One type for all sources that need only the motion.
 
-use super::{Goal, Hold, JerkLimited, Motion, PositionWave, Setpoint, Trapezoid};
+use super::{
+    Goal, Hold, HoldResponse, JerkLimited, Motion, PositionWave, Rate, Setpoint, Trapezoid,
+};
 use crate::group::LinePath;
 
 /// Any source of an axis that needs only the motion. Sources with further inputs are separate:
@@ -46,36 +48,27 @@ impl Source {
             Self::Wave(wave) => wave.limits().acceleration,
         }
     }
-
-    /// Advances one cycle at a rate, as an override does. RT: O(1).
-    #[must_use]
-    pub fn advance_at(&mut self, rate: f64, motion: Motion, dt_s: f64) -> Motion {
-        match self {
-            Self::JerkLimited(source) => source.set_rate(rate, motion, dt_s),
-            Self::Line(along) => along.set_rate(rate, dt_s),
-            Self::Wave(wave) => wave.set_rate(rate),
-            Self::Trapezoid(trapezoid) => {
-                let slower = Trapezoid {
-                    velocity: trapezoid.velocity * rate,
-                    ..*trapezoid
-                };
-                return slower.advance(motion, dt_s);
-            }
-            Self::Hold(_) => {}
-        }
-        self.advance(motion, dt_s)
-    }
 }
 
 impl Setpoint for Source {
     /// RT: O(1).
-    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
+    fn advance(&mut self, motion: Motion, rate: Rate, dt_s: f64) -> Motion {
         match self {
-            Self::Hold(hold) => hold.advance(motion, dt_s),
-            Self::Trapezoid(trapezoid) => trapezoid.advance(motion, dt_s),
-            Self::JerkLimited(source) => source.advance(motion, dt_s),
-            Self::Line(along) => along.advance(motion, dt_s),
-            Self::Wave(wave) => wave.advance(motion, dt_s),
+            Self::Hold(hold) => hold.advance(motion, rate, dt_s),
+            Self::Trapezoid(trapezoid) => trapezoid.advance(motion, rate, dt_s),
+            Self::JerkLimited(source) => source.advance(motion, rate, dt_s),
+            Self::Line(along) => along.advance(motion, rate, dt_s),
+            Self::Wave(wave) => wave.advance(motion, rate, dt_s),
+        }
+    }
+
+    fn at_hold(&self) -> HoldResponse {
+        match self {
+            Self::Hold(hold) => hold.at_hold(),
+            Self::Trapezoid(trapezoid) => trapezoid.at_hold(),
+            Self::JerkLimited(source) => source.at_hold(),
+            Self::Line(along) => along.at_hold(),
+            Self::Wave(wave) => wave.at_hold(),
         }
     }
 

@@ -112,14 +112,14 @@ proptest! {
                 source = taken;
             }
             for _ in 0..cycles {
-                let motion = source.advance(sequence.motion, DT);
+                let motion = source.advance(sequence.motion, Rate::WHOLE, DT);
                 sequence.then(motion)?;
             }
         }
         if source.target().is_some() || matches!(source, Source::Hold(_) | Source::Wave(_)) {
             let mut left = 200_000;
             while !source.finished(sequence.motion) && left > 0 {
-                let motion = source.advance(sequence.motion, DT);
+                let motion = source.advance(sequence.motion, Rate::WHOLE, DT);
                 sequence.then(motion)?;
                 left -= 1;
             }

@@ -7,7 +7,7 @@
 
 use super::error::{finite, usable};
 use super::spline::{Interpolation, Piece, check_corner, check_end, check_stop};
-use super::{Hold, Knot, Motion, MotionLimits, Setpoint, SetpointError};
+use super::{Hold, HoldResponse, Knot, Motion, MotionLimits, Rate, Setpoint, SetpointError};
 
 /// The configuration of a stream.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -214,14 +214,19 @@ impl<const N: usize> Stream<N> {
 
 impl<const N: usize> Setpoint for Stream<N> {
     /// RT: O(points passed in one cycle).
-    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
+    fn advance(&mut self, motion: Motion, rate: Rate, dt_s: f64) -> Motion {
         if dt_s.is_nan() || dt_s <= 0.0 {
             return motion;
         }
         if (motion.position, motion.velocity) != (self.last.position, self.last.velocity) {
             self.state = StreamState::Underrun;
         }
-        self.start();
+        if !rate.is_held() {
+            self.start();
+        } else if self.state == StreamState::Moving {
+            // The time of the points passes without the axis.
+            self.state = StreamState::Underrun;
+        }
         let position = match self.state {
             StreamState::Moving => self.pass(dt_s),
             StreamState::Waiting => Some(motion.position),
@@ -233,11 +238,16 @@ impl<const N: usize> Setpoint for Stream<N> {
             None => {
                 self.state = StreamState::Underrun;
                 let acceleration = self.config.limits.acceleration;
-                Hold { acceleration }.advance(motion, dt_s)
+                Hold { acceleration }.brake(motion, dt_s)
             }
         };
         self.last = next;
         next
+    }
+
+    /// A stream that has not begun waits.
+    fn at_hold(&self) -> HoldResponse {
+        HoldResponse::Ends
     }
 
     fn finished(&self, motion: Motion) -> bool {

@@ -53,7 +53,9 @@ fn stream_follows_its_points() {
         if next == 101 {
             stream.close().unwrap();
         }
-        sequence.then(stream.advance(sequence.motion, DT)).unwrap();
+        sequence
+            .then(stream.advance(sequence.motion, Rate::WHOLE, DT))
+            .unwrap();
         cycles += 1;
         // One point every tenth cycle.
         if cycles % 10 == 0 && cycles < 1000 {
@@ -74,7 +76,10 @@ fn stream_waits_for_its_first_points() {
     let mut stream = Stream::<4>::new(config(Interpolation::Cubic), Motion::at(0.0)).unwrap();
     for k in 1..=2 {
         stream.push(sine(k)).unwrap();
-        assert_eq!(stream.advance(Motion::at(0.0), DT), Motion::at(0.0));
+        assert_eq!(
+            stream.advance(Motion::at(0.0), Rate::WHOLE, DT),
+            Motion::at(0.0)
+        );
         assert_eq!(stream.state(), StreamState::Waiting);
     }
     stream.push(sine(3)).unwrap();
@@ -84,7 +89,7 @@ fn stream_waits_for_its_first_points() {
         stream.push(sine(5)),
         Err(SetpointError::Full { capacity: 4 })
     );
-    assert!(stream.advance(Motion::at(0.0), DT).velocity > 0.0);
+    assert!(stream.advance(Motion::at(0.0), Rate::WHOLE, DT).velocity > 0.0);
     assert_eq!(stream.state(), StreamState::Moving);
 }
 
@@ -150,7 +155,10 @@ fn stream_rejects_points_that_break_a_limit() {
         none.push(knot(0.0, 0.0)),
         Err(SetpointError::Full { capacity: 0 })
     );
-    assert_eq!(none.advance(Motion::at(0.0), DT), Motion::at(0.0));
+    assert_eq!(
+        none.advance(Motion::at(0.0), Rate::WHOLE, DT),
+        Motion::at(0.0)
+    );
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -199,7 +207,7 @@ proptest! {
                 Event::HoldUp => sequence.hold_up(),
                 Event::Close => { let _ = stream.close(); }
                 Event::Run(cycles) => for _ in 0..cycles {
-                    sequence.then(stream.advance(sequence.motion, DT))?;
+                    sequence.then(stream.advance(sequence.motion, Rate::WHOLE, DT))?;
                     prop_assert!(sequence.motion.position.abs() <= 50.0 + 1e-9);
                 },
             }

@@ -5,7 +5,9 @@
 
 use super::error::position;
 use super::spline::{Interpolation, Piece, check_corner, check_end, check_stop};
-use super::{Hold, Knot, Motion, MotionLimits, RateCourse, SetpointError};
+use super::{
+    Hold, HoldResponse, Knot, Motion, MotionLimits, Rate, RateCourse, Setpoint, SetpointError,
+};
 
 /// A problem and its line in the text, counted from 1.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -436,24 +438,12 @@ impl Playback {
         self.state == State::Interrupted
     }
 
-    /// Advances one cycle. `table` must be the table passed to [`Playback::new`]. RT: O(rows passed
-    /// in one cycle).
-    #[must_use]
-    pub fn advance(&mut self, table: &Table, motion: Motion, dt_s: f64, rate: f64) -> Motion {
-        if dt_s.is_nan() || dt_s <= 0.0 {
-            return motion;
+    /// Returns the source of set-points. `table` must be the table passed to [`Playback::new`].
+    pub const fn with_table<'p>(&'p mut self, table: &'p Table) -> TablePlayback<'p> {
+        TablePlayback {
+            playback: self,
+            table,
         }
-        if (motion.position, motion.velocity) != (self.last.position, self.last.velocity) {
-            self.state = State::Interrupted;
-        }
-        self.last = if self.state == State::Interrupted {
-            let acceleration = self.acceleration;
-            Hold { acceleration }.advance(motion, dt_s)
-        } else {
-            let position = self.pass(table, dt_s * rate) + self.offset;
-            motion.then(position, (position - motion.position) / dt_s, dt_s)
-        };
-        self.last
     }
 
     /// True if the last point has been passed and the axis stands.
@@ -515,6 +505,43 @@ impl Playback {
         }
         self.state = State::Ended;
         table.ends()[1]
+    }
+}
+
+/// A [`Playback`] with its table.
+#[derive(Debug)]
+pub struct TablePlayback<'p> {
+    playback: &'p mut Playback,
+    table: &'p Table,
+}
+
+impl Setpoint for TablePlayback<'_> {
+    /// The time of the table passes at the rate. RT: O(rows passed in one cycle).
+    fn advance(&mut self, motion: Motion, rate: Rate, dt_s: f64) -> Motion {
+        if dt_s.is_nan() || dt_s <= 0.0 {
+            return motion;
+        }
+        let playback = &mut *self.playback;
+        let last = playback.last;
+        if (motion.position, motion.velocity) != (last.position, last.velocity) {
+            playback.state = State::Interrupted;
+        }
+        playback.last = if playback.state == State::Interrupted {
+            let acceleration = playback.acceleration;
+            Hold { acceleration }.brake(motion, dt_s)
+        } else {
+            let position = playback.pass(self.table, dt_s * rate.value()) + playback.offset;
+            motion.then(position, (position - motion.position) / dt_s, dt_s)
+        };
+        playback.last
+    }
+
+    fn at_hold(&self) -> HoldResponse {
+        HoldResponse::Waits
+    }
+
+    fn finished(&self, motion: Motion) -> bool {
+        self.playback.finished(motion)
     }
 }
 

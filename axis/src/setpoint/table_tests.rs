@@ -28,7 +28,9 @@ fn run(table: &Table) -> (u32, Motion) {
     let mut sequence = Sequence::from(start, LIMITS, DT);
     let mut cycles = 0;
     while !playback.finished(sequence.motion) {
-        let next = playback.advance(table, sequence.motion, DT, 1.0);
+        let next = playback
+            .with_table(table)
+            .advance(sequence.motion, Rate::WHOLE, DT);
         sequence.then(next).unwrap();
         cycles += 1;
     }
@@ -173,7 +175,9 @@ proptest! {
             if held_up == Some(cycle) {
                 sequence.hold_up();
             }
-            let next = playback.advance(&table, sequence.motion, DT, 1.0);
+            let next = playback
+                .with_table(&table)
+                .advance(sequence.motion, Rate::WHOLE, DT);
             sequence.then(next)?;
             prop_assert!(next.position.abs() <= 2.0 + 1e-9);
             if playback.finished(next) {
@@ -220,13 +224,13 @@ proptest! {
         let mut rate = TableRate::WHOLE;
         for (wanted, cycles) in rates.into_iter().chain([(0.0, 3000), (1.0, 20_000)]) {
             for _ in 0..cycles {
-                let rate = rate.advance(wanted, DT, |course| {
+                let rate = rate.advance(Rate::new(wanted), DT, |course| {
                     players.iter().zip(&tables).all(|((play, _), table)| {
                         play.keeps(table, &limits, course, DT)
                     })
                 });
                 for ((play, motion), table) in players.iter_mut().zip(&tables) {
-                    let next = play.advance(table, *motion, DT, rate);
+                    let next = play.with_table(table).advance(*motion, rate, DT);
                     let change = (next.velocity - motion.velocity).abs();
                     prop_assert!(change <= limits.acceleration * DT * (1.0 + 1e-9));
                     prop_assert!(next.velocity.abs() <= limits.velocity + 1e-9);

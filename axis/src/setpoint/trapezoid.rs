@@ -4,7 +4,7 @@
 //! cycle ends exactly on the target. The continuous rule √(2·a·d) overshoots by up to one cycle, so
 //! the sum over cycles is inverted instead.
 
-use super::{Motion, Setpoint};
+use super::{HoldResponse, Motion, Rate, Setpoint};
 
 /// Fraction of the acceleration used to plan braking. Rounding makes some cycles slightly too fast;
 /// without a reserve the errors would add up and end beyond the target.
@@ -44,9 +44,8 @@ impl Trapezoid {
         self
     }
 
-    /// Advances one cycle. RT: O(1).
-    #[must_use]
-    pub fn advance(self, motion: Motion, dt_s: f64) -> Motion {
+    /// Advances one cycle with the velocity as it is. RT: O(1).
+    fn step(self, motion: Motion, dt_s: f64) -> Motion {
         if dt_s <= 0.0 {
             return motion;
         }
@@ -85,8 +84,14 @@ impl Trapezoid {
 }
 
 impl Setpoint for Trapezoid {
-    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
-        Self::advance(*self, motion, dt_s)
+    /// The velocity is that of the move × rate. The caller limits a rate above 1.
+    fn advance(&mut self, motion: Motion, rate: Rate, dt_s: f64) -> Motion {
+        let velocity = self.velocity * rate.value();
+        Self { velocity, ..*self }.step(motion, dt_s)
+    }
+
+    fn at_hold(&self) -> HoldResponse {
+        HoldResponse::Waits
     }
 
     fn finished(&self, motion: Motion) -> bool {

@@ -14,13 +14,13 @@ fn plain(target: f64, velocity: f64, acceleration: f64) -> Trapezoid {
 }
 
 /// Runs until finished and checks every cycle. Returns the number of cycles and the final motion.
-fn run(plan: Trapezoid, start: Motion, limit: f64, dt: f64) -> (u32, Motion) {
+fn run(mut plan: Trapezoid, start: Motion, limit: f64, dt: f64) -> (u32, Motion) {
     let mut motion = start;
     for cycle in 0..5_000_000 {
         if plan.finished(motion) {
             return (cycle, motion);
         }
-        let next = plan.advance(motion, dt);
+        let next = plan.advance(motion, Rate::WHOLE, dt);
         let change = (next.velocity - motion.velocity).abs();
         assert!(
             change <= limit * dt * (1.0 + 1e-9) + 1e-12,
@@ -95,10 +95,10 @@ fn trapezoid_with_lower_acceleration_does_not_overshoot() {
         velocity: 200.0,
         ..Motion::default()
     };
-    let plan = plain(50.0, 200.0, 200.0).taking_over(motion, 2000.0, 2000.0, DT);
+    let mut plan = plain(50.0, 200.0, 200.0).taking_over(motion, 2000.0, 2000.0, DT);
     let mut at = motion;
     while !plan.finished(at) {
-        at = plan.advance(at, DT);
+        at = plan.advance(at, Rate::WHOLE, DT);
         assert!(at.position <= 50.0);
     }
 }
@@ -110,7 +110,10 @@ fn trapezoid_without_time_does_not_move() {
         velocity: 2.0,
         ..Motion::default()
     };
-    assert_eq!(plain(9.0, 1.0, 1.0).advance(motion, 0.0), motion);
+    assert_eq!(
+        plain(9.0, 1.0, 1.0).advance(motion, Rate::WHOLE, 0.0),
+        motion
+    );
 }
 
 proptest! {
@@ -120,11 +123,11 @@ proptest! {
         start in -1e3..1e3f64, way in -200.0..200.0f64, velocity in 2.0..1e3f64, acceleration in 5.0..1e5f64,
         dt in prop::sample::select(vec![0.000_25, 0.001, 0.004]),
     ) {
-        let plan = plain(start + way, velocity, acceleration);
+        let mut plan = plain(start + way, velocity, acceleration);
         let mut motion = Motion::at(start);
         let (low, high) = (start.min(plan.target), start.max(plan.target));
         while !plan.finished(motion) {
-            motion = plan.advance(motion, dt);
+            motion = plan.advance(motion, Rate::WHOLE, dt);
             prop_assert!(motion.velocity.abs() <= velocity);
             prop_assert!((low..=high).contains(&motion.position), "{:?} {:?}", plan, motion);
         }
@@ -142,17 +145,17 @@ proptest! {
         speeds in (0.01..1.0f64, 0.01..1.0f64), ramps in (0.02..1.0f64, 0.02..1.0f64),
     ) {
         let limit = 2000.0;
-        let plan = plain(first, 200.0 * speeds.0, limit * ramps.0);
+        let mut plan = plain(first, 200.0 * speeds.0, limit * ramps.0);
         let mut motion = Motion::at(0.0);
         for _ in 0..after {
-            motion = plan.advance(motion, DT);
+            motion = plan.advance(motion, Rate::WHOLE, DT);
         }
-        let next = plain(second, 200.0 * speeds.1, limit * ramps.1).taking_over(motion, plan.braking, limit, DT);
+        let mut next = plain(second, 200.0 * speeds.1, limit * ramps.1).taking_over(motion, plan.braking, limit, DT);
         let bound = 200.0 * speeds.1.max(speeds.0);
         let (low, high) = (first.min(second).min(0.0), first.max(second).max(0.0));
         let mut at = motion;
         for _ in 0..200_000 {
-            at = next.advance(at, DT);
+            at = next.advance(at, Rate::WHOLE, DT);
             prop_assert!(at.velocity.abs() <= bound);
             prop_assert!((low - 1e-9..=high + 1e-9).contains(&at.position), "{:?}", at);
         }

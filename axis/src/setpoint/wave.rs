@@ -7,9 +7,12 @@
 use core::f64::consts::TAU;
 
 use super::error::{position, usable};
-use super::rate::Rate;
+use super::rate::WaveRate;
 use super::spline::within;
-use super::{Goal, Hold, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint, SetpointError};
+use super::{
+    Goal, Hold, HoldResponse, JerkLimited, Motion, MotionLimits, MoveRequest, Rate, Setpoint,
+    SetpointError,
+};
 
 /// The shape of an oscillation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -144,9 +147,8 @@ pub struct PositionWave {
     centre: f64,
     limits: MotionLimits,
     state: State,
-    /// The wanted rate of the wave's time, and the present one of a sine.
-    wanted: f64,
-    rate: Rate,
+    /// The present rate of a sine's time.
+    rate: WaveRate,
     last: Motion,
 }
 
@@ -215,8 +217,7 @@ impl PositionWave {
             centre,
             limits,
             state,
-            wanted: 1.0,
-            rate: Rate::WHOLE,
+            rate: WaveRate::WHOLE,
             last: motion,
         })
     }
@@ -227,12 +228,6 @@ impl PositionWave {
         &self.limits
     }
 
-    /// Sets how fast the time of the wave passes, from 0 to 1. A sine changes its rate within the
-    /// limits of the axis. RT: O(1).
-    pub const fn set_rate(&mut self, rate: f64) {
-        self.wanted = rate.min(1.0);
-    }
-
     /// Returns true if the axis was interrupted; it stands since then.
     #[must_use]
     pub fn interrupted(&self) -> bool {
@@ -241,25 +236,27 @@ impl PositionWave {
 }
 
 impl Setpoint for PositionWave {
-    /// RT: O(1).
-    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
+    /// The time of the wave passes at the rate, at most 1. A sine changes its rate within the limits
+    /// of the axis. RT: O(1).
+    fn advance(&mut self, motion: Motion, rate: Rate, dt_s: f64) -> Motion {
         if dt_s.is_nan() || dt_s <= 0.0 {
             return motion;
         }
+        let wanted = rate.min(Rate::WHOLE);
         if (motion.position, motion.velocity) != (self.last.position, self.last.velocity) {
             self.state = State::Interrupted;
         }
         let next = match &mut self.state {
             State::Sine => {
                 let (slopes, limits) = (self.wave.slopes(), &self.limits);
-                let rate = self.rate.advance(self.wanted, slopes, limits, dt_s);
+                let rate = self.rate.advance(wanted, slopes, limits, dt_s);
                 let value = self.wave.advance(rate * dt_s);
                 let position = self.centre + value;
                 motion.then(position, (position - motion.position) / dt_s, dt_s)
             }
             State::Square(source) => {
                 let mut ahead = self.wave;
-                let target = self.centre + ahead.advance(self.wanted * dt_s);
+                let target = self.centre + ahead.advance(wanted.value() * dt_s);
                 let order = MoveRequest::within(Goal::Position(target), self.limits);
                 let same = source.request().goal == order.goal;
                 // A hold delays a move, and the wave waits for its end.
@@ -272,16 +269,19 @@ impl Setpoint for PositionWave {
                 {
                     *source = next;
                 }
-                source.set_rate(self.wanted, motion, dt_s);
-                source.advance(motion, dt_s)
+                source.advance(motion, wanted, dt_s)
             }
             State::Interrupted => Hold {
                 acceleration: self.limits.acceleration,
             }
-            .advance(motion, dt_s),
+            .brake(motion, dt_s),
         };
         self.last = next;
         next
+    }
+
+    fn at_hold(&self) -> HoldResponse {
+        HoldResponse::Waits
     }
 
     fn finished(&self, motion: Motion) -> bool {

@@ -128,7 +128,7 @@ proptest! {
                 motion.velocity = 0.0;
                 differences = Motion::at(motion.position);
             }
-            let next = source.advance(motion, DT);
+            let next = source.advance(motion, Rate::WHOLE, DT);
             let velocity = (next.position - motion.position) / DT;
             let acceleration = (velocity - differences.velocity) / DT;
             let jerk = (acceleration - differences.acceleration) / DT;
@@ -171,9 +171,9 @@ proptest! {
         let mut ended = false;
         let rates = rates.into_iter().chain([(0.0, 20_000), (1.0, 60_000)]);
         for (rate, cycles) in rates {
-            source.set_rate(rate);
+            let rate = Rate::new(rate);
             for _ in 0..cycles {
-                let next = source.advance(motion, DT);
+                let next = source.advance(motion, rate, DT);
                 let jerk = (next.acceleration - motion.acceleration) / DT;
                 prop_assert!(next.velocity.abs() <= LIMITS.velocity + 1e-9);
                 prop_assert!(next.acceleration.abs() <= LIMITS.acceleration + 1e-6);
@@ -185,7 +185,7 @@ proptest! {
                     break;
                 }
             }
-            prop_assert!(rate > 0.0 || cycles < 20_000 || motion.velocity == 0.0, "{:?}", source);
+            prop_assert!(!rate.is_held() || cycles < 20_000 || motion.velocity == 0.0, "{:?}", source);
         }
         prop_assert!(ended && motion.stands_at(1.0), "{:?}", source);
     }

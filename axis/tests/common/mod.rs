@@ -1,7 +1,7 @@
 //! Reference drive for these tests: transitions of the standard, an ideal motor, one cycle of delay
 //! in each direction.
 
-use ecaxis_axis::setpoint::{Hold, Motion, Ramp, Trapezoid};
+use ecaxis_axis::setpoint::{Hold, Motion, Ramp, Rate, Setpoint, Trapezoid};
 use ecaxis_axis::{
     Axis, AxisConfig, AxisStatus, Command, FeedForward, Inputs, Limits, Loops, Mode, Modes,
     Outputs, PositionPid, Scale, State, VelocityLoop, VelocityUnit,
@@ -48,6 +48,11 @@ pub struct Drive {
     /// again.
     pub mode_delay: Option<u32>,
     mode_waits: u32,
+    /// The mode changes without power only.
+    pub mode_unpowered: bool,
+    /// Cycles in Operation enabled until the mode is shown. `None`: it is always shown.
+    pub shown_after: Option<u32>,
+    enabled_cycles: u32,
     /// Torque of the load in torque mode, per mille.
     pub load: f64,
     /// Position of the home switch, counts before homing. `None`: never found.
@@ -57,6 +62,12 @@ pub struct Drive {
     pub homing_error: bool,
     /// Never acknowledges a set-point.
     pub deaf: bool,
+    /// Obeys no halt (bit 8).
+    pub ignores_halt: bool,
+    /// Cycles of a homing in which bits 12 and 10 are those of an earlier one.
+    pub stale_attained: u32,
+    /// The drive has found its home switch.
+    pub homing_searched: bool,
     pub homing: Homing,
     set_point: Option<f64>,
     acknowledged: bool,
@@ -86,11 +97,17 @@ impl Drive {
             resets: 0,
             mode_delay: Some(0),
             mode_waits: 0,
+            mode_unpowered: false,
+            shown_after: None,
+            enabled_cycles: 0,
             load: 0.0,
             home_at: Some(-2000.0),
             home_is: 0.0,
             homing_error: false,
             deaf: false,
+            ignores_halt: false,
+            stale_attained: 0,
+            homing_searched: false,
             homing: Homing::NotStarted,
             set_point: None,
             acknowledged: false,
@@ -118,6 +135,7 @@ impl Drive {
         match self.mode {
             1 => bit(self.acknowledged, 12) | bit(self.reached, 10),
             3 => bit(self.velocity == 0.0, 12) | bit(self.reached, 10),
+            6 if self.stale_attained > 0 => 0x1400,
             6 => match self.homing {
                 Homing::NotStarted => 0x0400,
                 Homing::Searching => 0x0000,
@@ -130,7 +148,7 @@ impl Drive {
 
     /// PP, PV and HM. `rose`: rising edge of bit 4.
     fn profile(&mut self, out: &Outputs, rose: bool, dt: f64) {
-        let halt = out.controlword & 0x100 != 0;
+        let halt = out.controlword & 0x100 != 0 && !self.ignores_halt;
         let start = out.controlword & 0x10 != 0;
         let mrpm = 2000.0 / 60_000.0;
         let slope = f64::from(out.profile_acceleration) * mrpm;
@@ -145,11 +163,13 @@ impl Drive {
             self.acknowledged &= start;
         }
         if self.mode == 6 {
+            self.stale_attained = self.stale_attained.saturating_sub(1);
             self.homing = match self.homing {
                 _ if !start && self.homing != Homing::Done => Homing::NotStarted,
                 _ if rose => Homing::Searching,
                 Homing::Searching if self.homing_error => Homing::Error,
                 Homing::Searching if self.home_at.is_some_and(|at| self.position <= at) => {
+                    self.homing_searched = true;
                     (self.position, self.velocity) = (self.home_is, 0.0);
                     Homing::Done
                 }
@@ -162,14 +182,14 @@ impl Drive {
             acceleration: 0.0,
         };
         let next = match (self.mode, self.set_point, self.homing) {
-            _ if halt => rest.advance(here, dt),
+            _ if halt => rest.brake(here, dt),
             (1, Some(target), _) => Trapezoid {
                 target,
                 velocity: f64::from(out.profile_velocity) * mrpm,
                 acceleration: slope,
                 braking: slope,
             }
-            .advance(here, dt),
+            .advance(here, Rate::WHOLE, dt),
             (3, _, _) => {
                 let ramp = Ramp {
                     target: f64::from(out.target_velocity) * mrpm,
@@ -179,7 +199,7 @@ impl Drive {
                 here.then(self.position + velocity * dt, velocity, dt)
             }
             (6, _, Homing::Searching) => here.then(self.position - 8.0, -8.0 / dt, dt),
-            _ => rest.advance(here, dt),
+            _ => rest.brake(here, dt),
         };
         (self.position, self.velocity) = (next.position, next.velocity);
         self.reached = match self.mode {
@@ -193,13 +213,20 @@ impl Drive {
         (self.position.round() as i64) as i32
     }
 
+    fn mode_shown(&self) -> i8 {
+        match self.shown_after {
+            Some(cycles) if self.enabled_cycles <= cycles => 0,
+            _ => self.mode,
+        }
+    }
+
     pub fn inputs(&self) -> Inputs {
         Inputs {
             statusword: self.statusword(),
             position: Some(self.raw_position()),
             velocity: Some((self.velocity / 2000.0 * 60_000.0).round() as i32),
             torque: Some(self.torque),
-            mode_display: Some(self.mode),
+            mode_display: Some(self.mode_shown()),
             fresh: true,
             ..Inputs::default()
         }
@@ -219,7 +246,12 @@ impl Drive {
         } else {
             self.mode_waits + 1
         };
-        if self.mode_delay.is_some_and(|delay| self.mode_waits > delay) {
+        let powered = matches!(
+            self.state,
+            State::SwitchedOn | State::OperationEnabled | State::QuickStopActive
+        );
+        let changes = self.mode_delay.is_some_and(|delay| self.mode_waits > delay);
+        if changes && !(self.mode_unpowered && powered) {
             self.mode = out.mode;
             self.mode_waits = 0;
             (self.set_point, self.acknowledged, self.reached) = (None, false, true);
@@ -252,6 +284,10 @@ impl Drive {
                 }
             }
             other => other,
+        };
+        self.enabled_cycles = match self.state {
+            State::OperationEnabled => self.enabled_cycles + 1,
+            _ => 0,
         };
         let before = self.position;
         self.torque = 0;

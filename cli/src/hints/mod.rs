@@ -5,10 +5,10 @@ use std::path::Path;
 
 use ecaxis_axis::cia402::describe;
 use ecaxis_axis::scale::UnitMismatch;
-use ecaxis_axis::{CommandError, HomingError, State, Trip, VelocityUnit};
+use ecaxis_axis::{CommandError, EnableBlocker, HomingError, State, Trip, VelocityUnit};
 use ecaxis_ecat::al_status_code::al_status_hint;
 use ecaxis_ecat::mailbox::abort_code as abort;
-use ecaxis_esi::address;
+use ecaxis_esi::{SDO_OF_MACHINE_FILE, address};
 use ecaxis_master::acyclic::StateError;
 use ecaxis_master::config::{ConfigError, LimitConflict, Nic, UnitProblem};
 use ecaxis_master::mailbox::{CoeCause, SdoError};
@@ -97,6 +97,12 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         Cause::Identity { .. } => {
             "check the order of the devices; for another model or firmware, name its ESI file with `esi`, or pick with `product` and `revision`; `identity = \">=\"` accepts newer revisions as well; `ecaxis compare` shows all differences".to_owned()
         }
+        Cause::Modules { .. } => {
+            "plug the modules in the order of `modules`, or correct `modules`: the list is complete, with \"-\" for an empty slot; `ecaxis compare` shows all differences".to_owned()
+        }
+        Cause::NotReady { .. } => {
+            "check the supply of the device and of its modules, and the modules in its slots; `ecaxis compare` compares them with the file".to_owned()
+        }
         Cause::Serial { found, .. } => {
             format!("if the device was replaced on purpose, write `serial = {found}` or omit `serial`")
         }
@@ -159,9 +165,12 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         Cause::PhaseNotLocked { .. } => {
             "wake-ups are too irregular: run with real-time priority (`ecaxis run` warns if it has none), or a longer `cycle`".to_owned()
         }
-        Cause::NotEnabled { state, code, mode_confirmed, .. } => not_enabled(*state, *code, *mode_confirmed),
+        Cause::NotEnabled { state, code, waiting, .. } => not_enabled(*state, *code, *waiting),
+        Cause::NodeNotOperational { .. } => {
+            "the gateway starts a node after it has booted and taken its configuration: check its power, node-ID and bit rate, and the node's `objects` (`ecaxis explain` lists what the gateway writes)".to_owned()
+        }
         Cause::WrongMode { .. } => {
-            "the drive refused the mode: check that its firmware supports it and that no parameter forbids it".to_owned()
+            "the drive refused the mode: check 0x6502 (supported drive modes), and that no parameter forbids it".to_owned()
         }
         Cause::Trip { trip: Trip::FollowingError { .. }, limits, .. } if !limits.is_empty() => {
             allows_less(limits)
@@ -197,7 +206,11 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
             if *edge == "rising" { "already on" } else { "off" }
         ),
         Cause::StepTimeout { .. } => "check the drive's state and fault; the step waits for `bus.enable_timeout`, or for the longest stop time of an axis".to_owned(),
-        Cause::NotSwitched { .. } => "check 0x6502 (supported drive modes) and the mode's requirements in the drive's manual".to_owned(),
+        Cause::NotSwitched { .. } => {
+            return failure
+                .hint("check 0x6502 (supported drive modes) and the mode's requirements in the drive's manual")
+                .hint(MODE_CHANGE);
+        }
         Cause::NotHomed { error, .. } => not_homed(*error).to_owned(),
         Cause::VariableRange { .. } => "test the variable with `if` before this step, or correct its range under [variables]".to_owned(),
         Cause::Alarm { .. } => "remove its cause, then start again".to_owned(),
@@ -205,6 +218,7 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         Cause::WaitTimeout { .. } => "check the sensor and its wiring, or give the step a longer `timeout`".to_owned(),
         Cause::TooLarge(_) => "map fewer objects with `pdo.rx` and `pdo.tx`".to_owned(),
         Cause::ClockNotSettled { .. } => "frames reach the clocks too irregularly, or the device has a faulty clock: run with real-time priority, or with `dc = \"off\"`".to_owned(),
+        Cause::PowerLostWithoutCause { .. } => "an error in ecaxis: keep the recording and the fault report, and report it".to_owned(),
         Cause::NotDisabled { .. } => "the drive ignores its Controlword: switch its power off by hand, then check its fault".to_owned(),
         Cause::Refused { by_axis, .. } => {
             refused(by_axis.as_deref(), error.device().map_or("", |device| &device.name))
@@ -217,7 +231,7 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         Cause::FollowLost { cause: None, .. } => "keep the followed axis under power and within what the follower's limits and range allow".to_owned(),
         Cause::LineShaftWaits { .. } => "start the step when `line_shafts` of the server's state shows \"running\"".to_owned(),
         Cause::LineShaftEnded { .. } => "restore the stream of set-points, then `reset`, `enable` and start the program again".to_owned(),
-        Cause::EnableRefused { .. } => "`reset` the axis first, or look at what stopped it".to_owned(),
+        Cause::EnableRefused { .. } => "`reset` an axis that has stopped; for one that still moves, find out what moves it".to_owned(),
         Cause::GroupStopped { cause, .. } => {
             let cause = self::failure(cause, nic).hints.into_iter();
             let back = "once the cause is known, restart the group with the steps `reset` and `enable`";
@@ -293,11 +307,17 @@ fn not_homed(error: HomingError) -> &'static str {
         HomingError::Drive => {
             "the search reached the other limit switch or found no index pulse: check switches, their wiring and the drive's digital inputs, and the direction of `homing.method`"
         }
+        HomingError::NeverCleared => {
+            "this drive does not clear Statusword bit 12 when homing starts: check its homing method (0x6098), or switch it off and on before the next homing"
+        }
+        HomingError::Elsewhere { .. } => {
+            "the drive did not keep the home offset, or counts it with the other sign (0x607C; maxon 0x30B0): compare it with `homing.position`"
+        }
         HomingError::ModeRefused => {
-            "check 0x6502 (supported drive modes): this drive may not support homing"
+            "check 0x6502 (supported drive modes): this drive may not support homing; for a drive that changes its mode only without power set `mode_change = \"no-power\"`"
         }
         HomingError::PowerLost => "check the drive's fault (0x603F) and its supply",
-        HomingError::Aborted => "home the axis again before any absolute move",
+        HomingError::Aborted | HomingError::Held => "home the axis again before any absolute move",
     }
 }
 
@@ -305,6 +325,10 @@ fn not_homed(error: HomingError) -> &'static str {
 fn units(problem: &UnitProblem) -> String {
     let found = match problem {
         UnitProblem::Contradiction(found) => found,
+        UnitProblem::PositionRange(_) => {
+            return "write 0 to 0x607B:01 and :02 with `sdo`: ecaxis counts on where 32 bits end"
+                .to_owned();
+        }
         UnitProblem::NoRatedTorque { .. } => {
             return "add `rated_torque = 0.1` (Nm), or give torques in percent".to_owned();
         }
@@ -345,10 +369,10 @@ fn units(problem: &UnitProblem) -> String {
     }
 }
 
-/// Returns the hint for an SDO error. `origin` is the source of the request; `OWN_SDO` for the
+/// Returns the hint for an SDO error. `origin` is the source of the request; [`SDO_OF_MACHINE_FILE`] for the
 /// user's own list.
 fn sdo(error: &SdoError, origin: &str) -> String {
-    let own = origin == OWN_SDO;
+    let own = origin == SDO_OF_MACHINE_FILE;
     match error.cause {
         CoeCause::Abort(code) => match code {
             code if abort::is_no_such_object(code) && own => {
@@ -421,9 +445,6 @@ const fn soe(code: u16) -> &'static str {
     }
 }
 
-/// The origin of start-up SDOs from the machine file.
-const OWN_SDO: &str = "sdo of the machine file";
-
 fn state(error: &StateError) -> String {
     match error {
         StateError::Refused { code, .. } => al_status(*code).to_owned(),
@@ -440,13 +461,26 @@ pub(crate) fn al_status(code: u16) -> &'static str {
     al_status_hint(code).unwrap_or("look the code up in the device's manual")
 }
 
-fn not_enabled(state: State, code: Option<u16>, mode_confirmed: bool) -> String {
+/// The advice for a drive that does not change its mode in Operation enabled.
+const MODE_CHANGE: &str =
+    "for a drive that changes its mode only without power set `mode_change = \"no-power\"`";
+
+fn not_enabled(state: State, code: Option<u16>, waiting: Option<EnableBlocker>) -> String {
+    match waiting {
+        Some(EnableBlocker::Mode { .. }) => {
+            return "check that 0x6060 is mapped or written and that 0x6502 has the mode; for a drive that shows it in 0x6061 only in Operation enabled set `mode_display = \"enabled\"`".to_owned();
+        }
+        Some(EnableBlocker::Follows { .. }) => {
+            return "look for a limit switch, a closed brake or an internal limit; for a drive that does not serve bit 12 in this mode set `follows_bit = false`".to_owned();
+        }
+        Some(EnableBlocker::Position) => {
+            return "map 0x6064 with `pdo.tx`; check the drive's encoder".to_owned();
+        }
+        _ => {}
+    }
     match (state, code) {
         (State::Fault | State::FaultReactionActive, Some(code)) if code != 0 => describe(code).hint.to_owned(),
         (State::Fault | State::FaultReactionActive, _) => "read the drive's error history (0x1003)".to_owned(),
-        (State::OperationEnabled, _) if !mode_confirmed => {
-            "the drive does not accept the mode: check that 0x6060 is mapped or written, and supported".to_owned()
-        }
         _ => "check the supply of the power stage, STO and enable inputs, and that no other tool controls the drive".to_owned(),
     }
 }
@@ -466,7 +500,7 @@ fn allows_less(limits: &[LimitConflict]) -> String {
 fn trip(trip: &Trip) -> &'static str {
     match trip {
         Trip::FollowingError { .. } => {
-            "is the axis free to move and tuned? lower `speed` and `ramp`, or raise `limits.following_error` and the drive's 0x6065"
+            "is the axis free to move and tuned? lower `speed` and `ramp`, or raise `limits.following_error` and the drive's 0x6065; an error that grows with the velocity needs `dead_time`"
         }
         Trip::PositionLimit { .. } => {
             "move the axis back by hand, or check `limits.position` and `offset`"
@@ -478,7 +512,19 @@ fn trip(trip: &Trip) -> &'static str {
         Trip::EmergencyStop => "find out why it was pressed, then reset and enable the axis again",
         Trip::SetPointNotTaken => "the drive must be in profile position mode with 0x607A mapped",
         Trip::NotFollowing { .. } => {
-            "look for a limit switch, a closed brake or an internal limit; for a drive that does not serve the bit set `follows_bit = false`"
+            "look for a limit switch, a closed brake or an internal limit; for a drive that does not serve bit 12 in this mode set `follows_bit = false`"
+        }
+        Trip::HaltIgnored { .. } => {
+            "check the drive's halt option code (0x605D) and its deceleration (0x6084, 0x609A); run the axis in CSP if the drive has no halt"
+        }
+        Trip::UnlistedStatusword { .. } => {
+            "compare the Statusword with the drive's manual; check the supply of the drive and whether 0x6041 is mapped where the ESI says"
+        }
+        Trip::PositionJump { .. } => {
+            "home the axis again; the drive shifts 0x6064 on its own: check its encoder, its homing and its position range (0x607B)"
+        }
+        Trip::VelocityContradiction { .. } => {
+            "check the drive's velocity unit (0x60A9, `velocity_unit`), `encoder` and `per_turn`"
         }
         Trip::NotStopped { .. } => {
             "check the drive's quick stop (0x605A, 0x6085), its torque limit and the load; `stop_timeout` sets how long a stop may take"
@@ -488,6 +534,9 @@ fn trip(trip: &Trip) -> &'static str {
         }
         Trip::Skew { .. } | Trip::HomingSkew { .. } => {
             "look for what holds one half of the gantry; decouple the halves to move them alone"
+        }
+        Trip::ModeNotShown { .. } => {
+            "check that 0x6060 is mapped and that 0x6502 has the mode; a slower drive needs a longer `mode_time`"
         }
         Trip::ModeLost { .. } => "another tool changes the drive's mode: disconnect it",
     }

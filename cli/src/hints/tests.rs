@@ -1,3 +1,4 @@
+use ecaxis_axis::Mode;
 use ecaxis_master::acyclic::{AlState, DeviceRef};
 use ecaxis_master::eoe::TapStep;
 use ecaxis_master::link::OpenError;
@@ -48,16 +49,17 @@ fn every_failure_has_a_hint() {
         };
         Cause::State(refused).with_device(device())
     };
-    let not_enabled = |state, code| {
+    let waiting = |state, code, waiting| {
         Cause::NotEnabled {
             state,
             statusword: 0,
-            mode_confirmed: true,
+            waiting,
             code,
             timeout_ms: 5000,
         }
         .with_device(device())
     };
+    let not_enabled = |state, code| waiting(state, code, None);
     let missing = Cause::Missing {
         expected: 2,
         found: 1,
@@ -137,8 +139,16 @@ fn every_failure_has_a_hint() {
         ),
         (start_up(0x0602_0000, "ESI"), FAILED, "firmware"),
         (start_up(0x0601_0002, "mode csp"), FAILED, "firmware"),
-        (start_up(0x0601_0002, OWN_SDO), FAILED, "from `sdo`"),
-        (start_up(0x0602_0000, OWN_SDO), FAILED, "`index`"),
+        (
+            start_up(0x0601_0002, SDO_OF_MACHINE_FILE),
+            FAILED,
+            "from `sdo`",
+        ),
+        (
+            start_up(0x0602_0000, SDO_OF_MACHINE_FILE),
+            FAILED,
+            "`index`",
+        ),
         (
             start_up(0x0604_0041, "pdo.rx in RxPdo 0x1600"),
             FAILED,
@@ -147,6 +157,42 @@ fn every_failure_has_a_hint() {
         (refused(0x001e), FAILED, "assigned TxPDOs"),
         (refused(0x0035), FAILED, "cycle time"),
         (not_enabled(State::SwitchOnDisabled, None), FAILED, "STO"),
+        (
+            waiting(
+                State::SwitchedOn,
+                None,
+                Some(EnableBlocker::Mode {
+                    expected: Mode::Csp,
+                    display: Mode::Unknown(0),
+                }),
+            ),
+            FAILED,
+            "`mode_display = \"enabled\"`",
+        ),
+        (
+            waiting(
+                State::OperationEnabled,
+                None,
+                Some(EnableBlocker::Follows { mode: Mode::Csp }),
+            ),
+            FAILED,
+            "`follows_bit = false`",
+        ),
+        (
+            Cause::NotSwitched { mode: Mode::Pp }.with_device(device()),
+            FAILED,
+            "`mode_change = \"no-power\"`",
+        ),
+        (
+            Cause::NodeNotOperational {
+                id: 6,
+                state: NodeState::Unknown,
+                timeout_ms: 5000,
+            }
+            .with_device(device()),
+            FAILED,
+            "`objects`",
+        ),
         (
             not_enabled(State::Fault, Some(0x8611)),
             FAILED,
@@ -262,6 +308,7 @@ fn is_a_key(key: &str) -> bool {
 #[test]
 fn hints_name_keys_that_exist() {
     assert!(is_a_key("pdo.rx") && is_a_key("cycle") && is_a_key("per_turn"));
+    assert!(is_a_key("mode_change") && is_a_key("mode_display") && is_a_key("dead_time"));
     assert!(!is_a_key("pdo.xr") && !is_a_key("cycel"));
     for code in 0..=u16::MAX {
         for key in al_status(code).split('`').skip(1).step_by(2) {

@@ -48,9 +48,10 @@ pub(crate) fn print_page(document: &Document) -> Result<(), Failure> {
 
 /// Prints text with colours for states and findings, on a terminal.
 pub(crate) fn shown(text: &str) -> Result<(), Failure> {
+    let text = output::without_controls(text);
     match style::on_stdout() {
-        true => result(&style::decorated(text)),
-        false => result(text),
+        true => result(&style::decorated(&text)),
+        false => result(&text),
     }
 }
 
@@ -92,7 +93,8 @@ pub(crate) fn note(text: &str) {
 /// Prints a line of a failure on stderr.
 pub(crate) fn print_always(text: &str) {
     output::log_message(text);
-    let text = output::wrapped(text, output::stderr_width());
+    let text = output::without_controls(text);
+    let text = output::wrapped(&text, output::stderr_width());
     let _ = output::print_line(|mut err| style::complaint(&mut err, &text));
 }
 

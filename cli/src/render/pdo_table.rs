@@ -22,7 +22,7 @@ pub(crate) fn process_data(device: &Device, layout: &Layout, out: &mut Document)
             _ => "unused",
         };
         let own = (sm.start_address, sm.default_size, sm.control_byte);
-        let of = |p: &SmLayout| (p.start_address, p.len, p.control_byte);
+        let of = |p: &SmLayout| (p.start_address, p.len, p.control());
         let (address, len, control) = planned.map_or(own, of);
         let fmmu = planned.map(|p| p.fmmu.map_or("next free".to_owned(), |f| f.to_string()));
         let (address, control) = (hex16(address), format!("0x{control:02x}"));

@@ -173,7 +173,7 @@ impl Observer for ProgressPrinter {
             }
             Progress::GroupReleased { group } => {
                 note(&format!(
-                    "the group `{group}` has been reset and can be enabled again"
+                    "the stop of the group `{group}` has ended; its axes can be enabled"
                 ));
             }
             Progress::DeviceReturned {
@@ -181,10 +181,11 @@ impl Observer for ProgressPrinter {
                 after_ns,
                 home,
                 first,
+                has_axes,
                 ..
             } => note(&match first {
-                true => device_appeared(device),
-                false => device_returned(device, *after_ns, *home),
+                true => device_appeared(device, *has_axes),
+                false => device_returned(device, *after_ns, *home, *has_axes),
             }),
             Progress::GroupWaits { group } => {
                 note(&format!(
@@ -288,17 +289,31 @@ fn axis_text(axis: &AxisLine) -> String {
     }
 }
 /// Describes an optional device that was absent.
-pub fn device_appeared(device: &DeviceRef) -> String {
-    format!("{device} has appeared and is in Op; reset its axes, then enable them")
+pub fn device_appeared(device: &DeviceRef, has_axes: bool) -> String {
+    format!("{device} has appeared and is in Op{}", next_step(has_axes))
+}
+
+/// Returns what a device that is in Op needs next.
+fn next_step(has_axes: bool) -> &'static str {
+    match has_axes {
+        true => "; reset its axes, then enable them",
+        false => "; its outputs are off until a step sets them",
+    }
 }
 
 /// Describes a device that is in Op again.
-pub fn device_returned(device: &DeviceRef, after_ns: Nanos, home: Option<Home>) -> String {
+pub fn device_returned(
+    device: &DeviceRef,
+    after_ns: Nanos,
+    home: Option<Home>,
+    has_axes: bool,
+) -> String {
     let after = after_ns as f64 * 1e-9;
     let home = match home {
         Some(Home::Lost) => "; it had no power, so home is lost",
         Some(Home::Kept) => "; it had no power, and keeps home by its absolute encoder",
         None => "",
     };
-    format!("{device} is in Op again after {after:.2} s{home}; reset its axes, then enable them")
+    let next = next_step(has_axes);
+    format!("{device} is in Op again after {after:.2} s{home}{next}")
 }

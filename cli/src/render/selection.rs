@@ -10,7 +10,7 @@ pub(crate) fn configuration(selection: &Selection, cycle_ns: u64) -> Value {
     let layout = &selection.layout;
     let sync_manager = |sm: &SmLayout| {
         json!({
-            "sm": sm.sm, "address": sm.start_address, "bytes": sm.len, "control": sm.control_byte,
+            "sm": sm.sm, "address": sm.start_address, "bytes": sm.len, "control": sm.control(),
         })
     };
     let clock = selection

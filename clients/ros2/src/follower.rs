@@ -4,7 +4,9 @@
 //! come at the rate of the publisher; between them a leader moves on, and a gear follows it within
 //! the limits of the axis.
 
-use ecaxis_axis::setpoint::{Gear, GearConfig, GearInMode, Motion, MotionLimits, Playback, Table};
+use ecaxis_axis::setpoint::{
+    Gear, GearConfig, GearInMode, Master, Motion, MotionLimits, Playback, Rate, Setpoint, Table,
+};
 use ecaxis_client::SetPoint;
 
 use crate::joints::Joint;
@@ -372,7 +374,11 @@ impl Follower {
                 } else {
                     for _ in 0..steps {
                         leader.advance(dt_s);
-                        *motion = gear.advance(leader.motion, *motion, dt_s);
+                        let master = Master {
+                            motion: leader.motion,
+                            comes_to_rest: false,
+                        };
+                        *motion = gear.with_master(master).advance(*motion, Rate::WHOLE, dt_s);
                     }
                     return (Some(SetPoint::Position(motion.position)), None);
                 }
@@ -391,7 +397,9 @@ impl Follower {
                     Some(End::Done)
                 } else {
                     for _ in 0..steps {
-                        *motion = playback.advance(table, *motion, dt_s, 1.0);
+                        *motion = playback
+                            .with_table(table)
+                            .advance(*motion, Rate::WHOLE, dt_s);
                     }
                     return (Some(SetPoint::Position(motion.position)), None);
                 }

@@ -250,6 +250,16 @@ impl Machine {
         self.complete("sim_input", name, keys)
     }
 
+    /// Sends an NMT command to a node behind a gateway: `start`, `stop`, `pre_operational` or
+    /// `reset`.
+    ///
+    /// # Errors
+    /// Fails if the node is unknown, or its axis has power.
+    pub fn command_node(&self, device: &str, node: u8, action: &str) -> Result<()> {
+        let keys = json!({"device": device, "node": node, "action": action});
+        self.complete("node", device, keys)
+    }
+
     /// Sets an output that no axis writes.
     ///
     /// # Errors

@@ -3,8 +3,8 @@
 use std::fmt;
 
 use super::{
-    DcMode, Dictionary, Fmmu, FmmuUse, LocalName, Mailbox, Pdo, Position, Slots, SmMapping, SmUse,
-    Soe, SyncManager, SyncUnit,
+    DcMode, Dictionary, Direction, Fmmu, FmmuUse, LocalName, Mailbox, Pdo, Position, Slots,
+    SmMapping, SmUse, Soe, SyncManager, SyncUnit,
 };
 use ecaxis_ecat::vendor::VendorId;
 
@@ -36,7 +36,7 @@ impl fmt::Display for Identity {
 /// The identity and the names of a device, without its content.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DeviceHeader {
-    /// The number of the `Device` element in its list, from 1, as in element paths.
+    /// The number of the `Device` element in the file, from 1.
     pub number: u32,
     /// Vendor, product code and revision.
     pub identity: Identity,
@@ -53,6 +53,8 @@ pub struct Device {
     pub position: Position,
     /// Element path, as in [`super::Warning`].
     pub path: String,
+    /// The number of the `Device` element in the file, from 1.
+    pub number: u32,
     /// Vendor, product code and revision.
     pub identity: Identity,
     /// Text of `Type`, e.g. `EPOS4`.
@@ -124,6 +126,30 @@ impl Device {
             let drive = pdo.drive();
             pdo.entries.iter_mut().for_each(|entry| entry.sub = drive);
         }
+    }
+
+    /// Decides what each SyncManager carries, once its PDOs are known. Returns the SyncManagers whose
+    /// text says something else.
+    pub(crate) fn resolve_sync_managers(&mut self) -> Vec<(u8, SmUse)> {
+        let mut contradicted = Vec::new();
+        for (number, sm) in (0..=u8::MAX).zip(&mut self.sync_managers) {
+            let pdos = self.rx_pdos.iter().chain(&self.tx_pdos);
+            let own = pdos.filter(|pdo| pdo.sm == Some(number));
+            let resolved = sm.resolved(own.map(|pdo| pdo.direction));
+            let text = std::mem::replace(&mut sm.usage, resolved);
+            if text != SmUse::Other && text != resolved {
+                contradicted.push((number, text));
+            }
+        }
+        contradicted
+    }
+
+    /// Returns the SyncManager that carries a direction unless a PDO names another one.
+    #[must_use]
+    pub fn primary_sm(&self, direction: Direction) -> Option<u8> {
+        let usage = SmUse::from(direction);
+        let mut all = self.sync_managers.iter();
+        u8::try_from(all.position(|sm| sm.usage == usage && !sm.virtual_)?).ok()
     }
 
     /// Returns the SyncManager through which the MainDevice reads the mailbox.

@@ -23,6 +23,40 @@ impl Dictionary {
     }
 }
 
+impl Dictionary {
+    /// Returns how the dictionary contradicts a download; `None` if it permits the download or has
+    /// no objects at all.
+    pub(crate) fn contradiction(
+        &self,
+        (index, sub): (u16, u8),
+        data: &[u8],
+        complete_access: bool,
+    ) -> Option<String> {
+        if self.objects.is_empty() {
+            return None;
+        }
+        let Some(object) = self.object(index) else {
+            return Some("is not in the dictionary".to_owned());
+        };
+        if complete_access {
+            return None;
+        }
+        let Some(item) = object.items.iter().find(|item| item.sub == sub) else {
+            return Some("is not in the dictionary".to_owned());
+        };
+        let bytes = item.default.len();
+        let is_text = item.type_name.contains("STRING") || item.type_name.contains("ARRAY");
+        if bytes > 0 && bytes != data.len() && !is_text {
+            let given = data.len();
+            return Some(format!(
+                "is written with {given} bytes, the object has {bytes}"
+            ));
+        }
+        let is_read_only = item.access.write == Writable::Never;
+        is_read_only.then(|| "is read-only in the dictionary".to_owned())
+    }
+}
+
 /// The kind of an object (ETG.1000.6).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum ObjectCode {

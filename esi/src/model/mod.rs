@@ -14,7 +14,7 @@
 //! # let bytes = include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/examples/io.xml"));
 //! # let file = ecaxis_esi::parse(bytes)?;
 //! let device = &file.devices[0];
-//! assert_eq!((file.vendor.id, device.identity.product), (1, 2));
+//! assert_eq!((file.vendors[0].id, device.identity.product), (1, 2));
 //! assert_eq!(device.sync_managers[3].start_address, 0x1200);
 //! assert_eq!(device.tx_pdos[0].entries[0].index, 0x6000);
 //! # Ok::<(), Box<dyn std::error::Error>>(())
@@ -70,8 +70,8 @@ impl fmt::Display for Position {
 /// A whole ESI file (`EtherCATInfo`).
 #[derive(Debug, Clone, Default)]
 pub struct EsiFile {
-    /// The vendor.
-    pub vendor: Vendor,
+    /// The vendor of each `EtherCATInfo` in file order: one, except in an `EtherCATInfoList`.
+    pub vendors: Vec<Vendor>,
     /// The groups of devices.
     pub groups: Vec<Group>,
     /// The devices in file order.
@@ -88,6 +88,13 @@ pub struct EsiFile {
 }
 
 impl EsiFile {
+    /// Returns the name of a vendor in the file; empty if the file does not name it.
+    #[must_use]
+    pub fn vendor_name(&self, id: u32) -> &str {
+        let vendor = self.vendors.iter().find(|vendor| vendor.id == id);
+        vendor.map_or("", |vendor| &vendor.name)
+    }
+
     /// Returns identity, type and name of each device, first of those built.
     pub fn headers(&self) -> impl Iterator<Item = (Identity, &str, &str)> {
         let built = self.devices.iter();

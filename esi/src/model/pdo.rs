@@ -2,6 +2,9 @@
 
 use super::{Position, Text};
 
+/// The maximum number of entries of one oversampled PDO; a frame has 11888 bits of process data.
+const MAX_SAMPLED_ENTRIES: usize = 16_384;
+
 /// The direction of a PDO, seen from the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Direction {
@@ -96,6 +99,44 @@ impl Pdo {
     #[must_use]
     pub fn bit_len(&self) -> u32 {
         self.entries.iter().map(|e| u32::from(e.bit_len)).sum()
+    }
+
+    /// Returns the PDOs that carry `factor` samples of this one in a cycle. `None`: the factor is
+    /// larger than `OSMax` or than a frame.
+    ///
+    /// With an index increment, each sample is a separate PDO with the next index. Without it, a
+    /// single entry becomes longer, and several entries are repeated in the same PDO.
+    #[must_use]
+    pub fn samples(&self, factor: u16) -> Option<Vec<Self>> {
+        if factor <= 1 {
+            return Some(vec![self.clone()]);
+        }
+        let entries = self.entries.len().max(1).saturating_mul(factor.into());
+        let max = self.oversampling.and_then(|own| own.max);
+        if entries > MAX_SAMPLED_ENTRIES || max.is_some_and(|max| factor > max) {
+            return None;
+        }
+        let increment = self.oversampling.map_or(0, |own| own.index_increment);
+        if increment > 0 {
+            let all = (0..factor).map(|sample| {
+                let mut copy = self.clone();
+                copy.index = self.index.wrapping_add(sample);
+                for entry in copy.entries.iter_mut().filter(|entry| !entry.is_gap()) {
+                    entry.index = entry.index.wrapping_add(sample.wrapping_mul(increment));
+                }
+                copy
+            });
+            return Some(all.collect());
+        }
+        let mut longer = self.clone();
+        match longer.entries.as_mut_slice() {
+            [only] => only.bit_len = only.bit_len.saturating_mul(factor),
+            _ => {
+                let one = longer.entries.clone();
+                longer.entries = (0..factor).flat_map(|_| one.iter().cloned()).collect();
+            }
+        }
+        Some(vec![longer])
     }
 
     /// Returns the approximate memory use in bytes.

@@ -1,6 +1,6 @@
 //! Slots and their modules.
 
-use super::{Dictionary, InitCmd, Object, Pdo, Position, SlotDependence};
+use super::{Device, Dictionary, InitCmd, Object, Pdo, Position, SlotDependence};
 
 /// `Slots`: the places for modules of a modular device.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -17,6 +17,31 @@ pub struct Slots {
     pub slots: Vec<Slot>,
     /// `ModulePdoGroup`, sorted by the number that modules refer to.
     pub pdo_groups: Vec<ModulePdoGroup>,
+}
+
+impl Slots {
+    /// The number of subindices of 0xF030.
+    pub const MAX_PLACES: usize = 254;
+
+    /// Returns the number of places: slots and their instances, without the limits of 0xF030 and
+    /// of `MaxSlotCount`.
+    #[must_use]
+    pub fn declared_places(&self) -> u64 {
+        let counts = self.slots.iter().map(|slot| u64::from(slot.instances()));
+        counts.fold(0, u64::saturating_add)
+    }
+
+    /// Returns the slot of each place, with the number of the instance.
+    pub fn places(&self) -> impl Iterator<Item = (&Slot, u32)> {
+        let most = self
+            .max_count
+            .and_then(|count| usize::try_from(count).ok())
+            .filter(|count| *count > 0)
+            .map_or(Self::MAX_PLACES, |count| count.min(Self::MAX_PLACES));
+        let each = self.slots.iter();
+        each.flat_map(|slot| (0..slot.instances()).map(move |instance| (slot, instance)))
+            .take(most)
+    }
 }
 
 /// The index steps of a module from one slot or slot group to the next.
@@ -68,6 +93,14 @@ pub struct Slot {
     pub module_classes: Vec<String>,
 }
 
+impl Slot {
+    /// Returns the number of places of the slot.
+    #[must_use]
+    pub fn instances(&self) -> u32 {
+        self.max_instances.max(self.min_instances).max(1)
+    }
+}
+
 /// One `Module` of an ESI file.
 #[derive(Debug, Clone, Default)]
 pub struct Module {
@@ -102,12 +135,13 @@ pub struct Module {
 }
 
 impl Module {
-    /// Returns the module as plugged at `place`, with slot-dependent indices shifted. Places count
-    /// from 0 over all slots and their instances.
+    /// Returns the module as plugged at `place` of a device: slot-dependent indices are shifted, and
+    /// each PDO of the default assignment names its SyncManager. Places count from 0 over all slots
+    /// and their instances.
     #[must_use]
-    pub fn at(&self, slots: &Slots, slot: &Slot, place: usize) -> Self {
+    pub fn at(&self, device: &Device, slots: &Slots, slot: &Slot, place: usize) -> Self {
         let place = SlotPosition::new(slots, slot, place);
-        let mut module = self.without_objects_at(&place);
+        let mut module = self.without_objects_at(device, &place);
         let objects = place.objects(self).map(|(index, object)| Object {
             index,
             ..object.clone()
@@ -135,7 +169,11 @@ impl Module {
 
     /// Same as [`Self::at`] without the dictionary, which [`SlotPosition::objects`] provides.
     /// Dictionaries are long, and a device may have many places.
-    pub(crate) fn without_objects_at(&self, place: &SlotPosition) -> Self {
+    pub(crate) fn without_objects_at(&self, device: &Device, place: &SlotPosition) -> Self {
+        // ETG.2000: without `Sm`, a PDO is not assigned by default, unless it is mandatory. A module
+        // that names no SyncManager at all would have no process data.
+        let mut all = self.rx_pdos.iter().chain(&self.tx_pdos);
+        let names_none = all.all(|pdo| pdo.sm.is_none());
         let mut module = Self {
             rx_pdos: self.rx_pdos.clone(),
             tx_pdos: self.tx_pdos.clone(),
@@ -150,6 +188,9 @@ impl Module {
             ..*self
         };
         for pdo in module.rx_pdos.iter_mut().chain(&mut module.tx_pdos) {
+            if pdo.sm.is_none() && (pdo.mandatory || names_none) {
+                pdo.sm = device.primary_sm(pdo.direction);
+            }
             pdo.index = place.pdo_index(pdo.index, pdo.depends_on);
             for excluded in &mut pdo.exclude {
                 excluded.index = place.pdo_index(excluded.index, excluded.depends_on);

@@ -1,6 +1,6 @@
 //! FMMUs, SyncManagers, sync units and DC operation modes.
 
-use super::Position;
+use super::{Direction, Position};
 
 /// One `Fmmu` element. Its index in `Device::fmmus` is its number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -50,8 +50,52 @@ pub enum SmUse {
     Outputs,
     /// Inputs.
     Inputs,
-    /// Empty or unknown text.
+    /// Nothing in the file says what it carries.
     Other,
+}
+
+impl SmUse {
+    /// Returns the usage that mode and direction of a control byte (register 0x0804) mean.
+    fn of_control_byte(control: u8) -> Self {
+        match control & 0x0f {
+            0x00 => Self::Inputs,
+            0x04 => Self::Outputs,
+            0x02 => Self::MBoxIn,
+            0x06 => Self::MBoxOut,
+            _ => Self::Other,
+        }
+    }
+}
+
+impl From<Direction> for SmUse {
+    fn from(direction: Direction) -> Self {
+        match direction {
+            Direction::Rx => Self::Outputs,
+            Direction::Tx => Self::Inputs,
+        }
+    }
+}
+
+impl SyncManager {
+    /// Returns what the SyncManager carries. `directions` are those of the PDOs that name it.
+    ///
+    /// A mailbox is what its text says. The PDOs decide the direction of process data, because the
+    /// layout follows them, unless text and `ControlByte` agree on the other direction. Without
+    /// PDOs the text decides, and without a known text the `ControlByte` of an enabled SyncManager.
+    pub(super) fn resolved(&self, mut directions: impl Iterator<Item = Direction>) -> SmUse {
+        if matches!(self.usage, SmUse::MBoxOut | SmUse::MBoxIn) {
+            return self.usage;
+        }
+        let first = directions.next();
+        let one = first.filter(|first| directions.all(|other| other == *first));
+        let by_control = SmUse::of_control_byte(self.control_byte);
+        match (one.map(SmUse::from), self.usage) {
+            (Some(_), text) if text == by_control && text != SmUse::Other => text,
+            (Some(by_pdos), _) => by_pdos,
+            (None, SmUse::Other) if self.enable => by_control,
+            (None, text) => text,
+        }
+    }
 }
 
 /// One `Sm` element. Its index in `Device::sync_managers` is its number.
@@ -59,7 +103,7 @@ pub enum SmUse {
 pub struct SyncManager {
     /// The position of the element.
     pub position: Position,
-    /// The usage.
+    /// The usage. PDOs, text and `ControlByte` decide it together (`Device::resolve_sync_managers`).
     pub usage: SmUse,
     /// `StartAddress`: the physical start address.
     pub start_address: u16,

@@ -39,6 +39,31 @@ pub enum SelectError {
         /// The choices in the ESI as text.
         offered: String,
     },
+    /// PDOs of the device have the set-point of the mode, but no Controlword.
+    #[error("{device} has no mode {mode}: no RxPdo of the ESI has the Controlword 0x6040")]
+    NoControlword {
+        /// The type name of the device.
+        device: String,
+        /// The mode.
+        mode: Mode,
+    },
+    /// A PDO maps a value of CiA 402 under a subindex that the value does not have.
+    #[error(
+        "{device}: mode {mode} needs 0x{index:04X}:00; {} maps 0x{index:04X}:{sub:02X}",
+        position.origin()
+    )]
+    SubindexOfValue {
+        /// The type name of the device.
+        device: String,
+        /// The position of the `Entry`.
+        position: Position,
+        /// The mode.
+        mode: Mode,
+        /// The index of the object.
+        index: u16,
+        /// The subindex in the ESI.
+        sub: u8,
+    },
     /// No PDO of the device carries the Controlword of an axis.
     #[error("{device} has no axis {number}: no RxPdo of the ESI has its Controlword 0x{index:04X}")]
     NoSuchAxis {
@@ -82,6 +107,16 @@ pub enum SelectError {
         given: usize,
         /// The number of places.
         places: usize,
+    },
+    /// A named module is for another mode.
+    #[error("{device}: module {module:?} is not for mode {mode}")]
+    ModuleMode {
+        /// The type name of the device.
+        device: String,
+        /// The module's type.
+        module: String,
+        /// The chosen mode.
+        mode: Mode,
     },
     /// The device has no PDO assignment with this name.
     #[error("{device} has no PDO assignment {wanted:?}; the ESI offers {offered}")]

@@ -25,13 +25,13 @@ mod dc;
 mod device;
 mod error;
 mod module;
-mod oversampling;
 mod pdo;
 mod soe;
 
 pub use dc::DcSettings;
 pub use device::{DeviceQuery, find_device};
 pub use error::SelectError;
+pub use module::{module_names, plugged_modules};
 
 use std::collections::HashMap;
 
@@ -78,9 +78,10 @@ pub struct SelectOptions<'a> {
     pub more_rx: &'a [EntryRef],
     /// Objects added to the input PDOs, which keep their own.
     pub more_tx: &'a [EntryRef],
-    /// Modules slot by slot (type, name or identity; `-` for none). Slots without an element in
-    /// this list follow mode and default.
-    pub modules: &'a [&'a str],
+    /// The modules place by place (type, name or identity; `-` or an empty text for none). `None`:
+    /// each place follows mode and default. The list is complete: a place after its end is empty,
+    /// except for a required one and one that the mode fills.
+    pub modules: Option<&'a [&'a str]>,
     /// The name of an `AlternativeSmMapping`.
     pub assignment: Option<&'a str>,
     /// The name or description of a `Dc/OpMode`, or `off`.
@@ -129,6 +130,19 @@ pub struct Selection {
 }
 
 impl Selection {
+    /// Returns the module identities place by place, with 0 for an empty place, as in 0xF030.
+    #[must_use]
+    pub fn module_idents(&self) -> Vec<u32> {
+        let count = self.modules.iter().map(|module| module.place + 1).max();
+        let mut idents = vec![0; count.unwrap_or(0)];
+        for module in &self.modules {
+            if let Some(ident) = idents.get_mut(module.place) {
+                *ident = module.ident;
+            }
+        }
+        idents
+    }
+
     /// Returns `true` if the device generates SYNC0 or SYNC1.
     #[must_use]
     pub fn activates_sync(&self) -> bool {
@@ -223,10 +237,7 @@ pub fn select(
     };
     let rx = select(Direction::Rx, choice.rx, choice.more_rx, &mut notes)?;
     let tx = select(Direction::Tx, choice.tx, choice.more_tx, &mut notes)?;
-    let mut layout = Layout::new(device, &rx, &tx)?;
-    if choice.mode.is_some() {
-        watch_outputs(device, &mut layout, &mut notes);
-    }
+    let layout = Layout::new(device, &rx, &tx)?;
     let dc = dc_mode
         .filter(|mode| mode.assign_activate != 0)
         .map(|mode| dc::settings(mode, choice.cycle_ns))
@@ -271,26 +282,6 @@ pub fn select(
     Ok(selection)
 }
 
-/// Enables the output watchdog: a drive must stop if its outputs fail, whatever its ESI contains.
-/// Bit 6 of the ControlByte (ETG.1000.4, table 58) lets writes of the outputs trigger the watchdog.
-fn watch_outputs(device: &Device, layout: &mut Layout, notes: &mut Vec<String>) {
-    const WATCHDOG_TRIGGER: u8 = 0x40;
-    for sm in &mut layout.outputs {
-        let of_file = sm.control_byte;
-        sm.control_byte |= WATCHDOG_TRIGGER;
-        if sm.control_byte != of_file {
-            let manager = device.sync_managers.get(usize::from(sm.sm));
-            let position = manager.map(|sm| sm.position).unwrap_or_default();
-            notes.push(format!(
-                "SyncManager {} gets ControlByte 0x{:02x}, with the watchdog trigger that 0x{of_file:02x} ({}) lacks",
-                sm.sm,
-                sm.control_byte,
-                position.origin()
-            ));
-        }
-    }
-}
-
 fn merged(device: &Device, placed: &[module::PluggedModule<'_>]) -> Dictionary {
     let mut dictionary = device.dictionary.clone();
     // The position of each object, and the module object that it copies. Slot-independent objects
@@ -333,20 +324,19 @@ pub fn offered_modes(file: &EsiFile, device: &Device) -> Vec<Mode> {
         .into_iter()
         .filter(|&mode| {
             if has_slots {
-                return module::choose(&file.modules, device, Some((mode, &[0])), &[]).is_ok_and(
+                return module::choose(&file.modules, device, Some((mode, &[0])), None).is_ok_and(
                     |placed| placed.iter().any(|p| module::mode_of(&p.module).is_some()),
                 );
             }
-            let has = |pdo: &Pdo, index| pdo.entries.iter().any(|entry| entry.index == index);
+            let rx_pdos = &device.rx_pdos;
             // An empty mapping object takes any object that the dictionary maps.
-            let mappable = |target| {
+            let mappable = |index| {
                 let empty = |pdo: &Pdo| !pdo.fixed && pdo.entries.is_empty();
-                let item = device.dictionary.item(target, 0);
-                device.rx_pdos.iter().any(empty) && item.is_some_and(|i| i.pdo_mapping.rx)
+                let item = device.dictionary.item(index, 0);
+                rx_pdos.iter().any(empty) && item.is_some_and(|i| i.pdo_mapping.rx)
             };
-            mode.target_object().is_some_and(|target| {
-                device.rx_pdos.iter().any(|pdo| has(pdo, target)) || mappable(target)
-            })
+            let carries = |index| pdo::contains(rx_pdos, index) || mappable(index);
+            mode.target_object().is_some_and(carries) && carries(pdo::CONTROLWORD)
         })
         .collect()
 }
@@ -354,7 +344,7 @@ pub fn offered_modes(file: &EsiFile, device: &Device) -> Vec<Mode> {
 /// Returns all PDOs of one direction, including those of the default module, for images without a
 /// choice.
 pub(crate) fn default_pdos(device: &Device, modules: &[Module], direction: Direction) -> Vec<Pdo> {
-    let placed = module::choose(modules, device, None, &[]).unwrap_or_default();
+    let placed = module::choose(modules, device, None, None).unwrap_or_default();
     pdo::PdoSelector {
         device,
         placed: &placed,

@@ -10,8 +10,8 @@ use crate::model::{Device, Module, Slot, SlotPosition, Slots};
 
 const CONTROLWORD: u16 = 0x6040;
 const MODES_OF_OPERATION: u16 = 0x6060;
-/// The number of subindices of 0xF030.
-const MAX_PLACES: usize = 254;
+/// The name of a place without a module in `modules`.
+const EMPTY_PLACE: &str = "-";
 /// The maximum size in bytes of the modules in all places together, with their objects. A selection
 /// copies them.
 const MAX_SIZE: usize = 24 << 20;
@@ -29,6 +29,40 @@ pub(super) struct PluggedModule<'m> {
     pub source: &'m Module,
 }
 
+/// Returns the names of module identities as in [`SelectOptions::modules`], for lists as in 0xF030
+/// and 0xF050. Empty places at the end of the list are omitted.
+///
+/// [`SelectOptions::modules`]: super::SelectOptions::modules
+#[must_use]
+pub fn module_names(modules: &[Module], idents: &[u32]) -> Vec<String> {
+    // A name that other modules have as well does not select one.
+    let own = |module: &Module| {
+        let mut others = modules.iter().filter(|other| other.ident != module.ident);
+        let name = (!others.any(|other| is_called(other, &module.type_name)))
+            .then(|| module.type_name.to_string());
+        name.filter(|name| !name.is_empty())
+    };
+    let name = |ident: &u32| match modules.iter().find(|module| module.ident == *ident) {
+        _ if *ident == 0 => EMPTY_PLACE.to_owned(),
+        module => module
+            .and_then(own)
+            .unwrap_or_else(|| format!("0x{ident:08x}")),
+    };
+    plugged_modules(idents).iter().map(name).collect()
+}
+
+/// Returns the places of a list as in 0xF030 and 0xF050 up to the last module.
+#[must_use]
+pub fn plugged_modules(idents: &[u32]) -> &[u32] {
+    let last = idents.iter().rposition(|ident| *ident != 0);
+    let len = last.map_or(0, |last| last + 1);
+    idents.get(..len).unwrap_or_default()
+}
+
+fn is_called(module: &Module, name: &str) -> bool {
+    module.type_name.eq_ignore_ascii_case(name) || module.name.eq_ignore_ascii_case(name)
+}
+
 /// One instance of a slot.
 struct Instance<'a> {
     slot: &'a Slot,
@@ -41,16 +75,16 @@ struct Instance<'a> {
 /// Returns the selected modules. The list is empty if the device has no slots or its optional slots
 /// stay empty.
 ///
-/// `wanted` names modules place by place (type, name or identity; `-` for none). A mode fills each
-/// place that `wanted` does not name and that is required or holds an axis in use.
+/// `wanted` is [`SelectOptions::modules`](super::SelectOptions::modules). A mode fills each place
+/// that `wanted` does not name and that is required or holds an axis in use.
 pub(super) fn choose<'m>(
     modules: &'m [Module],
     device: &'m Device,
     mode: Option<(Mode, &[u16])>,
-    wanted: &[&str],
+    wanted: Option<&[&str]>,
 ) -> Result<Vec<PluggedModule<'m>>, SelectError> {
     let Some(slots) = device.slots.as_ref() else {
-        return match wanted.len() {
+        return match wanted.map_or(0, <[_]>::len) {
             0 => Ok(Vec::new()),
             given => Err(SelectError::TooManyModules {
                 device: device.name.clone(),
@@ -60,21 +94,37 @@ pub(super) fn choose<'m>(
         };
     };
     let places = places(modules, slots)?;
-    if wanted.len() > places.len() {
+    let named_places = wanted.unwrap_or_default();
+    if named_places.len() > places.len() {
         return Err(SelectError::TooManyModules {
             device: device.name.clone(),
-            given: wanted.len(),
+            given: named_places.len(),
             places: places.len(),
         });
     }
     let (mut chosen, mut size) = (Vec::new(), 0usize);
     for (number, place) in places.iter().enumerate() {
-        let by_name = wanted.get(number).map(|name| name.trim());
+        let by_name = named_places.get(number).map(|name| name.trim());
         let at = SlotPosition::new(slots, place.slot, number);
         let takes_mode = |axes: &[u16]| place.required || place.holds_axis(number, &at, axes);
         let module = match (by_name, mode) {
-            (Some(name), _) => named(device, place, name)?,
+            (Some(name), _) => {
+                let module = named(device, place, name)?;
+                let modes = mode.filter(|(_, axes)| takes_mode(axes));
+                if let (Some(module), Some((mode, _))) = (module, modes)
+                    && is_of_other_mode(module, mode)
+                {
+                    return Err(SelectError::ModuleMode {
+                        device: device.name.clone(),
+                        module: module.type_name.to_string(),
+                        mode,
+                    });
+                }
+                module
+            }
             (None, Some((mode, axes))) if takes_mode(axes) => for_mode(device, place, mode)?,
+            // The user's list is complete, so the places after its end stay empty.
+            (None, _) if wanted.is_some() && !place.required => None,
             _ => default_module(place),
         };
         let Some(module) = module else {
@@ -99,7 +149,7 @@ pub(super) fn choose<'m>(
         chosen.push(PluggedModule {
             place: number,
             slot_name: place.name.clone(),
-            module: module.without_objects_at(&at),
+            module: module.without_objects_at(device, &at),
             at,
             source: module,
         });
@@ -126,39 +176,29 @@ impl Instance<'_> {
 }
 
 fn places<'a>(modules: &'a [Module], slots: &'a Slots) -> Result<Vec<Instance<'a>>, SelectError> {
-    let most = slots
-        .max_count
-        .and_then(|count| usize::try_from(count).ok())
-        .filter(|count| *count > 0)
-        .map_or(MAX_PLACES, |count| count.min(MAX_PLACES));
     // If a file describes a module several times, the first description applies.
     let mut by_ident: HashMap<u32, &Module> = HashMap::new();
     for module in modules {
         by_ident.entry(module.ident).or_insert(module);
     }
     let mut places = Vec::new();
-    for slot in &slots.slots {
-        if places.len() >= most {
-            break;
-        }
-        let offered = offered(modules, &by_ident, slot)?;
-        let instances = slot.max_instances.max(slot.min_instances).max(1);
-        for instance in 0..instances {
-            if places.len() >= most {
-                break;
-            }
-            let name = if instances > 1 {
-                format!("{} {}", slot.name, instance + 1)
-            } else {
-                slot.name.clone()
-            };
-            places.push(Instance {
-                slot,
-                offered: Rc::clone(&offered),
-                name,
-                required: instance < slot.min_instances,
-            });
-        }
+    let mut last: Option<(&Slot, Rc<[&Module]>)> = None;
+    for (slot, instance) in slots.places() {
+        let offered = match last.take().filter(|(same, _)| std::ptr::eq(*same, slot)) {
+            Some((_, offered)) => offered,
+            None => offered(modules, &by_ident, slot)?,
+        };
+        last = Some((slot, Rc::clone(&offered)));
+        let name = match slot.instances() {
+            1 => slot.name.clone(),
+            _ => format!("{} {}", slot.name, instance + 1),
+        };
+        places.push(Instance {
+            slot,
+            offered,
+            name,
+            required: instance < slot.min_instances,
+        });
     }
     Ok(places)
 }
@@ -168,7 +208,7 @@ fn named<'a>(
     place: &Instance<'a>,
     name: &str,
 ) -> Result<Option<&'a Module>, SelectError> {
-    if name.is_empty() || name == "-" {
+    if name.is_empty() || name == EMPTY_PLACE {
         return Ok(None);
     }
     let ident = name
@@ -179,11 +219,10 @@ fn named<'a>(
             |hex| u32::from_str_radix(hex, 16).ok(),
         );
     let all = &place.offered;
-    let found = all.iter().copied().find(|module| {
-        module.type_name.eq_ignore_ascii_case(name)
-            || module.name.eq_ignore_ascii_case(name)
-            || ident == Some(module.ident)
-    });
+    let found = all
+        .iter()
+        .copied()
+        .find(|module| is_called(module, name) || ident == Some(module.ident));
     match found {
         Some(module) => Ok(Some(module)),
         None => Err(SelectError::NoSuchModule {
@@ -268,6 +307,16 @@ fn commanded_mode(module: &Module) -> Option<i8> {
         .iter()
         .find(|cmd| cmd.index == MODES_OF_OPERATION)?;
     command.data.first().map(|&byte| i8::from_le_bytes([byte]))
+}
+
+/// True if a module is for other modes: by the mode that its InitCmd commands, otherwise by name.
+fn is_of_other_mode(module: &Module, mode: Mode) -> bool {
+    let is_named =
+        |mode: Mode| mode.is_named_in(&module.type_name) || mode.is_named_in(&module.name);
+    match commanded_mode(module) {
+        Some(commanded) => commanded != mode.code(),
+        None => !is_named(mode) && Mode::ALL.into_iter().any(is_named),
+    }
 }
 
 pub(super) fn mode_of(module: &Module) -> Option<Mode> {

@@ -3,12 +3,12 @@
 use std::collections::HashMap;
 
 use super::module::PluggedModule;
-use super::{EntryRef, SelectError, oversampling};
+use super::{EntryRef, SelectError};
 use crate::axis;
 use crate::mode::Mode;
 use crate::model::{Coe, Device, Dictionary, Direction, Pdo, SmUse};
 
-const CONTROLWORD: u16 = 0x6040;
+pub(super) const CONTROLWORD: u16 = 0x6040;
 pub(super) const STATUSWORD: u16 = 0x6041;
 const POSITION: u16 = 0x6064;
 
@@ -80,7 +80,6 @@ impl PdoSelector<'_> {
         let mut pdos: Vec<Pdo> = device.iter().filter(|pdo| !pdo.virtual_).cloned().collect();
         for new in modules.filter(|pdo| !pdo.virtual_) {
             let mut new = new.clone();
-            new.sm = new.sm.or(self.primary_sm());
             match pdos.iter_mut().find(|old| old.index == new.index) {
                 Some(old) => {
                     let excluded: Vec<_> = old
@@ -139,7 +138,16 @@ impl PdoSelector<'_> {
         }
         let mut sampled = Vec::with_capacity(chosen.len());
         for pdo in chosen {
-            oversampling::append(&mut sampled, &pdo, self.samples(&pdo))?;
+            let factor = self.samples(&pdo);
+            let samples = pdo
+                .samples(factor)
+                .ok_or_else(|| SelectError::TooManySamples {
+                    pdo: pdo.index,
+                    position: pdo.position,
+                    factor,
+                    max: pdo.oversampling.and_then(|own| own.max),
+                })?;
+            sampled.extend(samples);
         }
         Ok(sampled)
     }
@@ -169,7 +177,7 @@ impl PdoSelector<'_> {
         };
         let of_direction = |sm: &&(u8, Vec<u16>)| {
             let usage = self.device.sync_managers.get(usize::from(sm.0));
-            usage.is_some_and(|sm| sm.usage == self.usage())
+            usage.is_some_and(|sm| sm.usage == SmUse::from(self.direction))
         };
         // A `Sm` of an OpMode without a `Pdo` keeps the default.
         let lists = |sm: &&(u8, Vec<u16>)| !assignment.whole_direction || !sm.1.is_empty();
@@ -272,17 +280,32 @@ impl PdoSelector<'_> {
             let index = axis::object(CONTROLWORD, axis);
             (axis > 0 && !contains(available, index)).then_some((axis, index))
         });
-        match missing {
-            Some((axis, index)) => SelectError::NoSuchAxis {
+        if let Some((axis, index)) = missing {
+            return SelectError::NoSuchAxis {
                 device,
                 number: axis.saturating_add(1),
                 index,
-            },
-            None => SelectError::ModeNotOffered {
+            };
+        }
+        let needed = self.needed(mode);
+        let mut entries = available.iter().flat_map(|pdo| &pdo.entries);
+        if let Some(entry) = entries.find(|e| needed.contains(&e.index) && e.sub != 0) {
+            return SelectError::SubindexOfValue {
                 device,
+                position: entry.position,
                 mode,
-                offered: offered_by_pdos(available),
-            },
+                index: entry.index,
+                sub: entry.sub,
+            };
+        }
+        let target = mode.target_object();
+        if !contains(available, CONTROLWORD) && target.is_some_and(|t| contains(available, t)) {
+            return SelectError::NoControlword { device, mode };
+        }
+        SelectError::ModeNotOffered {
+            device,
+            mode,
+            offered: offered_by_pdos(available),
         }
     }
 
@@ -429,27 +452,10 @@ impl PdoSelector<'_> {
         }
     }
 
-    /// Returns the SyncManager that carries this direction unless a PDO names another one.
-    fn primary_sm(&self) -> Option<u8> {
-        let place = self
-            .device
-            .sync_managers
-            .iter()
-            .position(|sm| sm.usage == self.usage() && !sm.virtual_)?;
-        u8::try_from(place).ok()
-    }
-
-    fn usage(&self) -> SmUse {
-        match self.direction {
-            Direction::Rx => SmUse::Outputs,
-            Direction::Tx => SmUse::Inputs,
-        }
-    }
-
     fn sm_of(&self, pdo: &Pdo) -> Result<u8, SelectError> {
         pdo.sm
             .filter(|sm| usize::from(*sm) < self.device.sync_managers.len())
-            .or_else(|| self.primary_sm())
+            .or_else(|| self.device.primary_sm(self.direction))
             .ok_or_else(|| SelectError::NoSyncManager {
                 device: self.device.name.clone(),
                 pdo: pdo.index,
@@ -535,10 +541,11 @@ fn contains_all(pdo: &Pdo, objects: &[u16]) -> bool {
     objects.all(|&index| contains(std::slice::from_ref(pdo), index))
 }
 
+/// True if a PDO maps the value of a CiA 402 object, which has subindex 0.
 pub(super) fn contains(set: &[Pdo], index: u16) -> bool {
     set.iter()
         .flat_map(|pdo| &pdo.entries)
-        .any(|entry| entry.index == index)
+        .any(|entry| (entry.index, entry.sub) == (index, 0))
 }
 
 fn offered_by_pdos(available: &[Pdo]) -> String {

@@ -6,10 +6,10 @@
 
 use ecaxis_ecat::mailbox::soe::{Idn, List};
 
-use super::{EntryRef, SelectError, SelectOptions, Selection, dc, left_out, watch_outputs};
+use super::{EntryRef, SelectError, SelectOptions, Selection, dc, left_out};
 use crate::layout::Layout;
 use crate::mode::Mode;
-use crate::model::{Device, Dictionary, Direction, Entry, EsiFile, Pdo, Position, SmUse, Soe};
+use crate::model::{Device, Dictionary, Direction, Entry, EsiFile, Pdo, Position, Soe};
 use crate::startup::{IdnValue, StartupIdn};
 
 /// The IDNs that drives carry in process data: number, bits, data type and name.
@@ -109,7 +109,6 @@ pub(super) fn select(
     let mut layout = Layout::new(device, &rx, &tx)?;
     layout.idns = true;
     if choice.mode.is_some() {
-        watch_outputs(device, &mut layout, &mut notes);
         let mut drives: Vec<_> = rx.iter().map(Pdo::drive).collect();
         drives.dedup();
         for drive in drives.iter().filter(|d| !axes.contains(&u16::from(**d))) {
@@ -151,23 +150,15 @@ impl Selector<'_> {
     /// Returns the telegrams of one direction. Drives that are in use carry what the mode needs; others
     /// carry what the ESI lists, because their telegrams are mandatory.
     fn pdos(&self, direction: Direction) -> Result<Vec<Pdo>, SelectError> {
-        let (offered, own, word, usage) = match direction {
+        let (offered, own, word) = match direction {
             Direction::Rx => (
                 &self.device.rx_pdos,
                 self.choice.rx,
                 Idn::MASTER_CONTROL_WORD,
-                SmUse::Outputs,
             ),
-            Direction::Tx => (
-                &self.device.tx_pdos,
-                self.choice.tx,
-                Idn::DRIVE_STATUS_WORD,
-                SmUse::Inputs,
-            ),
+            Direction::Tx => (&self.device.tx_pdos, self.choice.tx, Idn::DRIVE_STATUS_WORD),
         };
-        let mut sms = self.device.sync_managers.iter();
-        let primary = sms.position(|sm| sm.usage == usage);
-        let primary = primary.and_then(|sm| u8::try_from(sm).ok());
+        let primary = self.device.primary_sm(direction);
         let mut pdos = Vec::new();
         for pdo in offered.iter().filter(|p| p.sm.is_some() || p.mandatory) {
             let mut pdo = pdo.clone();

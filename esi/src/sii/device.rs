@@ -58,6 +58,9 @@ impl Sii {
             },
             ..Device::default()
         };
+        // Older images leave the types open.
+        device.resolve_sync_managers();
+        set_mailbox_sizes(&mut device.sync_managers, self.mailbox);
         device.number_drives();
         device
     }
@@ -66,10 +69,10 @@ impl Sii {
     #[must_use]
     pub fn to_esi_file(&self) -> EsiFile {
         EsiFile {
-            vendor: Vendor {
+            vendors: vec![Vendor {
                 id: self.identity.vendor,
                 name: String::new(),
-            },
+            }],
             devices: vec![self.to_device()],
             ..EsiFile::default()
         }
@@ -180,16 +183,7 @@ fn has_mailbox(sii: &Sii) -> bool {
 fn sync_managers(sii: &Sii) -> Vec<SyncManager> {
     let areas = sii.mailbox;
     if !sii.sync_managers.is_empty() {
-        let mut all: Vec<_> = sii.sync_managers.iter().map(sync_manager).collect();
-        // The header is what other MainDevices use (SOEM, ethercrab).
-        for sm in &mut all {
-            match sm.usage {
-                SmUse::MBoxOut if areas.receive_size > 0 => sm.default_size = areas.receive_size,
-                SmUse::MBoxIn if areas.send_size > 0 => sm.default_size = areas.send_size,
-                _ => {}
-            }
-        }
-        return all;
+        return sii.sync_managers.iter().map(sync_manager).collect();
     }
     let standard = |usage, start_address, len, control| SiiSyncManager {
         start_address,
@@ -207,10 +201,21 @@ fn sync_managers(sii: &Sii) -> Vec<SyncManager> {
     pair.map(sync_manager).collect()
 }
 
+/// Takes the sizes of the mailboxes from the header, as other MainDevices do (SOEM, ethercrab).
+fn set_mailbox_sizes(sync_managers: &mut [SyncManager], areas: MailboxAreas) {
+    for sm in sync_managers {
+        match sm.usage {
+            SmUse::MBoxOut if areas.receive_size > 0 => sm.default_size = areas.receive_size,
+            SmUse::MBoxIn if areas.send_size > 0 => sm.default_size = areas.send_size,
+            _ => {}
+        }
+    }
+}
+
 fn sync_manager(sm: &SiiSyncManager) -> SyncManager {
     SyncManager {
         position: Default::default(),
-        usage: usage(sm),
+        usage: sm.usage,
         start_address: sm.start_address,
         default_size: sm.len,
         min_size: None,
@@ -220,20 +225,6 @@ fn sync_manager(sm: &SiiSyncManager) -> SyncManager {
         virtual_: sm.enable & 4 != 0,
         op_only: sm.enable & 8 != 0,
         watchdog: None,
-    }
-}
-
-/// Returns the usage. Older images leave it open; it then follows from mode and direction.
-fn usage(sm: &SiiSyncManager) -> SmUse {
-    if sm.usage != SmUse::Other || sm.enable & 1 == 0 {
-        return sm.usage;
-    }
-    match sm.control & 0x0f {
-        0x00 => SmUse::Inputs,
-        0x04 => SmUse::Outputs,
-        0x02 => SmUse::MBoxIn,
-        0x06 => SmUse::MBoxOut,
-        _ => SmUse::Other,
     }
 }
 
@@ -357,13 +348,17 @@ mod tests {
     #[test]
     fn an_open_usage_follows_from_mode_and_direction() {
         let of = |control, enable| {
-            usage(&SiiSyncManager {
-                start_address: 0x1000,
-                len: 2,
-                control,
-                enable,
-                usage: SmUse::Other,
-            })
+            let sii = Sii {
+                sync_managers: vec![SiiSyncManager {
+                    start_address: 0x1000,
+                    len: 2,
+                    control,
+                    enable,
+                    usage: SmUse::Other,
+                }],
+                ..Sii::default()
+            };
+            sii.to_device().sync_managers[0].usage
         };
         for (control, expected) in [
             (0x20, SmUse::Inputs),

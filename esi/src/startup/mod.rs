@@ -27,6 +27,7 @@ use crate::axis;
 use crate::layout::Layout;
 use crate::model::{Device, InitCmd, Object, ObjectItem, Writable};
 use crate::select::{SelectError, SelectOptions, SelectedModule, Selection};
+use crate::xml::literal::slice;
 use crate::{Dictionary, Mode, address};
 
 /// One SDO download.
@@ -50,6 +51,71 @@ pub struct StartupSdo {
     /// True if the device may refuse the SDO and keep its own value.
     pub optional: bool,
 }
+
+impl StartupSdo {
+    /// Returns true if the SDO only clears a PDO assignment or the module list, which may remain
+    /// from another configuration. A device without the object has nothing to clear.
+    #[must_use]
+    pub fn clears_list(&self) -> bool {
+        let list = matches!(self.index, 0x1c10..=0x1c2f | MODULE_LIST);
+        self.optional && list && self.sub == 0 && is_zero(&self.data)
+    }
+
+    /// Returns the SDOs of single subindices that together write what this SDO writes by complete
+    /// access. `None` if neither the dictionary nor the kind of the object shows their lengths.
+    #[must_use]
+    pub fn by_subindex(&self, dictionary: &Dictionary) -> Option<Vec<Self>> {
+        // Subindex 0 occupies two bytes (ETG.1000.6).
+        const COUNT: usize = 2;
+        let part = |sub, data: &[u8]| Self {
+            sub,
+            complete_access: false,
+            data: data.to_vec(),
+            origin: format!("{}; complete access was refused", self.origin),
+            ..self.clone()
+        };
+        if !self.complete_access {
+            return None;
+        }
+        let start = if self.sub == 0 { 0 } else { COUNT };
+        let width = match self.index {
+            0x1c10..=0x1c2f => Some(2),
+            0x1600..=0x17ff | 0x1a00..=0x1bff | MODULE_LIST => Some(4),
+            _ => None,
+        };
+        let (mut parts, mut is_list) = (Vec::new(), width.is_some());
+        if let Some(width) = width {
+            let elements = self.data.get(COUNT - start..)?.chunks_exact(width);
+            parts.extend(
+                (1..=u8::MAX)
+                    .zip(elements)
+                    .map(|(sub, data)| part(sub, data)),
+            );
+        } else {
+            let mut block = vec![0; start];
+            block.extend(&self.data);
+            for item in &dictionary.object(self.index)?.items {
+                let is_writable = item.access.write != Writable::Never;
+                is_list |= item.sub == 0 && is_writable;
+                let value = slice(&block, item.bit_offset, item.bit_len);
+                if let Some(value) = value.filter(|_| item.sub > 0 && is_writable) {
+                    parts.push(part(item.sub, &value));
+                }
+            }
+        }
+        // The elements of a list are writable while its count is zero.
+        if let Some(count) = self.data.get(..1).filter(|_| is_list && self.sub == 0) {
+            parts.insert(0, part(0, &[0]));
+            if count != [0] {
+                parts.push(part(0, count));
+            }
+        }
+        (!parts.is_empty()).then_some(parts)
+    }
+}
+
+/// [`StartupSdo::origin`] of an `sdo` entry.
+pub const SDO_OF_MACHINE_FILE: &str = "sdo of the machine file";
 
 /// One IDN to write (SoE).
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -229,10 +295,11 @@ impl<'d> List<'d> {
 
     /// Adds a complete access download of the whole object from subindex 0, which occupies two
     /// bytes.
-    fn push_whole(&mut self, index: u16, data: Vec<u8>, origin: &str) {
+    fn push_whole(&mut self, index: u16, data: Vec<u8>, origin: &str, optional: bool) {
         self.push(index, 0, data, origin);
         if let Some(sdo) = self.sdos.last_mut() {
             sdo.complete_access = true;
+            sdo.optional = optional;
         }
     }
 
@@ -254,13 +321,12 @@ fn module_list(device: &Device, selection: &Selection, list: &mut List<'_>) {
         .slots
         .as_ref()
         .is_some_and(|slots| slots.download_module_ident_list);
-    let Some(last) = selection
-        .modules
-        .iter()
-        .map(|m| m.place)
-        .max()
-        .filter(|_| wanted)
-    else {
+    if !wanted {
+        return;
+    }
+    let Some(last) = selection.modules.iter().map(|m| m.place).max() else {
+        // The list of an earlier configuration does not remain.
+        list.push_optional(MODULE_LIST, 0, vec![0], "no module");
         return;
     };
     let origin = |module: &SelectedModule| {
@@ -290,22 +356,26 @@ fn module_list(device: &Device, selection: &Selection, list: &mut List<'_>) {
     list.push(MODULE_LIST, 0, vec![count], &whole);
 }
 
-/// Adds 0x60C2, which the device may refuse. CSP and CSV interpolate set-points over the bus cycle, and an axis may switch to
-/// them during operation. In CST alone, the EPOS4 application notes set the time to zero, so a
-/// stored time does not remain. Zero is written only if the dictionary permits zero.
+/// Adds 0x60C2, which the device may refuse. CSP and CSV interpolate set-points over the bus cycle,
+/// and an axis may switch to them from every mode. In CST alone, the EPOS4 application notes set
+/// the time to zero, so a stored time does not remain. Zero is written only if the dictionary
+/// permits zero.
 fn interpolation_time(
     selection: &mut Selection,
     axis: u16,
     choice: &SelectOptions<'_>,
     list: &mut List<'_>,
 ) -> Result<(), SelectError> {
-    let Some(mode) = selection.mode.filter(|mode| mode.is_cyclic()) else {
+    let Some(mode) = selection.mode else {
         return Ok(());
     };
+    let interpolates = interpolates(mode, &selection.layout.of_axis(axis));
+    if !interpolates && mode != Mode::Cst {
+        return Ok(());
+    }
     let objects = list.objects;
     let index = axis::object(INTERPOLATION_TIME, axis);
     let item = objects.item(index, 1);
-    let interpolates = mode != Mode::Cst || can_leave_cst(&selection.layout.of_axis(axis));
     let writable = match item {
         Some(item) => item.access.write != Writable::Never,
         None => objects.is_empty() && interpolates,
@@ -341,9 +411,13 @@ fn interpolation_time(
     Ok(())
 }
 
-/// True if the process data contain the mode, its display and an interpolated target.
-fn can_leave_cst(layout: &Layout) -> bool {
+/// True if the mode interpolates set-points, or if the process data contain the mode, its display
+/// and an interpolated target.
+fn interpolates(mode: Mode, layout: &Layout) -> bool {
     let mapped = |index| layout.rx_field(index, 0).is_some();
+    if matches!(mode, Mode::Csp | Mode::Csv) {
+        return true;
+    }
     mapped(MODES_OF_OPERATION)
         && layout.tx_field(MODES_OF_OPERATION_DISPLAY, 0).is_some()
         && [Mode::Csp, Mode::Csv]
@@ -391,6 +465,20 @@ fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list
                 address(cmd.index, cmd.sub)
             ));
             continue;
+        }
+        // The lists of PDOs and modules are often missing in dictionaries.
+        if !matches!(cmd.index, 0x1600..=0x17ff | 0x1a00..=0x1bff | 0x1c10..=0x1c2f | MODULE_LIST)
+            && let Some(how) = list.objects.dictionary.contradiction(
+                (cmd.index, cmd.sub),
+                &cmd.data,
+                cmd.complete_access,
+            )
+        {
+            selection.notes.push(format!(
+                "InitCmd of {origin} (line {}): {} {how}; it is sent all the same",
+                cmd.position.line,
+                address(cmd.index, cmd.sub)
+            ));
         }
         list.sdos.push(StartupSdo {
             transition,
@@ -445,6 +533,12 @@ fn user(
     for sdo in choice.sdo {
         match list.objects.item(sdo.index, sdo.sub) {
             Some(item) => {
+                if item.access.write == Writable::Never {
+                    selection.notes.push(format!(
+                        "start-up SDO {} is read-only in the ESI's dictionary",
+                        address(sdo.index, sdo.sub)
+                    ));
+                }
                 let expected = item.default.len();
                 let text = item.type_name.contains("STRING") || item.type_name.contains("ARRAY");
                 if expected != 0 && expected != sdo.data.len() && !text {
@@ -463,12 +557,7 @@ fn user(
             )),
             None => {}
         }
-        list.push(
-            sdo.index,
-            sdo.sub,
-            sdo.data.clone(),
-            "sdo of the machine file",
-        );
+        list.push(sdo.index, sdo.sub, sdo.data.clone(), SDO_OF_MACHINE_FILE);
     }
     Ok(())
 }

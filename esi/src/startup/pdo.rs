@@ -1,6 +1,6 @@
 //! 0x16xx, 0x1Axx, 0x1C12, 0x1C13: contents and assignment of PDOs.
 
-use super::{List, Objects};
+use super::List;
 use crate::model::{Coe, Device, Direction, Pdo, Writable};
 use crate::select::{SelectError, SelectOptions, Selection};
 
@@ -13,7 +13,7 @@ pub(super) fn configure(
     choice: &SelectOptions<'_>,
     list: &mut List<'_>,
 ) -> Result<(), SelectError> {
-    let assignments = assignments(device, selection, list.objects);
+    let assignments = assignments(device, selection);
     if !coe.pdo_assign {
         check_assignment(device, selection)?;
     }
@@ -29,8 +29,12 @@ pub(super) fn configure(
     // complete access replaces the whole assignment at once.
     let at_once = coe.complete_access && changes.sdos.is_empty();
     if coe.pdo_assign && !at_once {
-        for (sm, _) in &assignments {
-            list.push(assign_object(*sm), 0, vec![0], &sm_origin(device, *sm));
+        for (sm, pdos) in &assignments {
+            let (index, origin) = (assign_object(*sm), sm_origin(device, *sm));
+            match pdos.is_empty() {
+                true => list.push_optional(index, 0, vec![0], &origin),
+                false => list.push(index, 0, vec![0], &origin),
+            }
         }
     }
     list.sdos.append(&mut changes.sdos);
@@ -39,7 +43,13 @@ pub(super) fn configure(
             let count = u8::try_from(pdos.len()).unwrap_or(u8::MAX);
             let mut data = vec![count, 0];
             data.extend(pdos.iter().flat_map(|pdo| pdo.index.to_le_bytes()));
-            list.push_whole(assign_object(*sm), data, &sm_origin(device, *sm));
+            let is_optional = pdos.is_empty();
+            list.push_whole(
+                assign_object(*sm),
+                data,
+                &sm_origin(device, *sm),
+                is_optional,
+            );
         }
     } else if coe.pdo_assign {
         for (sm, pdos) in assignments.iter().filter(|(_, pdos)| !pdos.is_empty()) {
@@ -73,12 +83,9 @@ fn assign_object(sm: u8) -> u16 {
 }
 
 /// Returns each process data SyncManager with its PDOs, outputs first. SyncManagers without PDOs
-/// are included, to clear their assignment.
-fn assignments<'s>(
-    device: &Device,
-    selection: &'s Selection,
-    objects: &Objects<'_>,
-) -> Vec<(u8, Vec<&'s Pdo>)> {
+/// are included, to clear their assignment. Dictionaries often lack the assignment objects, so they
+/// do not decide whether the device has one.
+fn assignments<'s>(device: &Device, selection: &'s Selection) -> Vec<(u8, Vec<&'s Pdo>)> {
     use crate::model::SmUse::{Inputs, Outputs};
     let mut numbers: Vec<u8> = (0..=u8::MAX)
         .zip(&device.sync_managers)
@@ -94,7 +101,6 @@ fn assignments<'s>(
         .collect();
     numbers.sort_unstable();
     numbers.dedup();
-    let known = |index| objects.is_empty() || objects.object(index).is_some();
     numbers
         .into_iter()
         .map(|number| {
@@ -104,7 +110,6 @@ fn assignments<'s>(
                 all.filter(|pdo| pdo.sm == Some(number)).collect::<Vec<_>>(),
             )
         })
-        .filter(|(number, pdos)| !pdos.is_empty() || known(assign_object(*number)))
         .collect()
 }
 
@@ -216,7 +221,7 @@ fn check_contents(device: &Device, selection: &Selection) -> Result<(), SelectEr
             .rx_pdos
             .iter()
             .chain(&device.tx_pdos)
-            .find(|known| known.index == pdo.index);
+            .find(|known| known.index == pdo.index && !known.virtual_);
         if let Some(offered) = offered
             && selection.modules.is_empty()
             && offered.oversampling.is_none()

@@ -10,6 +10,7 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Devi
     let mut device = Device {
         position: c.position(element),
         path: c.path_of(element),
+        number: c.devices,
         physics: c.attribute(element, "Physics")?.unwrap_or_default(),
         invisible: c.attribute_flag(element, "Invisible")?,
         ..Device::default()
@@ -43,7 +44,9 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Devi
             "Slots" => device.slots = Some(slots::read(c, el)?),
             "Eeprom" => device.eeprom = eeprom::read(c, el)?,
             "ESC" => device.registers = registers(c, el)?,
-            "AlternativeSmMapping" => device.sm_mappings.push(device_info::sm_mapping(c, el)?),
+            "AlternativeSmMapping" => {
+                device_info::append_sm_mapping(c, el, &mut device.sm_mappings)?;
+            }
             "VendorSpecific" => device_info::vendor_specific(c, el, &mut device.sm_mappings)?,
             _ => {}
         }
@@ -53,6 +56,15 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Devi
         return Err(no_type(c, element));
     }
     (device.name, device.names) = names.take_all();
+    for (number, text) in device.resolve_sync_managers() {
+        if let Some(sm) = device.sync_managers.get(usize::from(number)) {
+            let message = format!(
+                "Sm {number} is called {text:?}; its PDOs are {:?}, which counts",
+                sm.usage
+            );
+            c.warn_at(sm.position, element, message);
+        }
+    }
     mapping::complete(&mut device);
     device.number_drives();
     if device.name.is_empty() {
@@ -82,7 +94,7 @@ pub(super) fn header<'a>(
     let (identity, type_name) = typed.ok_or_else(|| no_type(c, element))?;
     let name = names.take().into_owned();
     Ok(DeviceHeader {
-        number: element.number(),
+        number: c.devices,
         identity,
         name: match name.is_empty() {
             true => type_name.clone(),

@@ -114,20 +114,25 @@ pub(super) fn vendor_specific<'a>(
     mappings: &mut Vec<SmMapping>,
 ) -> Result<(), EsiError> {
     c.children(element, |c, el| match el.name {
-        "TwinCAT" => c.children(el, |c, el| {
-            if el.name == "AlternativeSmMapping" {
-                mappings.push(sm_mapping(c, el)?);
-            }
-            Ok(())
+        "TwinCAT" => c.children(el, |c, el| match el.name {
+            "AlternativeSmMapping" => append_sm_mapping(c, el, mappings),
+            _ => Ok(()),
         }),
         _ => Ok(()),
     })
 }
 
-pub(super) fn sm_mapping<'a>(
+/// Reads one more assignment and skips an unreadable one.
+pub(super) fn append_sm_mapping<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
-) -> Result<SmMapping, EsiError> {
+    to: &mut Vec<SmMapping>,
+) -> Result<(), EsiError> {
+    let read = sm_mapping(c, element).map(|mapping| to.push(mapping));
+    c.leave_out(element, read)
+}
+
+fn sm_mapping<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<SmMapping, EsiError> {
     let mut mapping = SmMapping {
         position: c.position(element),
         path: c.path_of(element),

@@ -52,7 +52,7 @@ fn info<'a>(
     for identity in identities.chain(skipped.map(|header| &mut header.identity)) {
         identity.vendor = vendor.id;
     }
-    file.vendor = vendor;
+    file.vendors.push(vendor);
     Ok(())
 }
 
@@ -91,6 +91,7 @@ fn descriptions<'a>(
             if el.name != "Device" {
                 return Ok(());
             }
+            c.devices = c.devices.saturating_add(1);
             if let Some(filter) = filter {
                 let start = c.mark();
                 // An unreadable header is a problem that the reader of the device reports.
@@ -156,7 +157,7 @@ fn modules_alone<'a>(
 ) -> Result<(), EsiError> {
     c.children(root, |c, el| {
         match el.name {
-            "Vendor" => file.vendor = read_vendor(c, el)?,
+            "Vendor" => file.vendors.push(read_vendor(c, el)?),
             "Module" => one_module(c, el, file)?,
             "Modules" => modules(c, el, file)?,
             "Descriptions" => descriptions(c, el, file, filter)?,

@@ -32,7 +32,7 @@ pub(super) fn bytes(
 }
 
 /// Returns `bit_len` bits of a block from `bit_offset`.
-pub(super) fn slice(block: &[u8], bit_offset: u32, bit_len: u32) -> Option<Bytes> {
+pub(crate) fn slice(block: &[u8], bit_offset: u32, bit_len: u32) -> Option<Bytes> {
     let (offset, length) = (
         usize::try_from(bit_offset).ok()?,
         usize::try_from(bit_len).ok()?,

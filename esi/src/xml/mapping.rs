@@ -43,9 +43,10 @@ pub(super) fn complete(device: &mut Device) {
 }
 
 fn pdos_of(device: &Device, direction: Direction) -> Vec<Pdo> {
-    let (range, usage) = match direction {
-        Direction::Rx => (0x1600..=0x17ff, SmUse::Outputs),
-        Direction::Tx => (0x1a00..=0x1bff, SmUse::Inputs),
+    let usage = SmUse::from(direction);
+    let range = match direction {
+        Direction::Rx => 0x1600..=0x17ff,
+        Direction::Tx => 0x1a00..=0x1bff,
     };
     let dictionary = &device.dictionary;
     let mut mapped: Vec<&Object> = dictionary

@@ -8,8 +8,8 @@
 //! `object` read the dictionary as written, and `resolve` joins both. `mapping` derives PDOs from
 //! the dictionary if a file has no PDO elements.
 //!
-//! Rules: Unknown elements are skipped. A PDO, object, data type or OpMode with an unreadable value
-//! is skipped. Any other element with an unreadable value, or damaged text, removes its device or
+//! Rules: Unknown elements are skipped. A PDO, object, data type, OpMode or alternative assignment
+//! with an unreadable value is skipped. Any other element with an unreadable value, or damaged text, removes its device or
 //! module. No file may cause a panic, unbounded recursion, or allocation beyond a fixed multiple of
 //! the need of real files.
 
@@ -22,7 +22,7 @@ mod device_info;
 mod eeprom;
 mod info;
 mod lines;
-mod literal;
+pub(crate) mod literal;
 mod mailbox;
 mod mapping;
 mod module;

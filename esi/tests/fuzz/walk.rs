@@ -84,11 +84,10 @@ fn choices(file: &EsiFile, device: &Device, reached: &mut Reached) {
             ]
         })
         .collect();
-    all.extend(
-        modules
-            .iter()
-            .map(|modules| SelectOptions { modules, ..plain }),
-    );
+    all.extend(modules.iter().map(|modules| SelectOptions {
+        modules: Some(modules),
+        ..plain
+    }));
     for pdo in device.rx_pdos.iter().chain(&device.tx_pdos).take(4) {
         own.extend(pdo.entries.iter().take(4).map(|entry| EntryRef {
             index: entry.index,

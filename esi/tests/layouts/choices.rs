@@ -13,7 +13,7 @@ const MANY_FINDINGS: usize = 24;
 pub fn of_file(file: &EsiFile, full: bool) -> String {
     let mut out = format!(
         "vendor {:08x}, {} devices, {} modules\n",
-        file.vendor.id,
+        file.vendors.last().map_or(0, |vendor| vendor.id),
         file.devices.len(),
         file.modules.len()
     );
@@ -156,7 +156,7 @@ impl Choices<'_> {
     ) {
         let modules: Vec<&str> = modules.iter().map(String::as_str).collect();
         let choice = SelectOptions {
-            modules: &modules,
+            modules: Some(&modules),
             ..*plain
         };
         self.add(name, &choice, full && self.full);

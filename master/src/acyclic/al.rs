@@ -99,10 +99,11 @@ pub(crate) fn is_wire(error: &Error) -> bool {
 
 /// True for a refusal by a device that may need SYNC0 before the change (ETG.1020).
 pub(crate) fn awaits_sync(error: &Error) -> bool {
-    let Cause::State(StateError::Refused { code, .. }) = &*error.cause else {
+    let Cause::State(error) = &*error.cause else {
         return false;
     };
-    al_status_code::SYNC_LOST.contains(code) || *code == al_status_code::DC_SYNC_IO_ERROR
+    let code = error.code();
+    al_status_code::SYNC_LOST.contains(&code) || code == al_status_code::DC_SYNC_IO_ERROR
 }
 
 /// Requests a lower state from all devices that are not in it, at the same time, even if some fail.
@@ -222,6 +223,7 @@ async fn wait_one(
             let late = StateError::Timeout {
                 wanted,
                 actual,
+                code,
                 timeout,
             };
             return Err(late.with_device(device));

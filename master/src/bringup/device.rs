@@ -3,10 +3,10 @@
 use ecaxis_ecat::mailbox::abort_code::is_no_such_object;
 use ecaxis_ecat::mailbox::eoe::Service;
 use ecaxis_ecat::registers;
-use ecaxis_esi::{StartupSdo, address};
+use ecaxis_esi::{Dictionary, StartupSdo, address};
 
-use super::process_data::ProcessDataPlan;
-use super::{BusDevice, Step};
+use super::process_data::{ControlBytes, ProcessDataPlan, SM_ACTIVATE};
+use super::{BusDevice, Step, modules};
 use crate::acyclic::{DeviceRef, Registers};
 use crate::config::duration::show;
 use crate::config::{DeviceConfig, StartupOptions};
@@ -54,13 +54,37 @@ pub(super) async fn start_up(
             .with_action("emptying the mailbox")
     })?;
     let mut held = 0;
-    let mut refused = None;
+    let mut in_parts: Vec<(&StartupSdo, u32)> = Vec::new();
+    let mut refused: Vec<(&StartupSdo, u32)> = Vec::new();
     for (done, sdo) in list.iter().enumerate() {
         let way = config.startup.way(sdo.index, sdo.sub);
-        let outcome = match write_startup_sdo(wire, &device.at, coe, sdo, way).await {
+        let dictionary = &config.selection.dictionary;
+        let timeout = device.timeouts.safe_op_op;
+        let end = modules::deadline(wire, timeout);
+        let outcome = loop {
+            match write_startup_sdo(wire, &device.at, coe, sdo, way, dictionary).await {
+                Err(error)
+                    if (!sdo.optional || sdo.clears_list())
+                        && modules::rejects_for_now(config, &error) =>
+                {
+                    if wire.now() >= end {
+                        return Err(modules::not_ready(error, timeout));
+                    }
+                    wire.delay(modules::RETRY).await;
+                }
+                outcome => break outcome,
+            }
+        };
+        let outcome = match outcome {
+            Err(error) if sdo.clears_list() && matches!(*error.cause, Cause::NotHeld { .. }) => {
+                progress(Step::Warning(error.to_string()));
+                continue;
+            }
             Err(error) if sdo.optional => {
                 let code = abort_code(&error).ok_or(error)?;
-                refused.get_or_insert(code);
+                if !(sdo.clears_list() && is_no_such_object(code)) {
+                    refused.push((sdo, code));
+                }
                 continue;
             }
             outcome => outcome?,
@@ -72,6 +96,7 @@ pub(super) async fn start_up(
                 device.at,
                 object(sdo)
             ))),
+            SdoOutcome::BySubindex(code) => in_parts.push((sdo, code)),
             SdoOutcome::Written => {}
         }
         progress(Step::StartUp {
@@ -80,8 +105,37 @@ pub(super) async fn start_up(
             of: list.len(),
         });
     }
-    if let Some(code) = refused {
-        let wanted: Vec<_> = list.iter().filter(|sdo| sdo.optional).copied().collect();
+    if let Some((_, code)) = in_parts.first() {
+        let objects = in_parts
+            .iter()
+            .map(|(sdo, _)| format!("0x{:04X}", sdo.index));
+        progress(Step::Warning(format!(
+            "{}: refuses complete access, {}; the subindices of {} were written one by one",
+            device.at,
+            abort_text(*code),
+            objects.collect::<Vec<_>>().join(", ")
+        )));
+    }
+    let (periods, others): (Vec<_>, Vec<_>) =
+        refused.into_iter().partition(|(sdo, _)| is_period(sdo));
+    for (sdo, code) in others {
+        let effect = match sdo.clears_list() {
+            true => format!(
+                "it keeps the list of an earlier configuration ({})",
+                sdo.origin
+            ),
+            false => format!("{} has no effect", sdo.origin),
+        };
+        progress(Step::Warning(format!(
+            "{}: refuses {}, {}: {effect}",
+            device.at,
+            object(sdo),
+            abort_text(code)
+        )));
+    }
+    if let Some((_, code)) = periods.first().copied() {
+        let wanted = list.iter().filter(|sdo| sdo.optional && is_period(sdo));
+        let wanted: Vec<_> = wanted.copied().collect();
         if let Some(kept) = kept_period(wire, &device.at, coe, &wanted, code).await? {
             progress(Step::Warning(format!(
                 "{}: refuses the interpolation time of this cycle (0x60C2), {}; it keeps {kept}",
@@ -133,6 +187,12 @@ pub(super) async fn set_ethernet(
     Ok(())
 }
 
+/// True for the interpolation time of an axis.
+fn is_period(sdo: &StartupSdo) -> bool {
+    const INTERPOLATION_TIME: u16 = 0x60c2;
+    ecaxis_esi::axis::of(sdo.index).is_some_and(|(_, same)| same == INTERPOLATION_TIME)
+}
+
 fn abort_code(error: &Error) -> Option<u32> {
     match &*error.cause {
         Cause::StartUp { source, .. } => source.abort_code(),
@@ -180,14 +240,43 @@ pub enum SdoOutcome {
     Held,
     /// Written, but not verified: the object cannot be read.
     Unreadable,
+    /// Written by its subindices, because the device has refused complete access with this code.
+    BySubindex(u32),
 }
 
 /// Writes one start-up SDO, unless the device already has the value and that suffices. Reads it
-/// back if requested.
+/// back if requested. If the device refuses complete access, writes the subindices instead; the
+/// dictionary is that of the device.
 ///
 /// # Errors
 /// Names the device and the object.
 pub async fn write_startup_sdo(
+    wire: &impl MailboxTransport,
+    at: &DeviceRef,
+    coe: &mut CoeClient,
+    sdo: &StartupSdo,
+    way: StartupOptions,
+    dictionary: &Dictionary,
+) -> Result<SdoOutcome, Error> {
+    let refused = match write_one(wire, at, coe, sdo, way).await {
+        Err(error) if sdo.complete_access => error,
+        outcome => return outcome,
+    };
+    let code = abort_code(&refused).filter(|code| !is_no_such_object(*code));
+    let (Some(code), Some(parts)) = (code, sdo.by_subindex(dictionary)) else {
+        return Err(refused);
+    };
+    let mut outcome = SdoOutcome::BySubindex(code);
+    for part in &parts {
+        if write_one(wire, at, coe, part, way).await? == SdoOutcome::Unreadable {
+            outcome = SdoOutcome::Unreadable;
+        }
+    }
+    Ok(outcome)
+}
+
+/// As [`write_startup_sdo`], in one transfer.
+async fn write_one(
     wire: &impl MailboxTransport,
     at: &DeviceRef,
     coe: &mut CoeClient,
@@ -311,7 +400,7 @@ pub(super) async fn map_process_data(
     region: Option<DeviceRegion>,
     status: Option<u32>,
 ) -> Result<(), Error> {
-    let plan = ProcessDataPlan::new(config, region, status);
+    let plan = ProcessDataPlan::new(config, device.control_bytes, region, status);
     device.op_only.clear();
     for block in &plan.sync_managers {
         device.op_only.extend(block.op_only);
@@ -328,6 +417,24 @@ pub(super) async fn map_process_data(
     for block in fmmus {
         write(wire, &device.at, step, block.register, &block.data).await?;
         device.op_only.extend(block.op_only);
+    }
+    Ok(())
+}
+
+/// Writes the ControlBytes of the ESI in PreOp. A controller takes them only while the SyncManager is
+/// disabled (ETG.1000.4, table 58).
+pub(super) async fn restore_control_bytes(
+    wire: &impl MailboxTransport,
+    config: &DeviceConfig,
+    device: &mut BusDevice,
+) -> Result<(), Error> {
+    const STEP: &str = "restoring the ControlBytes of the ESI";
+    device.control_bytes = ControlBytes::Esi;
+    let plan = ProcessDataPlan::new(config, device.control_bytes, None, None);
+    for block in &plan.sync_managers {
+        let activate = block.register + SM_ACTIVATE;
+        write(wire, &device.at, STEP, activate, &[0]).await?;
+        write(wire, &device.at, STEP, block.register, &block.data).await?;
     }
     Ok(())
 }

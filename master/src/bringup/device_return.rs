@@ -12,7 +12,7 @@ use tokio::sync::Mutex;
 
 use super::clocks::{self, START_DELAY};
 use super::device::{self, StartupPhase, read, write};
-use super::{BusDevice, Step, StepTimes, configure, mailbox};
+use super::{BusDevice, Step, StepTimes, configure, mailbox, modules};
 use crate::acyclic::{AlState, DeviceRef, al};
 use crate::config::Machine;
 use crate::datagram::DatagramClient;
@@ -95,15 +95,8 @@ pub(crate) async fn bring_back(
         let running = running.ok_or_else(|| Cause::NoStart.with_device(&device.at))?;
         join_pulses(bus, &device.at, dc, running).await?;
     }
-    let safe_op = [device.transition(AlState::SafeOp, false)];
-    let changed = al::change_states(wire, &safe_op, AlState::SafeOp).await;
-    match changed {
-        Err(error) if config.selection.dc.is_some() && al::awaits_sync(&error) => {
-            wire.delay(Duration::from_nanos(2 * START_DELAY)).await;
-            al::change_states(wire, &safe_op, AlState::SafeOp).await?;
-        }
-        changed => changed?,
-    }
+    let pulses = async || wire.delay(Duration::from_nanos(2 * START_DELAY)).await;
+    modules::enter_safe_op(wire, config, device, pulses, progress).await?;
     device::start_up(wire, config, device, StartupPhase::InSafeOp, progress).await?;
     if config.selection.activates_sync() && bus.reference.is_some() {
         await_settled(wire, machine, &device.at).await?;

@@ -52,6 +52,9 @@ pub(super) async fn compare(
             found.advice()
         )));
     }
+    if let Some(note) = adopted.setup.assumed_velocity_unit() {
+        progress(Step::Warning(format!("{}: {note}", device.at)));
+    }
     for sdo in adopted.changed(&config.selection.startup) {
         device::download(wire, &device.at, coe, &sdo).await?;
     }

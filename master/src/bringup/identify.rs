@@ -97,6 +97,7 @@ pub(super) async fn explain_scan(
         let timeout = al::StateError::Timeout {
             wanted: al::AlState::PreOp,
             actual,
+            code: 0,
             timeout: machine.pre_op_timeout(),
         };
         return timeout.with_device(&device);
@@ -305,9 +306,14 @@ pub(super) async fn assign(
         .filter(|(position, _)| !elsewhere.contains(position))
         .map(|(_, found)| product(found.identity))
         .collect();
-    if missing {
+    let is_shifted = is_shifted(machine, &there);
+    let lacking = || {
         let missing = missing_devices(machine, &there);
-        return Err(devices_missing(machine, found.len(), missing));
+        devices_missing(machine, found.len(), missing)
+    };
+    // Another device in the place of one is named first; it does not answer for those behind it.
+    if missing && (is_shifted || !holds_others(machine, &there)) {
+        return Err(lacking());
     }
 
     let located = machine.devices.iter().zip(&order);
@@ -326,7 +332,7 @@ pub(super) async fn assign(
             station,
         };
         let is_product = product(expected) == product(identity);
-        if !is_product && belongs_elsewhere(machine, identity) {
+        if !is_product && is_shifted && belongs_elsewhere(machine, identity) {
             let missing = missing_devices(machine, &there);
             if !missing.is_empty() {
                 return Err(devices_missing(machine, found.len(), missing));
@@ -340,6 +346,9 @@ pub(super) async fn assign(
                 "{at}: revision 0x{found:08x} stands for 0x{described:08x} of its ESI (identity = \"{rule}\")"
             )));
         }
+    }
+    if missing {
+        return Err(lacking());
     }
     for (position, ScannedDevice { identity, .. }) in found.iter().enumerate() {
         let position = u16::try_from(position).unwrap_or(u16::MAX);
@@ -390,6 +399,15 @@ async fn segments(
     Ok(Some(machine.devices.iter().map(place).collect()))
 }
 
+/// Returns true if the machine file accepts a device of this identity.
+pub(crate) fn accepts(config: &DeviceConfig, identity: Identity) -> bool {
+    let expected = config.selection.identity;
+    let revision = config
+        .identity
+        .accepts(expected.revision, identity.revision);
+    product(expected) == product(identity) && revision
+}
+
 /// Compares identity and serial number of a device with the machine file.
 ///
 /// # Errors
@@ -401,11 +419,8 @@ pub(crate) fn compare(
     at: &DeviceRef,
 ) -> Result<(), report::Error> {
     let expected = config.selection.identity;
-    let is_product = product(expected) == product(identity);
-    let accepted = config
-        .identity
-        .accepts(expected.revision, identity.revision);
-    if !is_product || !accepted {
+    if !accepts(config, identity) {
+        let is_product = product(expected) == product(identity);
         return Err(Cause::Identity {
             esi: config.esi_path.display().to_string(),
             expected: format!("{} ({expected})", config.selection.device_name),
@@ -442,6 +457,22 @@ fn identification_timeout(machine: &Machine, found: Identity) -> Duration {
 /// True if the file has a device of this product at a position.
 fn belongs_elsewhere(machine: &Machine, identity: Identity) -> bool {
     positions(machine).any(|(_, config)| product(config.selection.identity) == product(identity))
+}
+
+/// Returns true if more devices are as in the file when some are moved along the segment: one is
+/// missing in the middle, or one too many is there. Otherwise a device that differs is another one in
+/// its place.
+fn is_shifted(machine: &Machine, there: &[Product]) -> bool {
+    let expected: Vec<_> = positions(machine).collect();
+    let same = |wanted: usize, found: usize| is_product(expected.get(wanted), there.get(found));
+    let in_place = (0..there.len()).filter(|at| same(*at, *at)).count();
+    align::longest(expected.len(), there.len(), same).len() > in_place
+}
+
+/// Returns true if the device at a position is not the one of the file.
+fn holds_others(machine: &Machine, there: &[Product]) -> bool {
+    let mut pairs = positions(machine).zip(there);
+    pairs.any(|(expected, found)| !is_product(Some(&expected), Some(found)))
 }
 
 /// Returns the devices of the file that are missing on the bus, as `compare` does. A device missing

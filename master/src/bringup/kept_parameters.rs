@@ -5,6 +5,7 @@ use super::{BusDevice, Step};
 use crate::acyclic::parameters::restore::{Restored, restore};
 use crate::config::DeviceConfig;
 use crate::mailbox::{MailboxTransport, abort_text};
+use crate::parameters::class::CopyRule;
 use crate::report::{Cause, Error};
 use crate::text::pluralize;
 
@@ -48,19 +49,33 @@ pub(super) async fn restore_to(
             .with_device(at));
         }
     }
-    let done = restore(coe, wire, at, None, &kept.dump.parameters, &mut |_, _| {}).await;
+    let values = (
+        kept.dump.parameters.as_slice(),
+        CopyRule::to_other_unit(kept.dump.device.vendor),
+    );
+    let done = restore(coe, wire, at, None, values, &mut |_, _| {}).await;
     let done = done.map_err(|error| error.source.with_action(STEP))?;
     if !done.complete() {
         let problems = problems(&done);
         return Err(Cause::Settings { file, problems }.with_device(at));
     }
-    if done.written > 0 {
-        let settings = pluralize(done.written, "setting");
-        progress(Step::Warning(format!(
-            "{at}: has the serial number {}, {file} is of {}: {settings} restored, {} had their value. They are not \
-             stored in the device; `ecaxis sdo store` does",
-            device.serial, kept.dump.device.serial, done.same
-        )));
+    if done.written.is_empty() && done.skipped.iter().all(|skipped| skipped.kept.is_none()) {
+        return Ok(());
+    }
+    let result = match done.written.len() {
+        0 => format!("its {} settings have their value", done.same),
+        written => format!(
+            "{} restored, {} had their value. They are not stored in the device; `ecaxis sdo store` does",
+            pluralize(written, "setting"),
+            done.same
+        ),
+    };
+    progress(Step::Warning(format!(
+        "{at}: has the serial number {}, {file} is of {}: {result}",
+        device.serial, kept.dump.device.serial
+    )));
+    for line in done.lines_of_written().chain(done.lines_of_skipped()) {
+        progress(Step::Warning(format!("{at}: {line}")));
     }
     Ok(())
 }

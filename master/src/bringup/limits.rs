@@ -6,8 +6,8 @@ use ecaxis_ecat::index::AxisIndex;
 use ecaxis_esi::{StartupSdo, axis};
 
 use super::{BusDevice, Step, device};
-use crate::config::drive_limits::{OFFSETS, speed_unit};
-use crate::config::{AxisSetup, DeviceConfig};
+use crate::config::cycle_objects::OFFSETS;
+use crate::config::{AxisSetup, DeviceConfig, UnitProblem, is_maxon};
 use crate::mailbox::{MailboxTransport, NamedObject};
 use crate::report::{Cause, Error};
 
@@ -43,7 +43,7 @@ pub(super) async fn compare(
     let adopted = adopted.find(|(index, _)| *index == axis_index);
     let axis = adopted.map_or(axis, |(_, adopted)| &adopted.setup);
     let mut held = Vec::new();
-    for (index, sub) in axis.limit_objects() {
+    for (index, sub) in axis.limit_objects(is_maxon(selection)) {
         if exists(index, sub)
             && let Some(data) = coe
                 .upload_optional(wire, object(index), sub, false)
@@ -58,8 +58,14 @@ pub(super) async fn compare(
         let found = all.find(|(object, _)| *object == (index, sub))?;
         Some(found.1.clone())
     };
-    for mut conflict in axis.exceeded(drive, speed_unit(selection)) {
+    for mut conflict in axis.exceeded(drive, selection) {
         conflict.index = object(conflict.index);
+        if conflict.wraps() {
+            return Err(Cause::Units {
+                problems: vec![UnitProblem::PositionRange(conflict)],
+            }
+            .with_device(&device.at));
+        }
         progress(Step::Warning(format!("{}: {conflict}", device.at)));
         device.limits.push((axis_index, conflict));
     }

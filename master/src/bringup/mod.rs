@@ -47,13 +47,14 @@ mod kept_parameters;
 mod limits;
 mod mailbox;
 mod mapping;
+mod modules;
 mod output_defaults;
 pub mod process_data;
 pub(crate) mod ring;
 mod soe;
 mod times;
 pub(crate) use common_time::clock_offset;
-pub(crate) use identify::{compare as compare_identity, known as known_identity, name_at};
+pub(crate) use identify::{accepts, compare as compare_identity, known as known_identity, name_at};
 mod watchdog;
 
 pub use crate::report::bring_up::{Step, StepTime};
@@ -62,6 +63,8 @@ use device::StartupPhase;
 pub(crate) use device::enable_op_only;
 pub use device::{SdoOutcome, write_startup_sdo};
 pub use mailbox::mailbox_registers;
+pub use modules::{DETECTED_MODULES, difference as module_difference};
+use process_data::ControlBytes;
 pub use ring::RingDelays;
 pub use times::StepTimes;
 pub use watchdog::watchdog_registers;
@@ -102,6 +105,8 @@ pub struct BusDevice {
     pub propagation_delay: u32,
     /// DL status (0x0110) after the scan: which ports are in use.
     pub dl_status: u16,
+    /// The ControlBytes that the device accepts.
+    pub control_bytes: ControlBytes,
     /// The activation bytes that are 1 in Op only: SyncManagers, then FMMUs.
     pub op_only: Vec<u16>,
 }
@@ -329,6 +334,7 @@ async fn describe(
         revision: sub_device.identity().revision,
         propagation_delay,
         dl_status: topology::in_line(position, dl_status, wire.ring()),
+        control_bytes: ControlBytes::default(),
         op_only: Vec::new(),
     })
 }
@@ -372,6 +378,7 @@ fn absent(config: &DeviceConfig, index: u16) -> BusDevice {
         revision: 0,
         propagation_delay: 0,
         dl_status: 0,
+        control_bytes: ControlBytes::default(),
         op_only: Vec::new(),
     }
 }
@@ -421,22 +428,18 @@ async fn set_up(
     let dc = clocks::configure(wire, machine, devices, &image, progress);
     let dc = times.measure("SYNC0", None, dc).await?;
 
-    let each = machine.devices.iter().zip(&*devices);
+    let each = machine.devices.iter().zip(&mut *devices);
     let each = each.filter(|(_, device)| device.present);
+    let plan = dc.as_ref();
     let changes = each.map(|(config, device)| {
-        let change = async {
-            let transition = [device.transition(AlState::SafeOp, false)];
-            let changed = al::change_states(wire, &transition, AlState::SafeOp).await;
-            match (&changed, config.selection.dc.is_some(), &dc) {
-                (Err(error), true, Some(plan)) if al::awaits_sync(error) => {
-                    tracing::debug!("{error}; requested again once SYNC0 runs");
-                    clocks::await_pulses(wire, plan).await;
-                    al::change_states(wire, &transition, AlState::SafeOp).await
-                }
-                _ => changed,
+        let pulses = async || {
+            if let Some(plan) = plan {
+                clocks::await_pulses(wire, plan).await;
             }
         };
-        times.measure("SafeOp", Some(&device.at.name), change)
+        let name = &config.name;
+        let change = modules::enter_safe_op(wire, config, device, pulses, progress);
+        times.measure("SafeOp", Some(name), change)
     });
     try_join_all(changes).await?;
     progress(Step::State(AlState::SafeOp));
@@ -467,6 +470,9 @@ async fn configure(
     times.measure("Ethernet (EoE)", name, step).await?;
     let step = device::start_up(wire, config, device, StartupPhase::InPreOp, progress);
     times.measure("start-up SDOs", name, step).await?;
+    // Other modules explain another mapping, so they come first.
+    let step = modules::compare(wire, config, device, progress);
+    times.measure("modules", name, step).await?;
     let step = mapping::compare(wire, config, device);
     times.measure("mapping read back", name, step).await?;
     let step = async {

@@ -10,8 +10,27 @@ use crate::rt::image::DeviceRegion;
 
 const FMMU_SIZE: u16 = 16;
 /// The activation bytes of a SyncManager and of an FMMU.
-const SM_ACTIVATE: u16 = 6;
+pub(super) const SM_ACTIVATE: u16 = 6;
 const FMMU_ACTIVATE: u16 = 12;
+
+/// The ControlBytes of a device's SyncManagers.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum ControlBytes {
+    /// With the watchdog trigger that the machine file demands.
+    #[default]
+    Watched,
+    /// As in the ESI.
+    Esi,
+}
+
+impl ControlBytes {
+    const fn of(self, sm: &SmLayout) -> u8 {
+        match self {
+            Self::Watched => sm.control(),
+            Self::Esi => sm.control_byte,
+        }
+    }
+}
 
 /// Bytes for consecutive registers of one device.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -51,7 +70,12 @@ pub struct ProcessDataPlan {
 impl ProcessDataPlan {
     /// `region`, `status`: the process data and the mailbox status in the process image.
     #[must_use]
-    pub fn new(config: &DeviceConfig, region: Option<DeviceRegion>, status: Option<u32>) -> Self {
+    pub fn new(
+        config: &DeviceConfig,
+        control: ControlBytes,
+        region: Option<DeviceRegion>,
+        status: Option<u32>,
+    ) -> Self {
         let layout = &config.selection.layout;
         let (mut sync_managers, mut mappings) = (Vec::new(), Vec::new());
         for (sms, kind) in [(&layout.outputs, WRITE), (&layout.inputs, READ)] {
@@ -61,7 +85,7 @@ impl ProcessDataPlan {
                     registers::SYNC_MANAGER + registers::SYNC_MANAGER_LEN * u16::from(sm.sm);
                 let op_only = config.device.op_only(sm);
                 let late = op_only.sync_manager && sm.len > 0;
-                let mut data = sync_manager(sm);
+                let mut data = sync_manager(sm, control.of(sm));
                 if late {
                     data[usize::from(SM_ACTIVATE)] = 0;
                 }
@@ -147,10 +171,10 @@ fn share_fmmus(mappings: &mut Vec<Mapping>) {
 }
 
 /// A SyncManager without data stays disabled: devices reject an active one of length 0.
-fn sync_manager(sm: &SmLayout) -> [u8; registers::SYNC_MANAGER_LEN as usize] {
+fn sync_manager(sm: &SmLayout, control: u8) -> [u8; registers::SYNC_MANAGER_LEN as usize] {
     let [p0, p1] = sm.start_address.to_le_bytes();
     let [n0, n1] = sm.len.to_le_bytes();
-    [p0, p1, n0, n1, sm.control_byte, 0, u8::from(sm.len > 0), 0]
+    [p0, p1, n0, n1, control, 0, u8::from(sm.len > 0), 0]
 }
 
 fn fmmu(number: usize, mapping: &Mapping) -> RegisterBlock {

@@ -8,8 +8,11 @@ use toml::Spanned;
 
 pub(crate) mod control;
 mod scale;
+mod torque_limit;
 
-pub(crate) use scale::is_maxon;
+pub(crate) use scale::{ambiguous_start, is_maxon};
+pub use torque_limit::TorqueLimit;
+pub(crate) use torque_limit::torque_limit;
 
 use super::fields::KeyExt;
 use super::problem::{Problems, Span};
@@ -57,9 +60,30 @@ pub(crate) fn setup(
         Some(homing) => Some(control::homing(homing, &config, selection, p)?),
         None => None,
     };
+    config.home = homing.as_ref().map(|setup| setup.homing.reference(&config));
     config.stop_timeout_s = control::seconds(&raw.stop_timeout);
     config.absolute = raw.absolute.value().unwrap_or(false);
+    scale::absolute_range(raw, &config, shown, p)?;
+    config.absolute_start = ambiguous_start(&config, shown).is_none();
     config.follows_bit = raw.follows_bit.value().unwrap_or(true);
+    for (key, place) in [
+        ("mode_display", raw.mode_display.place()),
+        ("mode_change", raw.mode_change.place()),
+        ("mode_time", raw.mode_time.place()),
+    ] {
+        let mapped = |s: &esi::Selection| s.layout.tx_field(0x6061, 0).is_some();
+        if let Some(place) = place
+            && selection.is_some_and(|selection| !mapped(selection))
+        {
+            let message = format!("`{key}` needs 0x6061 in the process data");
+            p.add_hint(place, message, "add \"0x6061\" to `pdo.tx`");
+        }
+    }
+    config.mode_display_enabled = raw.mode_display.value().unwrap_or(false);
+    config.mode_change_unpowered = raw.mode_change.value().unwrap_or(false);
+    if let Some(mode_time_s) = control::seconds(&raw.mode_time) {
+        config.mode_time_s = mode_time_s;
+    }
     if let Some(dead_time_s) = control::seconds(&raw.dead_time) {
         config.dead_time_s = dead_time_s;
     }
@@ -84,6 +108,7 @@ pub(crate) fn setup(
         compensation: Compensation::default(),
         second_encoder: None,
         brake_output: None,
+        torque_limit: TorqueLimit::default(),
     })
 }
 
@@ -105,12 +130,13 @@ fn quick_stop(sdos: &[RawSdo], selection: Option<&esi::Selection>) -> Option<Qui
 
 /// The targets that a mode needs in the process data, and the reported values.
 pub(super) const MODE_OBJECTS: [(Mode, &[u16], &[u16]); 5] = [
-    (Mode::Csp, &[0x607a], &[]),
+    // A switch to a position mode starts from the actual position.
+    (Mode::Csp, &[0x607a], &[0x6064]),
     (Mode::Csv, &[0x60ff], &[]),
     // A switch to CST starts from the actual torque.
     (Mode::Cst, &[0x6071], &[0x6077]),
     // A move's speed is a fraction of the axis limit, so the drive needs the profile objects.
-    (Mode::Pp, &[0x607a, 0x6081, 0x6083, 0x6084], &[]),
+    (Mode::Pp, &[0x607a, 0x6081, 0x6083, 0x6084], &[0x6064]),
     (Mode::Pv, &[0x60ff, 0x6083, 0x6084], &[]),
 ];
 
@@ -202,6 +228,13 @@ fn refused(error: &ConfigError, raw: &RawAxis, known: &TorqueSetup, unit: &str) 
         } => (
             of(raw.stop_timeout.place()),
             "`stop_timeout` must be above 0".to_owned(),
+        ),
+        ConfigError::NotPositive {
+            what: "mode_time_s",
+            ..
+        } => (
+            of(raw.mode_time.place()),
+            "`mode_time` must be above 0".to_owned(),
         ),
         ConfigError::NotPositive { .. } => (of(raw.target_window.place()), error.to_string()),
         ConfigError::Limit(LimitError::NotPositive { .. }) | ConfigError::Mode(_) => {

@@ -32,6 +32,8 @@ pub struct AxisSetup {
     pub second_encoder: Option<Signal>,
     /// The one-bit output that releases the axis's brake.
     pub brake_output: Option<Signal>,
+    /// What `limits.torque` does in modes other than CST.
+    pub torque_limit: super::TorqueLimit,
 }
 
 /// The homing of an axis.
@@ -44,15 +46,13 @@ pub struct HomingSetup {
     pub timeout_ns: u64,
 }
 
-impl HomingSetup {
-    /// Adds the SDOs before SafeOp, after those of the ESI.
-    pub(super) fn add_to(&self, startup: &mut Vec<esi::StartupSdo>) {
-        let at = startup
-            .iter()
-            .position(|sdo| sdo.transition == "SO")
-            .unwrap_or(startup.len());
-        startup.splice(at..at, self.startup.iter().cloned());
-    }
+/// Adds the SDOs of an axis before SafeOp, after those of the ESI.
+pub(super) fn add_startup(startup: &mut Vec<esi::StartupSdo>, added: &[esi::StartupSdo]) {
+    let at = startup
+        .iter()
+        .position(|sdo| sdo.transition == "SO")
+        .unwrap_or(startup.len());
+    startup.splice(at..at, added.iter().cloned());
 }
 
 /// The unit of an axis's torques, and the motor data.

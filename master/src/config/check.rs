@@ -8,9 +8,11 @@ use toml::Spanned;
 
 use super::cam;
 use super::compensation;
-use super::copy::{self, OutputWriter};
+use super::copy::{self, BitRange};
 use super::device::{self, CheckedDevice, EsiFiles};
+use super::device_groups;
 use super::duration::show;
+use super::ebus;
 use super::eoe;
 use super::fields::KeyExt;
 use super::gantry;
@@ -22,15 +24,17 @@ use super::path;
 use super::position_output;
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawBus, RawDevice, RawMachine};
+use super::roles::{OutputOwner, OwnerKind, ProcessDataRoles};
 use super::second_encoder;
 use super::sim;
 use super::steps::{self, Resolved, ResolvedAxis, ResolvedDevice};
 
 use crate::file_digest::{FileDigest, UsedFile};
+use crate::rt::image;
 
 use super::{
-    AxisSetup, Bus, CommonTimeUse, GroupStopScope, Locator, MAX_SUBDEVICES, Machine, Nic,
-    SegmentHead, ServerSetup, Signal, Spin, StopSetup, signal,
+    AxisSetup, Bus, CommonTimeUse, Locator, MAX_SUBDEVICES, Machine, Nic, SegmentHead, ServerSetup,
+    Signal, Spin, StopSetup, signal,
 };
 
 /// Returns `None` only if a problem has been reported.
@@ -58,6 +62,11 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         .collect();
     let connections = sim::Places::of(&raw.devices);
     let optional = OptionalPlaces::of(&raw.devices);
+    let spans: Vec<_> = raw
+        .devices
+        .iter()
+        .filter_map(|d| Some((d.name.as_ref()?.get_ref().clone(), d.span.clone())))
+        .collect();
     let needs = needed::of_steps(&raw.steps);
     for (raw, at) in raw.devices.into_iter().zip(places) {
         checked.push(device::check(raw, at, &mut files, (&all, &needs), p));
@@ -143,25 +152,15 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         p,
     );
     let encoders = second_encoder::check(&encoders, known, p);
-    let brakes = brake_outputs(&brakes, known, &program.outputs, p);
-    let steps = program.outputs.iter().zip(&program.output_places);
-    let steps = steps.map(|(output, place)| {
-        let what = format!("set by the step in line {}", p.line(place));
-        OutputWriter::new(output, what)
-    });
-    let opened = brakes.iter().map(|brake| {
-        let (axis, line) = (&brake.axis, p.line(&brake.place));
-        let what = format!("the brake output of `{axis}` in line {line}");
-        OutputWriter::new(&brake.output, what)
-    });
-    let mut writers: Vec<_> = steps.chain(opened).collect();
-    let position_outputs =
-        position_output::check(&raw.position_outputs, known, &axes, &program, &writers, p);
-    writers.extend(position_outputs.iter().map(|setup| {
-        let what = format!("switched by the position_output in line {}", setup.line);
-        OutputWriter::new(&setup.output, what)
-    }));
-    let copies = copy::check(&raw.copies, known, &writers, p);
+    let mut roles = ProcessDataRoles::of_devices(known, &axes);
+    for (output, place) in program.outputs.iter().zip(&program.output_places) {
+        let owner = OutputOwner::new(OwnerKind::Step, "", p.line(place));
+        roles.claim_at(BitRange::of(output), owner, place.clone(), p);
+    }
+    let brakes = brake_outputs(&brakes, known, &mut roles, p);
+    let positions = &raw.position_outputs;
+    let position_outputs = position_output::check(positions, known, &axes, &program, &mut roles, p);
+    let copies = copy::check(&raw.copies, known, &mut roles, p);
     let mut devices = Vec::new();
     let mut axes = Vec::new();
     for (index, checked) in (0..).map(DeviceIndex).zip(checked) {
@@ -180,9 +179,16 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         }
     }
     for encoder in encoders {
-        encoder.add_to(&mut axes, &program.stop, p);
+        encoder.add_to(&mut axes, &program.stop, &mut roles, p);
+    }
+    for used in &program.used {
+        roles.add_input(used, None, &program.stop, p);
+    }
+    for copy in &copies {
+        roles.add_source(copy.from.clone());
     }
     gantry::check_groups(&gantries, &axes, &program.stop, p);
+    ebus::check(&mut devices);
     let devices: IndexVec<_, _> = devices.into();
     let gateway = raw.mailbox_gateway.as_ref();
     let gateway = gateway.map(|raw| mailbox_gateway::check(raw, p));
@@ -190,7 +196,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
     let tap = tap.and_then(|raw| eoe::tap(raw, bus.as_ref(), &devices, p));
     connections.check(&devices, p);
     optional.check(&devices, &program, p);
-    Some(Machine {
+    let machine = Machine {
         path: path.to_owned(),
         sha256: FileDigest::of_machine(file, &p.files.files),
         files: std::iter::once(file)
@@ -212,6 +218,7 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         switched: program.switched,
         copies,
         position_outputs,
+        roles,
         stop: program.stop,
         overrides: program.overrides,
         tables: program.tables,
@@ -223,7 +230,20 @@ pub(crate) fn machine(file: &UsedFile, raw: RawMachine, p: &mut Problems<'_>) ->
         },
         mailbox_gateway: gateway,
         tap,
-    })
+    };
+    device_groups::check(&machine, &spans, p);
+    if let Err(error) = image::of(&machine.rt_config()) {
+        let name = &machine.devices[error.device].name;
+        let span = spans.iter().find(|(other, _)| other == name);
+        let message = format!("`{name}`: {error}");
+        let hint = "map fewer objects with `pdo.rx` and `pdo.tx`, or choose another `assignment`";
+        p.add_hint(
+            span.map_or(Span::default(), |(_, span)| span.clone()),
+            message,
+            hint,
+        );
+    }
+    Some(machine)
 }
 
 /// The output that releases a brake.
@@ -236,13 +256,8 @@ struct BrakeOutput {
 impl BrakeOutput {
     /// Reports a brake that closes on a moving axis: its output is in a group that may stop alone.
     fn check_group(&self, axis: &AxisSetup, stop: &StopSetup, p: &mut Problems<'_>) {
-        let of = |device| stop.groups.iter().find(|g| g.devices.contains(&device));
-        let Some(group) = of(self.output.device) else {
-            return;
-        };
-        let alone = group.outside == GroupStopScope::Continue;
-        if alone && of(axis.device).is_none_or(|own| own.name != group.name) {
-            let (name, axis, group) = (&self.output.name, &self.axis, &group.name);
+        if let Some(group) = stop.group_alone(self.output.device, Some(axis.device)) {
+            let (name, axis) = (&self.output.name, &self.axis);
             let message = format!(
                 "`{name}` opens the brake of `{axis}`, and its group `{group}` may stop while `{axis}` moves"
             );
@@ -252,11 +267,11 @@ impl BrakeOutput {
     }
 }
 
-/// Returns the outputs that release brakes. `set`: the outputs that steps set.
+/// Returns the outputs that release brakes. Each belongs to its axis.
 fn brake_outputs(
     brakes: &[(String, Spanned<String>)],
     known: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
-    set: &[Signal],
+    roles: &mut ProcessDataRoles,
     p: &mut Problems<'_>,
 ) -> Vec<BrakeOutput> {
     let mut found: Vec<BrakeOutput> = Vec::new();
@@ -264,35 +279,23 @@ fn brake_outputs(
         let Some(output) = signal::output_of_text(text, known, p) else {
             continue;
         };
-        let taken = found.iter().find(|other| other.output == output);
-        let problem = if output.field.bit_len != 1 {
-            let bits = output.field.bit_len;
-            Some((
-                format!("`{}` has {bits} bits", output.name),
-                "a brake is opened by an output of one bit",
-            ))
-        } else if let Some(BrakeOutput { axis: other, .. }) = taken {
-            let message = format!("`{}` opens the brake of `{other}` already", output.name);
-            Some((message, "each brake has an output of its own"))
-        } else if set.contains(&output) {
-            let message = format!(
-                "`{}` opens the brake of `{axis}`, and a step sets it",
-                output.name
-            );
-            Some((
+        if output.field.bit_len != 1 {
+            let message = format!("`{}` has {} bits", output.name, output.field.bit_len);
+            p.add_hint(
+                text.span(),
                 message,
-                "take it out of the step: the axis opens and closes its brake",
-            ))
-        } else {
-            None
-        };
-        match problem {
-            Some((message, hint)) => p.add_hint(text.span(), message, hint),
-            None => found.push(BrakeOutput {
+                "a brake is opened by an output of one bit",
+            );
+            continue;
+        }
+        let place = text.span();
+        let owner = OutputOwner::new(OwnerKind::Brake, axis, p.line(&place));
+        if roles.claim_at(BitRange::of(&output), owner, place.clone(), p) {
+            found.push(BrakeOutput {
                 axis: axis.clone(),
                 output,
-                place: text.span(),
-            }),
+                place,
+            });
         }
     }
     found

@@ -4,13 +4,14 @@
 use std::ops::Range;
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
-use ecaxis_esi as esi;
 use ecaxis_esi::layout::{Field, PdoLayout};
 
 use toml::Spanned;
 
+use super::fields::KeyExt;
 use super::problem::Problems;
 use super::raw::RawCopy;
+use super::roles::{OutputOwner, OwnerKind, ProcessDataRoles};
 use super::signal::{self, NameError, SignalDirection};
 use super::steps::ResolvedDevice;
 use super::{DeviceConfig, Signal};
@@ -24,6 +25,8 @@ pub struct CopySetup {
     pub from: BitRange,
     /// The outputs. Nothing else writes them.
     pub to: BitRange,
+    /// `true` for the frames of a safety connection, which also reach a device that has returned.
+    pub fsoe: bool,
     /// The line of its `[[copy]]` in the machine file.
     pub line: u32,
 }
@@ -49,6 +52,14 @@ pub struct BitRange {
 }
 
 impl BitRange {
+    pub(super) fn of(signal: &Signal) -> Self {
+        Self {
+            device: signal.device,
+            name: signal.name.clone(),
+            bits: bits_of(&signal.field),
+        }
+    }
+
     pub(super) fn overlaps(&self, device: DeviceIndex, bits: &Range<u32>) -> bool {
         self.device == device && overlap(&self.bits, bits)
     }
@@ -72,40 +83,11 @@ pub(super) fn bits_of(field: &Field) -> Range<u32> {
     field.bit_offset..field.bit_offset.saturating_add(field.bit_len.into())
 }
 
-/// Something other than a copy that writes an output.
-pub(crate) struct OutputWriter {
-    device: DeviceIndex,
-    name: String,
-    bits: Range<u32>,
-    /// The writer with its line, to complete "the output is …".
-    what: String,
-}
-
-impl OutputWriter {
-    pub fn new(output: &Signal, what: String) -> Self {
-        Self {
-            device: output.device,
-            name: output.name.clone(),
-            bits: bits_of(&output.field),
-            what,
-        }
-    }
-
-    /// Returns what writes the output already.
-    pub fn conflict(&self, output: &Signal) -> Option<&str> {
-        let bits = bits_of(&output.field);
-        let same = self.device == output.device
-            && self.bits.start < bits.end
-            && bits.start < self.bits.end;
-        same.then_some(self.what.as_str())
-    }
-}
-
-/// Returns the valid copies. `writers`: the outputs that steps and brakes write.
+/// Returns the valid copies, which own their outputs.
 pub(crate) fn check(
     raw: &[RawCopy],
     devices: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
-    writers: &[OutputWriter],
+    roles: &mut ProcessDataRoles,
     p: &mut Problems<'_>,
 ) -> Vec<CopySetup> {
     let mut copies: Vec<CopySetup> = Vec::new();
@@ -118,8 +100,20 @@ pub(crate) fn check(
         let (Some(from), Some(to)) = (from, to) else {
             continue;
         };
-        if let Some((message, hint)) = other_writer(&to, devices, writers, &copies) {
-            p.add_hint(to_text.span(), message, hint);
+        let line = p.line(&raw.span);
+        let named = |range: &BitRange, way| {
+            let device = devices[range.device].device;
+            device.is_some_and(|device| names_fsoe(device, way, &range.bits))
+        };
+        let fsoe = raw.fsoe.value().unwrap_or_else(|| {
+            named(&from, SignalDirection::In) || named(&to, SignalDirection::Out)
+        });
+        let kind = match fsoe {
+            true => OwnerKind::SafetyCopy,
+            false => OwnerKind::Copy,
+        };
+        let owner = OutputOwner::new(kind, "", line);
+        if !roles.claim_at(to.clone(), owner, to_text.span(), p) {
             continue;
         }
         if from.bits.len() != to.bits.len() {
@@ -137,73 +131,29 @@ pub(crate) fn check(
             );
             continue;
         }
-        let line = p.line(&raw.span);
-        copies.push(CopySetup { from, to, line });
+        copies.push(CopySetup {
+            from,
+            to,
+            fsoe,
+            line,
+        });
     }
     copies
 }
 
-/// Returns a message and a hint if anything else writes a part of the outputs.
-fn other_writer(
-    to: &BitRange,
-    devices: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
-    writers: &[OutputWriter],
-    copies: &[CopySetup],
-) -> Option<(String, &'static str)> {
-    const ONE_WRITER: &str =
-        "an output has one writer: remove the other, or copy to another output";
-    let subject = |name: &str| match name == to.name {
-        true => format!("`{name}`"),
-        false => format!("`{name}` in `{}`", to.name),
+/// Returns true if the ESI names an entry of these bits, or its PDO, after FSoE.
+fn names_fsoe(device: &DeviceConfig, way: SignalDirection, bits: &Range<u32>) -> bool {
+    let selection = &device.selection;
+    let (fields, pdos) = match way {
+        SignalDirection::In => (&selection.layout.tx, &selection.tx),
+        SignalDirection::Out => (&selection.layout.rx, &selection.rx),
     };
-    let device = devices[to.device].device?;
-    let layout = &device.selection.layout;
-    let mut own = layout.rx.iter().filter(|f| overlap(&bits_of(f), &to.bits));
-    let reserved = own.find_map(|field| Some((field, signal::reserved_for_axis(field, device)?)));
-    if let Some((field, why)) = reserved {
-        let name = name_of(field, device);
-        let hint = "give the axis a command instead, or copy to another output";
-        return Some((format!("{} {why}", subject(&name)), hint));
-    }
-    let mut written = writers.iter();
-    if let Some(other) = written.find(|other| to.overlaps(other.device, &other.bits)) {
-        return Some((
-            format!("{} is {}", subject(&other.name), other.what),
-            ONE_WRITER,
-        ));
-    }
-    let mut before = copies.iter();
-    if let Some(other) = before.find(|other| to.overlaps(other.to.device, &other.to.bits)) {
-        let message = match other.to == *to {
-            true => format!(
-                "`{}` is the target of the copy in line {}",
-                to.name, other.line
-            ),
-            false => format!(
-                "`{}` overlaps `{}`, the target of the copy in line {}",
-                to.name, other.to.name, other.line
-            ),
-        };
-        return Some((message, ONE_WRITER));
-    }
-    let mut repeats = layout.repeated_outputs();
-    let (first, _) = repeats.find(|(_, field)| overlap(&bits_of(field), &to.bits))?;
-    let name = name_of(first, device);
-    Some((
-        format!(
-            "{} repeats the object of PDO 0x{:04x}",
-            subject(&name),
-            first.pdo
-        ),
-        "copy to the object by its name: both PDOs then carry the value",
-    ))
-}
-
-/// Returns the name of an output with its device's name.
-fn name_of(field: &Field, device: &DeviceConfig) -> String {
-    let address = esi::address(field.index, field.sub).to_string();
-    let name = signal::field(&address, SignalDirection::Out, device).map(|(_, name)| name);
-    format!("{}.{}", device.name, name.unwrap_or(address))
+    let named = |name: &str| name.to_ascii_lowercase().contains("fsoe");
+    let mut own = fields.iter().filter(|field| overlap(&bits_of(field), bits));
+    own.any(|field| {
+        let pdo = pdos.iter().find(|pdo| pdo.index == field.pdo);
+        named(&field.name) || pdo.is_some_and(|pdo| named(&pdo.name))
+    })
 }
 
 /// Returns the bits that a text such as `io.Input 3`, `io.pdo.0x1A00` or `io.bytes.4..10` names.

@@ -169,38 +169,38 @@ fn each_mistake_is_reported_with_both_places() {
         (
             "a.Input 1",
             "x.0x6040",
-            "`x.Controlword` is written by the axis itself",
+            "`x.Controlword` is written by the axis `x` in line 4; the copy in line 23 may not",
             "command",
         ),
         (
             "x.Statusword",
             "x.0x6040",
-            "`x.Controlword` is written by the axis itself",
+            "`x.Controlword` is written by the axis `x` in line 4; the copy in line 23 may not",
             "command",
         ),
         (
             "x.bytes.0..4",
             "x.bytes.0..4",
-            "`x.Controlword` in `x.bytes.0..4` is written by",
+            "`x.Controlword` in `x.bytes.0..4` is written by the axis `x` in line 4",
             "command",
         ),
         (
             "a.Input 1",
             "a.Output 5",
-            "`a.Output 5` is set by the step in line 22",
-            "one writer",
+            "`a.Output 5` is set by the step in line 22; the copy in line 23 may not write it",
+            "one owner",
         ),
         (
             "io.b.pdo.0x1A00",
             "a.pdo.0x1600",
             "`a.Output 5` in `a.pdo.0x1600` is set by the step in line 22",
-            "one writer",
+            "one owner",
         ),
         (
             "a.Input 1",
             "io.b.Output 8",
-            "`io.b.Output 8` is the brake output of `x` in line 12",
-            "one writer",
+            "`io.b.Output 8` opens the brake of `x` in line 12; the copy in line 23",
+            "the axis opens and closes its brake",
         ),
         (
             "a.pdo.0x1A00",
@@ -224,7 +224,9 @@ fn an_output_is_the_target_of_one_copy() {
     let first = ("a.Input 1", "io.b.Output 1");
     let second = problem(&[first, ("a.Input 2", "io.b.Output 1")]);
     assert!(
-        second.message.contains("the target of the copy in line 23"),
+        second
+            .message
+            .contains("is written by the copy in line 23; the copy in line 26"),
         "{second}"
     );
     assert_eq!(second.line, 28);
@@ -254,7 +256,8 @@ fn a_controller_cannot_set_the_target_of_a_copy() {
         .expect_err("a copy writes it");
     assert_eq!(
         error.to_string(),
-        "`io.b.Output 1` is written by the copy in line 23; an output has one writer"
+        "`io.b.Output 1` is written by the copy in line 23; a controller may not write it; an output has \
+         one owner: remove one of both, or write another output"
     );
     machine.output("io.b", "Output 2").expect("free");
 }

@@ -8,16 +8,18 @@ use ecaxis_esi as esi;
 use ecaxis_esi::{Field, Layout};
 use toml::Spanned;
 
+use super::duration::show;
 use super::fields::{Key, KeyExt};
 use super::needed::{self, Needs};
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawDevice, RawEntry, SdoValue};
-use super::{DeviceConfig, Locator, MailboxSource, Startup, eoe, gateway, sdo, sim};
+use super::{DeviceConfig, Locator, MailboxSource, Startup, cycle_objects, eoe, gateway, sdo, sim};
 use crate::esi_library::{RevisionMatch, SiiImage};
 use crate::rt::config::ProcessDataCopy;
 
 mod axes;
 mod esi_files;
+mod watchdog;
 
 pub(crate) use axes::CheckedAxis;
 pub(crate) use esi_files::EsiFiles;
@@ -68,18 +70,37 @@ pub(crate) fn check(
         chosen
             .notes
             .extend(mailbox_note(device, image.as_deref(), mailbox));
+        watchdog::set_trigger(chosen, raw.watchdog_trigger.as_ref(), p);
+        let of_image = device.filter(|_| raw.esi.is_none());
+        chosen.notes.extend(of_image.and_then(without_pdos));
+        if let Some((cycle_ns, _)) = &files.cycle {
+            chosen.notes.extend(fixed_sync0(chosen, *cycle_ns));
+        }
         further_axes(chosen);
         repeated_outputs(chosen);
         profile_objects(&raw, chosen, p);
+        reported_position(&raw, chosen, p);
+    }
+    if let (Some(chosen), Some((cycle_ns, _))) = (chosen.as_ref(), &files.cycle) {
+        let setups = axes.iter().filter_map(|axis| axis.setup.as_ref());
+        cycle_objects::check(&raw, chosen, &setups.collect::<Vec<_>>(), *cycle_ns, p);
     }
     let notes = chosen.as_mut().map(|chosen| &mut chosen.notes);
     let eoe = eoe::device(&raw, device, notes, p);
+    let described = file.as_ref().map(|(_, file)| &**file).zip(device);
     let sim = raw.sim.take().map(|sim| {
+        let plugged = match (described, &files.cycle) {
+            (Some(described), Some((cycle_ns, _))) => sim::modules(&sim, described, *cycle_ns, p),
+            _ => None,
+        };
         let axis = match axes.first() {
             None => Err(()),
             Some(axis) => Ok(axis.setup.as_ref()),
         };
-        sim::check(sim, names, axis, p)
+        sim::SimSetup {
+            modules: plugged,
+            ..sim::check(sim, names, axis, p)
+        }
     });
     let network = gateway::check(
         &raw,
@@ -89,7 +110,10 @@ pub(crate) fn check(
         files.folder(),
         p,
     );
-    let startup = Startup::of(&raw);
+    let mut startup = Startup::of(&raw);
+    for setup in axes.iter().filter_map(|axis| axis.setup.as_ref()) {
+        startup.verify(setup.torque_limit.startup());
+    }
     let parameters = files.parameters(&raw, device, p);
     let device = device.map(|d| Arc::new(d.clone()));
     let identity = identity(raw.identity.as_ref(), p);
@@ -113,6 +137,7 @@ pub(crate) fn check(
             esi: file,
             sii: image,
             mailbox,
+            watchdog_trigger: raw.watchdog_trigger.value().unwrap_or_default(),
             selection: chosen?,
             startup,
             identity: identity?,
@@ -160,6 +185,40 @@ fn mailbox_note(
     })
 }
 
+/// Reports an EEPROM image without PDOs of a device that exchanges process data: many devices
+/// describe their PDOs in the ESI only.
+fn without_pdos(device: &esi::Device) -> Option<String> {
+    use esi::SmUse::{Inputs, Outputs};
+    let mut managers = device.sync_managers.iter();
+    let exchanges = managers.any(|sm| matches!(sm.usage, Outputs | Inputs));
+    let has_coe = device.mailbox.as_ref().is_some_and(|m| m.coe.is_some());
+    let has_none = device.rx_pdos.is_empty() && device.tx_pdos.is_empty();
+    (has_none && (exchanges || has_coe)).then(|| {
+        "warning: the EEPROM image describes no PDO, so the device exchanges no process data; \
+         name the ESI file of its vendor with `esi`"
+            .to_owned()
+    })
+}
+
+/// Reports a SYNC0 cycle that the OpMode fixes and that does not fit the bus cycle. Set-points then
+/// arrive at another distance from SYNC0 in each cycle.
+fn fixed_sync0(selection: &esi::Selection, cycle_ns: u64) -> Option<String> {
+    let dc = selection.dc.as_ref().filter(|dc| dc.activates_sync())?;
+    let sync0 = u64::from(dc.sync0_cycle_ns);
+    let fits = sync0 == 0 || cycle_ns.is_multiple_of(sync0) || sync0.is_multiple_of(cycle_ns);
+    (!fits).then(|| {
+        format!(
+            "warning: the OpMode \"{}\" ({}) fixes the cycle of SYNC0 at {}, so the bus cycle of {} must be \
+             a multiple of it, such as {}",
+            dc.name,
+            dc.position.origin(),
+            show(sync0),
+            show(cycle_ns),
+            show(cycle_ns.next_multiple_of(sync0))
+        )
+    })
+}
+
 /// Reports objects that a profile mode needs and the process data lacks.
 fn profile_objects(raw: &RawDevice, selection: &esi::Selection, p: &mut Problems<'_>) {
     let Some(text) = &raw.mode else { return };
@@ -183,6 +242,26 @@ fn profile_objects(raw: &RawDevice, selection: &esi::Selection, p: &mut Problems
             all.collect::<Vec<_>>().join(", ")
         );
         p.add_hint(text.span(), message, hint);
+    }
+}
+
+/// Reports an axis that begins in a position mode and does not report its position.
+fn reported_position(raw: &RawDevice, selection: &esi::Selection, p: &mut Problems<'_>) {
+    const POSITION: u16 = 0x6064;
+    let is_of_positions = matches!(selection.mode, Some(esi::Mode::Csp | esi::Mode::Pp));
+    let reports = |axis: &u16| {
+        let layout = selection.layout.of_axis(*axis);
+        layout.tx_field(POSITION, 0).is_some()
+    };
+    let missing = selection.axes.iter().find(|axis| !reports(axis));
+    if let (true, Some(axis), Some(mode)) = (is_of_positions, missing, &raw.mode) {
+        let message = format!(
+            "mode \"{}\" needs 0x{:04X} in the inputs, and they lack it",
+            mode.get_ref(),
+            esi::axis::object(POSITION, *axis)
+        );
+        let at = raw.pdo.tx.place().unwrap_or(mode.span());
+        p.add_hint(at, message, "add it to `pdo.tx`");
     }
 }
 
@@ -335,12 +414,9 @@ impl DeviceQuery<'_> {
             )
         };
         let (rx, tx) = (entries(&self.raw.pdo.rx), entries(&self.raw.pdo.tx));
-        let modules = self.raw.modules.as_ref().map(|m| m.get_ref().as_slice());
-        let modules: Vec<&str> = modules
-            .unwrap_or_default()
-            .iter()
-            .map(String::as_str)
-            .collect();
+        let modules = self.raw.modules.as_ref().map(|m| m.get_ref());
+        let modules: Option<Vec<&str>> =
+            modules.map(|names| names.iter().map(String::as_str).collect());
         let idns = self.idns(device, p)?;
         let mut choice = esi::SelectOptions {
             mode: self.mode,
@@ -349,7 +425,7 @@ impl DeviceQuery<'_> {
             tx: tx.as_deref(),
             more_rx: &[],
             more_tx: &[],
-            modules: &modules,
+            modules: modules.as_deref(),
             assignment: self.raw.assignment.as_ref().map(|a| a.get_ref().as_str()),
             dc_mode: self.raw.dc.as_ref().map(|d| d.get_ref().as_str()),
             cycle_ns: self.cycle_ns,
@@ -461,7 +537,9 @@ impl DeviceQuery<'_> {
             of(found.map(|s| s.span.clone()))
         };
         let at = match e {
-            E::ModeNotOffered { .. } => of(raw.mode.place()),
+            E::ModeNotOffered { .. } | E::NoControlword { .. } | E::SubindexOfValue { .. } => {
+                of(raw.mode.place())
+            }
             E::NoSuchAxis { number, .. } => {
                 let numbers = (1..).zip(&raw.axes.0);
                 let mut numbered =
@@ -470,7 +548,9 @@ impl DeviceQuery<'_> {
                 of(axis.map(|(_, axis)| axis.span.clone()))
             }
             E::NoSuchDcMode { .. } => of(raw.dc.place()),
-            E::NoSuchModule { .. } | E::TooManyModules { .. } => of(raw.modules.place()),
+            E::NoSuchModule { .. } | E::TooManyModules { .. } | E::ModuleMode { .. } => {
+                of(raw.modules.place())
+            }
             E::NoSuchAssignment { .. } => of(raw.assignment.place()),
             E::CycleNotExpressible { .. } | E::SoeCycle { .. } | E::DcOutOfRange { .. } => {
                 self.cycle.clone()
@@ -491,10 +571,20 @@ impl DeviceQuery<'_> {
                 e.to_string(),
                 "pick one by its mode (`mode = \"csp\"`), or name the modules slot by slot (`modules = [\"CSP\"]`)",
             ),
+            E::ModuleMode { .. } => p.add_hint(
+                at,
+                e.to_string(),
+                "name the module of `mode`, or leave `modules` out",
+            ),
             E::ModeNotOffered { .. } => p.add_hint(
                 at,
                 e.to_string(),
                 "pick another mode, or the ESI file of the drive; an I/O device has no `mode` and no [device.axis]",
+            ),
+            E::NoControlword { .. } | E::SubindexOfValue { .. } => p.add_hint(
+                at,
+                e.to_string(),
+                "get a correct ESI file from the vendor, or pick another mode",
             ),
             _ => p.add(at, e.to_string()),
         }

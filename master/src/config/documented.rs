@@ -35,14 +35,19 @@ fn known() -> BTreeSet<String> {
     keys
 }
 
+fn read(name: &str) -> String {
+    let docs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs");
+    std::fs::read_to_string(docs.join(name)).unwrap()
+}
+
 fn document() -> String {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/machine-file.md");
-    std::fs::read_to_string(path).unwrap()
+    read("machine-file.md")
 }
 
 #[test]
 fn document_lists_every_key() {
-    let (known, document) = (known(), document());
+    // The table of quirks is in a document of its own.
+    let (known, document) = (known(), document() + &read("drive.md"));
     assert!(known.len() > 130, "{known:?}");
     let there = |key: &str| {
         let shapes = [
@@ -142,6 +147,25 @@ fn descriptions_of_the_schema_are_those_of_the_document() {
         );
     }
     assert!(rows > 90, "{rows} keys in the document's tables");
+}
+
+/// Each quirk of the simulated drive is a row of docs/drive.md, and each row a quirk.
+#[test]
+fn document_lists_every_quirk_as_the_table_does() {
+    let document = read("drive.md");
+    let section = document.split("\n## Quirks\n").nth(1).unwrap_or_default();
+    let section = section.split("\n## ").next().unwrap_or_default();
+    let rows: Vec<&str> = section.lines().filter(|l| l.starts_with("| `")).collect();
+    let row = |quirk: &ecaxis_sim::Quirk| {
+        let mut letters = quirk.text.chars();
+        let first = letters.next().map(|c| c.to_lowercase().to_string());
+        let text = first.unwrap_or_default() + letters.as_str();
+        let (kind, _) = quirk.value.describe();
+        let objects = quirk.point.objects();
+        format!("| `{}` | {kind} | {objects} | {text} |", quirk.key)
+    };
+    let table: Vec<String> = ecaxis_sim::Quirks::TABLE.iter().map(row).collect();
+    assert_eq!(rows, table, "wanted:\n{}", table.join("\n"));
 }
 
 #[test]

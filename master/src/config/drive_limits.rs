@@ -9,7 +9,7 @@ use ecaxis_esi as esi;
 
 use super::problem::Problems;
 use super::raw::RawSdo;
-use super::{AxisSetup, UnitSource};
+use super::{AxisSetup, UnitSource, is_maxon};
 use crate::text::rounded;
 use ecaxis_ecat::object::NamedObject;
 
@@ -20,9 +20,10 @@ const MAX_PROFILE_VELOCITY: u16 = 0x607f;
 const FOLLOWING_WINDOW: u16 = 0x6065;
 const MAX_ACCELERATION: u16 = 0x60c5;
 const MAX_TORQUES: [u16; 3] = [0x6072, 0x60e0, 0x60e1];
-
-/// Offset objects, which add to a target after its limits: position, velocity, torque.
-pub(crate) const OFFSETS: [u16; 3] = [0x60b0, 0x60b1, 0x60b2];
+/// maxon: the speed that the gear allows at its input, and the nominal and largest motor current.
+const MAX_GEAR_SPEED: (u16, u8) = (0x3003, 3);
+const NOMINAL_CURRENT: (u16, u8) = (0x3001, 1);
+const CURRENT_LIMIT: (u16, u8) = (0x3001, 2);
 
 /// A limit of the drive that the machine file exceeds.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -43,8 +44,9 @@ impl fmt::Display for LimitConflict {
 }
 
 impl AxisSetup {
-    /// Returns index and subindex of the drive's limits for this axis.
-    pub(crate) fn limit_objects(&self) -> Vec<(u16, u8)> {
+    /// Returns index and subindex of the drive's limits for this axis. `maxon`: the drive has
+    /// maxon's objects.
+    pub(crate) fn limit_objects(&self, maxon: bool) -> Vec<(u16, u8)> {
         let mut objects = vec![
             (POSITION_RANGE, 1),
             (POSITION_RANGE, 2),
@@ -62,31 +64,39 @@ impl AxisSetup {
         if self.torque.limit_said {
             objects.extend(MAX_TORQUES.map(|index| (index, 0)));
         }
+        if maxon {
+            objects.push(MAX_GEAR_SPEED);
+        }
+        if maxon && self.torque.limit_said {
+            objects.extend([NOMINAL_CURRENT, CURRENT_LIMIT]);
+        }
         objects
     }
 
     /// Returns the limits that this axis exceeds. `drive` returns the bytes of a limit object.
-    /// `speed_unit`: the unit of 0x6080 if the ESI gives it. Zero means no limit.
+    /// Zero means no limit.
     pub(crate) fn exceeded(
         &self,
         drive: impl Fn(u16, u8) -> Option<Vec<u8>>,
-        speed_unit: Option<VelocityUnit>,
+        selection: &esi::Selection,
     ) -> Vec<LimitConflict> {
-        let wanted = self.limit_objects();
+        let wanted = self.limit_objects(is_maxon(selection));
         let value = |index: u16, sub: u8| {
             let known = wanted.contains(&(index, sub)).then(|| drive(index, sub))?;
             let signed = matches!(index, POSITION_RANGE | SOFTWARE_LIMIT);
             known.map(|bytes| number(&bytes, signed))
         };
-        let set = |index: u16| value(index, 0).filter(|n| *n != 0);
+        let set_in = |(index, sub): (u16, u8)| value(index, sub).filter(|n| *n != 0);
+        let set = |index: u16| set_in((index, 0));
         let mut found = Vec::new();
         for index in [SOFTWARE_LIMIT, POSITION_RANGE] {
             if let (Some(low), Some(high)) = (value(index, 1), value(index, 2)) {
                 self.positions(index, low, high, &mut found);
             }
         }
-        if let Some(speed) = set(MAX_MOTOR_SPEED) {
-            found.extend(self.speed(speed, speed_unit));
+        for object in [(MAX_MOTOR_SPEED, 0), MAX_GEAR_SPEED] {
+            let speed = set_in(object);
+            found.extend(speed.and_then(|speed| self.speed(object, speed, selection)));
         }
         let velocity = set(MAX_PROFILE_VELOCITY).and_then(|n| i32::try_from(n).ok());
         found.extend(velocity.and_then(|raw| self.profile_velocity(raw)));
@@ -98,6 +108,9 @@ impl AxisSetup {
         }
         for index in MAX_TORQUES {
             found.extend(set(index).and_then(|n| self.max_torque(index, n)));
+        }
+        if let (Some(nominal), Some(most)) = (set_in(NOMINAL_CURRENT), set_in(CURRENT_LIMIT)) {
+            found.extend(self.max_current(nominal, most));
         }
         found
     }
@@ -141,8 +154,16 @@ impl AxisSetup {
         }
     }
 
-    /// Checks 0x6080. CiA 402 counts it in rpm of the motor; some drives use the unit of 0x60A9.
-    fn speed(&self, raw: i64, unit: Option<VelocityUnit>) -> Option<LimitConflict> {
+    /// Checks a speed of the motor. CiA 402 counts 0x6080 in rpm; some drives use the unit of
+    /// 0x60A9. An ESI may give the unit.
+    fn speed(
+        &self,
+        (index, sub): (u16, u8),
+        raw: i64,
+        selection: &esi::Selection,
+    ) -> Option<LimitConflict> {
+        let item = selection.dictionary.item(index, sub);
+        let unit = item.and_then(|item| VelocityUnit::from_si_code(item.unit));
         let scale = &self.config.scale;
         let of_drive = scale.velocity_unit();
         let allowed = |unit| {
@@ -162,8 +183,8 @@ impl AxisSetup {
         };
         let name = &self.unit;
         Some(LimitConflict {
-            index: MAX_MOTOR_SPEED,
-            sub: 0,
+            index,
+            sub,
             text: format!(
                 "= {raw} {shown} allows {} {name}/s, `limits.velocity` is {} {name}/s{doubt}",
                 rounded(most),
@@ -234,6 +255,26 @@ impl AxisSetup {
         })
     }
 
+    /// Checks maxon's current limit. The rated torque is that of the nominal current.
+    fn max_current(&self, nominal: i64, raw: i64) -> Option<LimitConflict> {
+        let torque = &self.torque;
+        let is_known = torque.unit == super::TorqueUnit::Percent || torque.rated.is_some();
+        let most = raw as f64 / nominal as f64 * 100.0;
+        let limit = self.config.limits.torque;
+        let (index, sub) = CURRENT_LIMIT;
+        (is_known && exceeds(limit, most)).then(|| LimitConflict {
+            index,
+            sub,
+            text: format!(
+                "= {raw} mA, {nominal} mA nominal, allows {} {unit}, `limits.torque` is {} {unit}",
+                rounded(torque.shown(most)),
+                rounded(torque.shown(limit)),
+                unit = torque.unit,
+            ),
+            certain: true,
+        })
+    }
+
     /// Checks a torque limit in thousandths of the rated torque.
     fn max_torque(&self, index: u16, raw: i64) -> Option<LimitConflict> {
         let torque = &self.torque;
@@ -271,10 +312,50 @@ fn number(bytes: &[u8], signed: bool) -> i64 {
     }
 }
 
-/// Returns the unit of 0x6080 if the ESI gives it.
-pub(crate) fn speed_unit(selection: &esi::Selection) -> Option<VelocityUnit> {
-    let item = selection.dictionary.item(MAX_MOTOR_SPEED, 0)?;
-    VelocityUnit::from_si_code(item.unit)
+impl LimitConflict {
+    /// Returns `true` if positions repeat at the limit: the reported one would jump.
+    pub(crate) fn wraps(&self) -> bool {
+        esi::axis::of(self.index).is_some_and(|(_, same)| same == POSITION_RANGE)
+    }
+}
+
+/// The time at full speed within which the end of 32 bits is worth a note, in s.
+const SOON_S: f64 = 3600.0;
+
+/// Returns a note about a range of 32 bits on an endless axis. Some drives stop at its ends, others
+/// take it as no range.
+fn whole_range(axis: &AxisSetup, drive: impl Fn(u16, u8) -> Option<Vec<u8>>) -> Option<String> {
+    let config = &axis.config;
+    let modes = config.modes;
+    let has_range = config.limits.position.is_some();
+    if has_range || !(modes.contains(Mode::Csp) || modes.contains(Mode::Pp)) {
+        return None;
+    }
+    let end = |sub: u8| drive(SOFTWARE_LIMIT, sub).map(|bytes| number(&bytes, true));
+    let whole = (Some(i64::from(i32::MIN)), Some(i64::from(i32::MAX)));
+    let half = config.scale.units_of_counts(f64::from(i32::MAX));
+    let is_soon = half / config.limits.velocity < SOON_S;
+    (is_soon && (end(1), end(2)) == whole).then(|| {
+        let half = rounded(half);
+        format!(
+            "0x607d:01 and :02 are the whole range: some drives stop there, at {half} {}; 0 in both \
+             is not a limit",
+            axis.unit
+        )
+    })
+}
+
+/// Returns the bytes of an object after the start-up SDOs: those of an SDO, or the ESI's default.
+pub(super) fn after_startup(selection: &esi::Selection, index: u16, sub: u8) -> Option<Vec<u8>> {
+    let mut written = selection.startup.iter().rev();
+    match written.find(|sdo| (sdo.index, sdo.sub) == (index, sub)) {
+        Some(sdo) => Some(sdo.data.clone()),
+        None => {
+            let item = selection.dictionary.item(index, sub);
+            let default = item.filter(|item| item.has_default)?;
+            Some(default.default.to_vec())
+        }
+    }
 }
 
 /// Checks the limits that the file's `sdo` entries and the ESI set in the drive. Returns what need
@@ -285,39 +366,23 @@ pub(super) fn check(
     selection: &esi::Selection,
     p: &mut Problems<'_>,
 ) -> Vec<String> {
-    let written = |index: u16, sub: u8| {
-        let mut all = selection.startup.iter().rev();
-        all.find(|sdo| (sdo.index, sdo.sub) == (index, sub))
-    };
-    let drive = |index: u16, sub: u8| match written(index, sub) {
-        Some(sdo) => Some(sdo.data.clone()),
-        None => {
-            let item = selection.dictionary.item(index, sub);
-            let default = item.filter(|item| item.has_default)?;
-            Some(default.default.to_vec())
-        }
-    };
+    let drive = |index: u16, sub: u8| after_startup(selection, index, sub);
     let mut notes = Vec::new();
-    for conflict in axis.exceeded(drive, speed_unit(selection)) {
+    for conflict in axis.exceeded(drive, selection) {
         let object = (conflict.index, conflict.sub);
         let own = sdos.iter().rev().find(|s| s.address() == object);
         match own {
             Some(own) if conflict.certain => {
-                let hint = "lower the limit of the axis, or let the drive allow more";
+                let hint = match conflict.wraps() {
+                    true => "write 0 to 0x607B:01 and :02: ecaxis counts on where 32 bits end",
+                    false => "lower the limit of the axis, or let the drive allow more",
+                };
                 p.add_hint(own.value.span(), conflict.to_string(), hint);
             }
             Some(_) => notes.push(conflict.to_string()),
             None => notes.push(format!("{conflict} (in the ESI; the drive is asked)")),
         }
     }
-    for own in sdos.iter().filter(|sdo| OFFSETS.contains(&sdo.index)) {
-        let (index, sub) = own.address();
-        let is_zero = written(index, sub).is_none_or(|sdo| sdo.data.iter().all(|b| *b == 0));
-        if !is_zero {
-            let object = NamedObject { index, sub };
-            let message = format!("{object} adds to every target of the axis, past its limits");
-            p.add_hint(own.value.span(), message, "write 0, or leave it out");
-        }
-    }
+    notes.extend(whole_range(axis, drive));
     notes
 }

@@ -7,6 +7,10 @@ use ecaxis_axis::{AccelerationUnit, Axis, ConfigError, Mode, Scale, VelocityUnit
 use ecaxis_ecat::index::AxisIndex;
 use ecaxis_esi as esi;
 
+use super::drive_limits::{LimitConflict, after_startup};
+use super::problem::Problems;
+use super::raw::RawSdo;
+use super::sdo::little_endian;
 use super::{Action, AxisSetup, HomingSetup, Machine, Step, TorqueSetup, TorqueUnit, UnitSource};
 
 /// An axis setup with the drive's units.
@@ -28,6 +32,8 @@ pub struct AdoptedUnits {
 pub enum UnitProblem {
     #[error("{0}")]
     Contradiction(UnitMismatch),
+    #[error("{0}: the drive's positions jump there")]
+    PositionRange(LimitConflict),
     #[error("0x6076:00 is not there, so torques in {unit} mean nothing")]
     NoRatedTorque { unit: &'static str },
     #[error("0x3001:05 says no torque constant, so torques in A mean nothing")]
@@ -64,6 +70,7 @@ impl AxisSetup {
         adopted.take_acceleration_unit(offered);
         adopted.take_torque_constant(offered);
         adopted.take_rated_torque(offered);
+        adopted.setup.rescale_torque_limit();
         let setup = &mut adopted.setup;
         let unit = setup.config.scale.velocity_unit();
         if let Err(source) = Axis::new(setup.config) {
@@ -95,6 +102,22 @@ impl AxisSetup {
         said.then(|| (rated * self.torque.counts_per_newton_metre).round() as u32)
     }
 
+    /// Returns `true` if the axis commands torques, whose direction must be that of its positions.
+    fn commands_torque(&self) -> bool {
+        let config = &self.config;
+        config.modes.contains(Mode::Cst) || config.loops.csp.acceleration != 0.0
+    }
+
+    /// Returns a note if no source gives the unit of the drive's velocities.
+    pub(crate) fn assumed_velocity_unit(&self) -> Option<String> {
+        let unit = self.config.scale.velocity_unit();
+        (self.velocity_unit_from == UnitSource::Nothing).then(|| {
+            format!(
+                "velocities are assumed to be in {unit}: the drive has no 0x60A9; write the unit of its manual as `velocity_unit`"
+            )
+        })
+    }
+
     /// Returns `true` if the axis would move by a wrong factor or in the wrong direction.
     fn is_wrong(&self, found: &UnitMismatch) -> bool {
         match *found {
@@ -120,8 +143,12 @@ impl AxisSetup {
                 self.torque.unit != TorqueUnit::Percent
                     && self.torque.rated_from != UnitSource::File
             }
-            // Position and velocity must have the same polarity.
-            UnitMismatch::Polarity { found } => matches!(found & 0xc0, 0x40 | 0x80),
+            UnitMismatch::GearAlone { .. } => found.is_impossible_gear(),
+            // Position and velocity must have the same polarity. CiA 402-2 does not say whether
+            // torques have it too, and drives differ.
+            UnitMismatch::Polarity { found } => {
+                matches!(found & 0xc0, 0x40 | 0x80) || self.commands_torque()
+            }
             _ => false,
         }
     }
@@ -240,6 +267,63 @@ impl AdoptedUnits {
     }
 }
 
+/// The objects from which counts per motor turn follow.
+const COUNTS: [u16; 3] = [0x608f, 0x6091, 0x6092];
+
+/// Checks the units that the file's `sdo` entries set in the drive, and those of the ESI. Returns
+/// what need not be an error.
+pub(super) fn check(
+    axis: &AxisSetup,
+    sdos: &[RawSdo],
+    selection: &esi::Selection,
+    p: &mut Problems<'_>,
+) -> Vec<String> {
+    let number = |index: u16, sub: u8| {
+        let bytes = after_startup(selection, index, sub)?;
+        u32::try_from(little_endian(&bytes, false)).ok()
+    };
+    let ratio = |index: u16| Some([number(index, 1)?, number(index, 2)?]);
+    let offered = DriveUnits {
+        encoder_resolution: ratio(0x608f),
+        gear_ratio: ratio(0x6091),
+        feed_constant: ratio(0x6092),
+        position_unit: number(0x60a8, 0),
+        velocity_unit: number(0x60a9, 0),
+        polarity: number(0x607e, 0).map(|polarity| polarity.to_le_bytes()[0]),
+        ..DriveUnits::default()
+    };
+    let written = |index: u16| sdos.iter().rev().find(|sdo| sdo.index == index);
+    let mut notes = Vec::new();
+    for found in offered.contradictions(&axis.config.scale, None) {
+        let (index, _) = found.object();
+        // An ESI's default is not what the drive holds, so it proves nothing.
+        let is_certain = !COUNTS.contains(&index)
+            || COUNTS.iter().all(|index| {
+                written(*index).is_some() || selection.dictionary.item(*index, 1).is_none()
+            });
+        let is_wrong = axis.is_wrong(&found);
+        match written(index) {
+            Some(own) if is_wrong && is_certain => {
+                p.add_hint(own.value.span(), found.to_string(), found.advice());
+            }
+            Some(_) => notes.push(found.to_string()),
+            None if is_wrong => notes.push(format!("{found} (in the ESI; the drive is asked)")),
+            None => {}
+        }
+    }
+    let has_velocity = |index: u16| {
+        let layout = &selection.layout;
+        layout.rx_field(index, 0).is_some() || layout.tx_field(index, 0).is_some()
+    };
+    if [0x606c, 0x60b1, 0x60ff, 0x6081]
+        .into_iter()
+        .any(has_velocity)
+    {
+        notes.extend(axis.assumed_velocity_unit());
+    }
+    notes
+}
+
 impl HomingSetup {
     /// Converts the SDOs' values to the drive's units.
     pub(super) fn rescale(&mut self, scale: &Scale, axis: u16) {
@@ -262,6 +346,7 @@ impl AdoptedUnits {
     /// Returns start-up SDOs whose values have changed.
     pub(crate) fn changed(&self, startup: &[esi::StartupSdo]) -> Vec<esi::StartupSdo> {
         let now = self.setup.homing.iter().flat_map(|h| &h.startup);
+        let now = now.chain(self.setup.torque_limit.startup());
         now.filter(|sdo| {
             let same = |s: &&esi::StartupSdo| (s.index, s.sub) == (sdo.index, sdo.sub);
             startup

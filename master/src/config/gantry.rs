@@ -116,6 +116,14 @@ fn join(
     let [a, b] = names.map(|name| name.get_ref());
     for (half, name) in [(&*first, names[0]), (&*second, names[1])] {
         let config = &half.config;
+        if config.mode_change_unpowered {
+            let message = format!("`{}` has `mode_change = \"no-power\"`", name.get_ref());
+            p.add_hint(
+                name.span(),
+                message,
+                "homing would remove the power of one half: use drives that change their mode with power",
+            );
+        }
         if config.mode != Mode::Csp {
             let message = format!("`{}` is not in CSP", name.get_ref());
             let hint = "write `mode = \"csp\"`: both halves of a gantry follow positions";

@@ -117,6 +117,8 @@ pub struct GatewaySetup {
 pub struct NodeSetup {
     /// The node-ID.
     pub id: u8,
+    /// The line of its `[[device.node]]` in the machine file.
+    pub line: u32,
     /// The model of the drive.
     pub drive: &'static str,
     /// The gateway's selection with the process data of this node alone. Objects that do the work
@@ -221,7 +223,7 @@ type Links = fn(&NodeSetup) -> &[PdoLink];
 const LINKS: [Links; 2] = [|node| &node.outputs, |node| &node.inputs];
 
 impl NodeSetup {
-    fn new(node: &NodeOptions, gateway: &esi::Selection) -> Self {
+    fn new(node: &NodeOptions, gateway: &esi::Selection, line: u32) -> Self {
         let each = |links: &[PdoLink], defaults| -> Vec<PdoLink> {
             links.iter().map(|link| explicit(link, defaults)).collect()
         };
@@ -239,6 +241,7 @@ impl NodeSetup {
         };
         Self {
             id: node.id,
+            line,
             drive: node.drive.name(),
             selection,
             outputs,
@@ -354,7 +357,7 @@ pub(super) fn check(
         node.inputs = raw.inputs.iter().map(|raw| link(raw, true)).collect();
         node.outputs = raw.outputs.iter().map(|raw| link(raw, false)).collect();
         complete(&mut node, raw, folder, p)?;
-        let setup = NodeSetup::new(&node, selection);
+        let setup = NodeSetup::new(&node, selection, p.line(&raw.span));
         network.simulated.nodes.push(node);
         // Validated after each node, so that the error marks the right one.
         if let Err(error) = network.simulated.validate(device) {

@@ -14,6 +14,7 @@
 //! | `compensation.rs` | backlash and pitch error of an axis |
 //! | `second_encoder.rs` | the encoder at the load of an axis |
 //! | `copy.rs` | inputs that are copied to outputs |
+//! | `roles.rs` | the owner of each output bit, and what each input decides |
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
 //! | `locator.rs` | how a device is located on the bus |
 //! | `needed.rs` | objects that the file needs in the process data |
@@ -26,8 +27,11 @@
 //! | `drive_limits.rs` | the limits that the drive itself allows |
 //! | `sim.rs` | settings of the simulated bus: connections, clocks |
 //! | `sim_motor.rs` | the motor of a simulated axis |
+//! | `sim_quirks.rs` | how a simulated drive differs from the standard |
 //! | `travel.rs` | switches and ends along a simulated axis |
 //! | `units.rs` | names of position units |
+//! | `device_groups.rs` | groups that the machine goes on without |
+//! | `ebus.rs` | the supply of terminals |
 //! | `gantry.rs` | two axes that move as one |
 //! | `gateway.rs` | the CAN network behind a gateway, its nodes and their axes |
 //! | `mailbox_gateway.rs` | the mailbox gateway for other vendors' tools |
@@ -49,12 +53,15 @@ mod check;
 mod compensation;
 mod copy;
 mod csv;
+pub(crate) mod cycle_objects;
 mod device;
+mod device_groups;
 #[cfg(test)]
 mod documented;
 pub(crate) mod drive_limits;
 mod drive_units;
 pub mod duration;
+mod ebus;
 mod eoe;
 #[macro_use]
 mod fields;
@@ -70,6 +77,7 @@ mod position_output;
 mod problem;
 mod program;
 mod raw;
+pub(crate) mod roles;
 pub mod schema;
 mod sdo;
 mod second_encoder;
@@ -77,6 +85,7 @@ mod signal;
 pub mod sim;
 mod sim_input;
 mod sim_motor;
+mod sim_quirks;
 mod startup;
 pub mod state_timeouts;
 pub(crate) mod steps;
@@ -88,6 +97,7 @@ mod travel;
 mod units;
 
 pub use crate::text::nearest;
+pub use axis::TorqueLimit;
 pub(crate) use axis::is_maxon;
 pub use axis_setup::{AxisSetup, HomingSetup, TorqueSetup, TorqueUnit, UnitSource};
 pub use cam::NamedCam;
@@ -106,6 +116,9 @@ pub use problem::{ConfigError, Problem};
 pub use program::{
     Action, AxisValue, Bound, NamedSignal, NumberPlace, ProgramInputs, Step, StopGroup, StopSetup,
     Subject, SwitchedInput, Test, Variable, VariableRef, VariableUse, When,
+};
+pub use roles::{
+    InputRole, InputUse, OutputOwner, OwnedOutput, OwnerKind, ProcessDataRoles, ReturnRule,
 };
 pub use signal::{NameError, Signal};
 pub use startup::{Startup, StartupOptions};
@@ -167,6 +180,8 @@ pub struct Machine {
     pub switched: Vec<SwitchedInput>,
     pub copies: Vec<CopySetup>,
     pub position_outputs: Vec<PositionOutputSetup>,
+    /// The owners of the outputs, and what the inputs decide.
+    pub roles: ProcessDataRoles,
     pub stop: StopSetup,
     pub overrides: OverrideConfig,
     /// The set-point tables that the steps play.
@@ -301,6 +316,7 @@ pub struct DeviceConfig {
     /// The EEPROM image that the file names.
     pub sii: Option<Arc<SiiImage>>,
     pub mailbox: MailboxSource,
+    pub watchdog_trigger: WatchdogTrigger,
     pub device: Arc<esi::Device>,
     pub selection: esi::Selection,
     pub startup: Startup,
@@ -366,6 +382,18 @@ pub enum MailboxSource {
     Eeprom,
 }
 
+/// Whether outputs trigger the SyncManager watchdog of their device (bit 6 of the ControlByte).
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum WatchdogTrigger {
+    /// Those of an axis do; a device that refuses this gets the ControlByte of its ESI.
+    #[default]
+    Preferred,
+    /// They do, or the bring-up fails.
+    Required,
+    /// As the ESI says.
+    Esi,
+}
+
 impl Machine {
     /// Returns the group's name in the machine file; empty for group 0, which has no name.
     #[must_use]
@@ -398,6 +426,13 @@ impl Machine {
             .enumerate()
             .filter(|(d, _)| self.group_of(*d) == group);
         group != GroupIndex::MACHINE && own.all(|(_, device)| device.optional)
+    }
+
+    /// Returns true if an axis is in the group.
+    #[must_use]
+    pub fn has_axes(&self, group: GroupIndex) -> bool {
+        let mut axes = self.axes.iter();
+        axes.any(|axis| self.group_of(axis.device) == group)
     }
 
     /// Returns the group of an axis: that of its device.
@@ -456,6 +491,7 @@ impl Machine {
             cams: self.cams.iter().map(|named| named.cam.clone()).collect(),
             line_shafts: self.line_shafts.iter().map(|setup| setup.shaft).collect(),
             copies: self.copies.iter().map(CopySetup::rt).collect(),
+            output_locks: self.roles.output_locks(),
             repeats: device::repeats(&self.devices),
         }
     }

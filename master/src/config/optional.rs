@@ -62,7 +62,13 @@ impl OptionalPlaces {
             } else if group.is_none_or(|group| group.outside != GroupStopScope::Continue) {
                 (
                     format!("the machine stops without `{name}`"),
-                    format!("add a [[stop.group]] with `{name}` and `outside = \"continue\"`"),
+                    format!(
+                        "add a [[stop.group]] with `{} = [\"{name}\"]` and `outside = \"continue\"`",
+                        match device.selection.mode {
+                            Some(_) => "axes",
+                            None => "devices",
+                        }
+                    ),
                 )
             } else if let Some(other) = other {
                 (
@@ -71,13 +77,6 @@ impl OptionalPlaces {
                         other.name
                     ),
                     "write a group for optional devices alone".to_owned(),
-                )
-            } else if program.outputs.iter().any(|signal| signal.device == index) {
-                (
-                    format!(
-                        "steps set outputs of `{name}`, which would be switched on as soon as it appears"
-                    ),
-                    "leave them out of the steps".to_owned(),
                 )
             } else if device.selection.dc.is_some() && !devices.iter().any(|d| steady(&d)) {
                 (

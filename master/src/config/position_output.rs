@@ -4,10 +4,11 @@ use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use toml::Spanned;
 
 use super::Signal;
-use super::copy::OutputWriter;
+use super::copy::BitRange;
 use super::fields::KeyExt;
 use super::problem::{Problems, suggestion};
 use super::raw::RawPositionOutput;
+use super::roles::{OutputOwner, OwnerKind, ProcessDataRoles};
 use super::signal::{self, SignalDirection};
 use super::steps::{Program, ResolvedAxis, ResolvedDevice};
 use crate::rt::position_output::PositionTrigger;
@@ -21,38 +22,38 @@ pub struct PositionOutputSetup {
     pub line: u32,
 }
 
-/// Checks the outputs. `writers`: those that something else writes.
+/// Checks the outputs, and makes each the property of its `[[position_output]]`.
 pub(crate) fn check(
     raw: &[RawPositionOutput],
     devices: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
     axes: &IndexVec<AxisIndex, ResolvedAxis<'_>>,
     program: &Program,
-    writers: &[OutputWriter],
+    roles: &mut ProcessDataRoles,
     p: &mut Problems<'_>,
 ) -> Vec<PositionOutputSetup> {
     let mut all: Vec<PositionOutputSetup> = Vec::new();
     for raw in raw {
         let output = raw.output.as_ref();
-        let output = output.and_then(|text| one_bit(text, devices, program, writers, &all, p));
+        let line = p.line(&raw.span);
+        let output = output.and_then(|text| one_bit(text, devices, program, (roles, line), p));
         let trigger = trigger(raw, axes, p);
         if let (Some(output), Some(trigger)) = (output, trigger) {
             all.push(PositionOutputSetup {
                 output,
                 trigger,
-                line: p.line(&raw.span),
+                line,
             });
         }
     }
     all
 }
 
-/// Returns an output of one bit that nothing else writes.
+/// Returns an output of one bit, owned by the `[[position_output]]` in this line.
 fn one_bit(
     text: &Spanned<String>,
     devices: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
     program: &Program,
-    writers: &[OutputWriter],
-    others: &[PositionOutputSetup],
+    (roles, line): (&mut ProcessDataRoles, u32),
     p: &mut Problems<'_>,
 ) -> Option<Signal> {
     let named = program.signals.iter().find(|s| s.name == *text.get_ref());
@@ -73,19 +74,9 @@ fn one_bit(
         );
         return None;
     }
-    let other = others.iter().find(|other| other.output == output);
-    let other =
-        other.map(|other| format!("switched by the position_output in line {}", other.line));
-    let taken = other.or_else(|| {
-        let mut writers = writers.iter();
-        writers.find_map(|writer| Some(writer.conflict(&output)?.to_owned()))
-    });
-    if let Some(writer) = taken {
-        let message = format!("`{}` is {writer}", output.name);
-        p.add_hint(text.span(), message, "an output has one writer");
-        return None;
-    }
-    Some(output)
+    let owner = OutputOwner::new(OwnerKind::PositionOutput, "", line);
+    let owned = roles.claim_at(BitRange::of(&output), owner, text.span(), p);
+    owned.then_some(output)
 }
 
 fn trigger(

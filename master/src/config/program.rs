@@ -384,7 +384,7 @@ impl AxisValue {
             Self::Enabled => yes(status.ready),
             Self::Moving => yes(status.moving),
             Self::AtRest => yes(status.at_rest),
-            Self::Homed => yes(status.homed),
+            Self::Homed => yes(status.homed()),
             Self::Fault => yes(status.fault.is_some() || status.trip.is_some()),
         }
     }

@@ -52,21 +52,42 @@ pub(crate) fn encode(
         }
     };
     let bytes = bytes(value, data_type)?;
-    if let (Some(item), SdoValue::Integer(n)) = (item, value) {
-        let signed = data_type.kind == Kind::Signed;
-        let low = item.min.as_deref().map(|b| little_endian(b, signed));
-        let high = item.max.as_deref().map(|b| little_endian(b, signed));
-        let n = i128::from(*n);
-        if low.is_some_and(|low| n < low) || high.is_some_and(|high| n > high) {
-            let end = |e: Option<i128>| e.map_or("…".to_owned(), |e| e.to_string());
-            let range = format!("{} to {}", end(low), end(high));
-            return Err((format!("{n} is outside what the ESI allows, {range}"), None));
-        }
+    if let (Some(item), SdoValue::Integer(_)) = (item, value)
+        && let Some(problem) = outside_range(item, data_type.kind, &bytes)
+    {
+        return Err((problem, None));
     }
     Ok(bytes)
 }
 
-fn little_endian(bytes: &[u8], signed: bool) -> i128 {
+/// Returns the problem with a value that ecaxis derives, if the ESI's range excludes it.
+pub(crate) fn outside_esi_range(item: &ObjectItem, data: &[u8]) -> Option<String> {
+    let data_type = DataType::named(&item.type_name, item.bit_len)?;
+    outside_range(item, data_type.kind, data)
+}
+
+fn outside_range(item: &ObjectItem, kind: Kind, data: &[u8]) -> Option<String> {
+    if !matches!(kind, Kind::Signed | Kind::Unsigned) {
+        return None;
+    }
+    let signed = kind == Kind::Signed;
+    let number = |bytes: &[u8]| little_endian(bytes, signed);
+    let low = item.min.as_deref().map(number);
+    let high = item.max.as_deref().map(number);
+    // Files write 0 to 0 where they define no range.
+    if low.zip(high).is_some_and(|(low, high)| low >= high) {
+        return None;
+    }
+    let n = number(data);
+    let is_outside = low.is_some_and(|low| n < low) || high.is_some_and(|high| n > high);
+    is_outside.then(|| {
+        let end = |e: Option<i128>| e.map_or("…".to_owned(), |e| e.to_string());
+        let range = format!("{} to {}", end(low), end(high));
+        format!("{n} is outside what the ESI allows, {range}")
+    })
+}
+
+pub(crate) fn little_endian(bytes: &[u8], signed: bool) -> i128 {
     let negative = signed && bytes.last().is_some_and(|b| b & 0x80 != 0);
     let mut all = [if negative { 0xff } else { 0 }; 16];
     for (to, from) in all.iter_mut().zip(bytes) {

@@ -7,6 +7,7 @@ use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use super::fields::KeyExt;
 use super::problem::{Problems, Span};
 use super::raw::RawSecondEncoder;
+use super::roles::{InputUse, ProcessDataRoles, UsedInput};
 use super::signal::{self, SignalDirection};
 use super::steps::ResolvedDevice;
 use super::{AxisSetup, Signal, StopSetup};
@@ -77,7 +78,13 @@ pub(crate) fn check(
 impl CheckedEncoder {
     /// Adds the encoder to its axis. Both must stop together: the axis would move without the
     /// encoder.
-    pub(crate) fn add_to(self, axes: &mut [AxisSetup], stop: &StopSetup, p: &mut Problems<'_>) {
+    pub(crate) fn add_to(
+        self,
+        axes: &mut [AxisSetup],
+        stop: &StopSetup,
+        roles: &mut ProcessDataRoles,
+        p: &mut Problems<'_>,
+    ) {
         let group = |device| stop.groups.iter().position(|g| g.devices.contains(&device));
         let Some(axis) = axes.iter_mut().find(|axis| axis.name == self.axis) else {
             return;
@@ -91,6 +98,12 @@ impl CheckedEncoder {
             p.add_hint(self.place, message, hint);
             return;
         }
+        let used = UsedInput {
+            usage: InputUse::SecondEncoder,
+            signal: self.input.clone(),
+            place: self.place,
+        };
+        roles.add_input(&used, Some(axis.device), stop, p);
         axis.config.second_encoder = Some(self.encoder);
         axis.second_encoder = Some(self.input);
     }

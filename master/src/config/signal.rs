@@ -7,9 +7,9 @@ use ecaxis_esi::layout::Field;
 
 use toml::Spanned;
 
-use super::copy::bits_of;
 use super::problem::{Problems, suggestion};
 use super::raw::RawSignal;
+use super::roles::OwnerKind;
 use super::steps::ResolvedDevice;
 use super::{AxisRef, DeviceConfig, InputRef, Machine, OutputRef};
 use crate::rt::image::NumericFormat;
@@ -50,13 +50,6 @@ impl Signal {
         }
     }
 }
-
-/// Objects that only the axes write (CiA 402, ETG.6010).
-const AXIS_OUTPUTS: [u16; 11] = [
-    0x6040, 0x6060, 0x6071, 0x607a, 0x6081, 0x6083, 0x6084, 0x60b1, 0x60b2, 0x60b8, 0x60ff,
-];
-/// The position offset adds to the target position; the axis keeps it at zero.
-const POSITION_OFFSET: u16 = 0x60b0;
 
 /// The direction of a signal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -202,7 +195,7 @@ pub(crate) fn of_text(
     found.transpose()
 }
 
-/// Returns an output that no axis writes, from a text such as `io.Output 3`.
+/// Returns an output from a text such as `io.Output 3`.
 pub(crate) fn output_of_text(
     text: &Spanned<String>,
     devices: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
@@ -225,7 +218,7 @@ pub(crate) fn output_of_text(
     resolve(&raw, devices, SignalDirection::Out, p)
 }
 
-/// Returns an input of the machine, or an output that no axis writes.
+/// Returns an input or an output of the machine.
 pub(crate) fn resolve(
     raw: &RawSignal,
     devices: &IndexVec<DeviceIndex, ResolvedDevice<'_>>,
@@ -331,22 +324,6 @@ pub(super) fn field<'d>(
     }
 }
 
-/// Returns why only the axis of a device may write an output.
-pub(super) fn reserved_for_axis(field: &Field, device: &DeviceConfig) -> Option<&'static str> {
-    device.selection.mode?;
-    let (axis, same) = esi::axis::of(field.index)?;
-    let is_used = device.selection.axes.contains(&axis);
-    if same != POSITION_OFFSET && !AXIS_OUTPUTS.contains(&same) {
-        None
-    } else if !is_used {
-        Some("belongs to an axis of the drive that is not used")
-    } else if same == POSITION_OFFSET {
-        Some("adds to the axis' target, past its limits")
-    } else {
-        Some("is written by the axis itself")
-    }
-}
-
 fn one(
     wanted: &str,
     way: SignalDirection,
@@ -366,15 +343,6 @@ fn one(
             "numbers have 64 bits at most",
         ));
     }
-    if way == SignalDirection::Out
-        && let Some(why) = reserved_for_axis(field, device)
-    {
-        let message = format!("`{}` {why}", signal.name);
-        return Err(NameError::of_signal(
-            message,
-            "give the axis a command instead",
-        ));
-    }
     Ok(signal)
 }
 
@@ -389,7 +357,11 @@ impl Machine {
             let fields = candidates.fields.iter();
             let named =
                 fields.filter_map(|field| one(&candidates.name(field), way, index, device).ok());
-            named.collect()
+            let free = |signal: &Signal| {
+                let conflict = || self.roles.command_conflict(signal, OwnerKind::Controller);
+                way == SignalDirection::In || conflict().is_none()
+            };
+            named.filter(free).collect()
         })
     }
 
@@ -417,46 +389,35 @@ impl Machine {
         Ok(InputRef(known(&mut self.inputs, signal)))
     }
 
-    /// Returns an output that no axis writes. Names are as for inputs.
+    /// Returns an output for a controller. Names are as for inputs.
     ///
     /// # Errors
-    /// Fails if no output or several outputs have this name, if an axis or a copy writes it, or if
-    /// it releases a brake.
+    /// Fails if no output or several outputs have this name, or if it has another owner
+    /// ([`ProcessDataRoles`](super::ProcessDataRoles)).
     pub fn output(&mut self, device: &str, name: &str) -> Result<OutputRef, NameError> {
         let signal = self.signal(device, name, SignalDirection::Out)?;
-        let mut axes = self.axes.iter();
-        if let Some(axis) = axes.find(|axis| axis.brake_output.as_ref() == Some(&signal)) {
-            return Err(NameError {
-                message: format!("`{}` opens the brake of `{}`", signal.name, axis.name),
-                hint: "the axis opens and closes its brake".to_owned(),
-                device: false,
-            });
-        }
-        let mut positions = self.position_outputs.iter();
-        if let Some(setup) = positions.find(|setup| setup.output == signal) {
-            return Err(NameError::of_signal(
-                format!(
-                    "`{}` is switched by the position_output in line {}",
-                    signal.name, setup.line
-                ),
-                "an output has one writer",
-            ));
-        }
-        let bits = bits_of(&signal.field);
-        let mut copies = self.copies.iter();
-        if let Some(copy) = copies.find(|copy| copy.to.overlaps(signal.device, &bits)) {
-            return Err(NameError::of_signal(
-                format!(
-                    "`{}` is written by the copy in line {}",
-                    signal.name, copy.line
-                ),
-                "an output has one writer",
-            ));
-        }
+        self.claim_output(signal, OwnerKind::Controller)
+    }
+
+    fn claim_output(&mut self, signal: Signal, owner: OwnerKind) -> Result<OutputRef, NameError> {
+        let claimed = self.roles.claim_command(&signal, owner);
+        claimed.map_err(|conflict| NameError::of_signal(conflict.message, conflict.hint))?;
         Ok(OutputRef(known(&mut self.outputs, signal)))
     }
 
-    /// Makes all inputs readable, and all outputs settable that nothing else writes. Leaves out
+    /// Fails if clients may not set an output: it has no such name, or another owner.
+    ///
+    /// # Errors
+    /// As [`Machine::output`].
+    pub fn check_client_output(&self, device: &str, name: &str) -> Result<(), NameError> {
+        let signal = self.signal(device, name, SignalDirection::Out)?;
+        let conflict = self.roles.command_conflict(&signal, OwnerKind::Client);
+        conflict.map_or(Ok(()), |conflict| {
+            Err(NameError::of_signal(conflict.message, conflict.hint))
+        })
+    }
+
+    /// Makes all inputs readable, and all outputs without another owner settable by clients. Leaves out
     /// fields of more than 64 bits. `inputs` then has one signal for each input.
     pub fn use_all_signals(&mut self) -> Vec<(OutputRef, Signal)> {
         let mut names = Vec::new();
@@ -475,7 +436,9 @@ impl Machine {
                     let _ = self.input(&device, &name);
                 }
                 SignalDirection::Out => {
-                    if let Ok(output) = self.output(&device, &name)
+                    let signal = self.signal(&device, &name, SignalDirection::Out);
+                    let claimed = signal.and_then(|s| self.claim_output(s, OwnerKind::Client));
+                    if let Ok(output) = claimed
                         && !outputs.iter().any(|(known, _)| *known == output)
                     {
                         outputs.push((output, self.outputs[output.0].clone()));

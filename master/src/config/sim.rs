@@ -1,13 +1,16 @@
 //! `[device.sim]`: settings of a device on the simulated bus.
 
+use ecaxis_esi as esi;
+use ecaxis_esi::{Device, EsiFile};
 use ecaxis_sim::gateway::GatewayOptions;
 use ecaxis_sim::network::topology::Media;
-use ecaxis_sim::{Medium, PortRequest, Topology, TopologyError};
+use ecaxis_sim::{Medium, PortRequest, Quirks, Topology, TopologyError};
 
 use super::fields::KeyExt;
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawDevice, RawSim};
 use super::sim_motor::{self, MotorSetup};
+use super::sim_quirks;
 use super::travel::{self, TrackSetup};
 use super::{AxisSetup, DeviceConfig, Locator};
 
@@ -30,12 +33,17 @@ pub struct SimSetup {
     pub jitter_ns: u32,
     /// The time from a request in AL control to the answer in AL status.
     pub state_change_ns: Option<u64>,
+    /// The modules in the slots as (place, identity); `None`: those that the device is configured
+    /// with.
+    pub modules: Option<Vec<(usize, u32)>>,
     /// The network behind a gateway.
     pub gateway: Option<GatewayOptions>,
     /// The switches and ends along a drive's axis.
     pub track: TrackSetup,
     /// The motor of a drive's axis.
     pub motor: MotorSetup,
+    /// How the device differs from the standard.
+    pub quirks: Quirks,
 }
 
 /// The maximum drift. Crystals are far better.
@@ -81,15 +89,47 @@ pub(crate) fn check(
             .and_then(|ns| u32::try_from(ns).ok())
             .unwrap_or(0),
         state_change_ns: raw.state_change.value(),
+        modules: None,
         gateway: None,
         motor: raw
             .motor
             .map(|raw| sim_motor::check(&raw, axis, p))
             .unwrap_or_default(),
+        quirks: raw
+            .quirks
+            .map(|raw| sim_quirks::check(&raw, axis, p))
+            .unwrap_or_default(),
         track: raw
             .track
             .and_then(|raw| travel::check(&raw, axis, p))
             .unwrap_or_default(),
+    }
+}
+
+/// Returns the modules that the simulated device has in its slots, as (place, identity). `None`
+/// without such a key, or if a module does not fit.
+pub(crate) fn modules(
+    raw: &RawSim,
+    (file, device): (&EsiFile, &Device),
+    cycle_ns: u64,
+    p: &mut Problems<'_>,
+) -> Option<Vec<(usize, u32)>> {
+    let key = raw.modules.as_ref()?;
+    let names: Vec<&str> = key.get_ref().iter().map(String::as_str).collect();
+    let choice = esi::SelectOptions {
+        modules: Some(&names),
+        cycle_ns,
+        ..esi::SelectOptions::default()
+    };
+    match esi::select(file, device, &choice) {
+        Ok(selection) => {
+            let plugged = selection.modules.iter();
+            Some(plugged.map(|m| (m.place, m.ident)).collect())
+        }
+        Err(error) => {
+            p.add(key.span(), error.to_string());
+            None
+        }
     }
 }
 

@@ -1,5 +1,7 @@
 //! Options for start-up SDOs besides writing them.
 
+use ecaxis_esi::StartupSdo;
+
 use super::raw::RawDevice;
 
 /// The options of a device's start-up SDOs.
@@ -36,6 +38,18 @@ impl Startup {
         });
         let own = own.collect();
         Self { all, own }
+    }
+
+    /// Reads objects of derived start-up SDOs back, unless the file has options for them.
+    pub(crate) fn verify(&mut self, derived: &[StartupSdo]) {
+        for sdo in derived {
+            let options = StartupOptions {
+                verify: true,
+                ..self.all
+            };
+            // The last options win, and an `sdo` entry has precedence.
+            self.own.insert(0, (sdo.index, sdo.sub, options));
+        }
     }
 
     /// Returns the options of IDNs (SoE).

@@ -29,6 +29,7 @@ use super::raw::{
     Levels, NamedValues, RawAction, RawAxes, RawNumber, RawOverride, RawProgram, RawSimulation,
     RawStep, RawStop, RawVariable, TimeLimit,
 };
+use super::roles::{InputUse, UsedInput};
 use super::subprograms::MOST_STEPS;
 use super::{
     Action, AxisSetup, DeviceConfig, NamedCam, NamedSignal, NumberPlace, OverrideConfig,
@@ -93,6 +94,8 @@ pub(crate) struct Program {
     pub overrides: OverrideConfig,
     pub steps: Vec<Step>,
     pub inputs: Vec<Signal>,
+    /// What the inputs decide, each with its place.
+    pub used: Vec<UsedInput>,
     pub outputs: Vec<Signal>,
     /// For each output, the first place that sets it.
     pub output_places: Vec<Span>,
@@ -129,6 +132,8 @@ pub(crate) fn check(
         paths: known.paths,
         tables: known.tables.to_vec(),
         inputs: Vec::new(),
+        used: Vec::new(),
+        usage: InputUse::Condition,
         outputs: Vec::new(),
         output_places: Vec::new(),
         count: 0,
@@ -153,10 +158,13 @@ pub(crate) fn check(
     if p.count() == before {
         checker.flow(&steps, repeat, p);
     }
-    let mut button = |raw: Option<Spanned<_>>| raw.and_then(|raw| checker.when(raw.get_ref(), p));
+    let mut button = |raw: Option<Spanned<_>>, usage| {
+        checker.usage = usage;
+        raw.and_then(|raw| checker.when(raw.get_ref(), p))
+    };
     let buttons = ProgramInputs {
-        pause: button(buttons.pause),
-        step: button(buttons.step),
+        pause: button(buttons.pause, InputUse::Pause),
+        step: button(buttons.step, InputUse::Step),
     };
     let stop = checker.stop(&stop, p);
     checker.check_groups(&steps, &stop, p);
@@ -168,6 +176,7 @@ pub(crate) fn check(
         overrides,
         steps,
         inputs: checker.inputs,
+        used: checker.used,
         outputs: checker.outputs,
         output_places: checker.output_places,
         tables: checker.tables,
@@ -189,6 +198,9 @@ struct ProgramChecker<'c> {
     paths: &'c [NamedPath],
     tables: Vec<Table>,
     inputs: Vec<Signal>,
+    /// What the inputs decide, and what those decide that are being checked.
+    used: Vec<UsedInput>,
+    usage: InputUse,
     outputs: Vec<Signal>,
     output_places: Vec<Span>,
     count: usize,

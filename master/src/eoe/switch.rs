@@ -1,7 +1,7 @@
 //! A learning switch (IEEE 802.1D, without spanning tree: its ports form no loop). Pure: it decides
 //! to which ports a frame goes.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 
 use ecaxis_ecat::mailbox::eoe::{MAX_FRAME, MIN_FRAME, MacAddress};
 
@@ -40,7 +40,7 @@ struct Place {
 /// The addresses that a switch has learned.
 #[derive(Debug, Clone, Default)]
 pub struct Switch {
-    addresses: HashMap<MacAddress, Place>,
+    addresses: BTreeMap<MacAddress, Place>,
 }
 
 /// Returns true for the address of a group: a multicast or broadcast.
@@ -228,7 +228,7 @@ mod tests {
             frames in proptest::collection::vec((0..4_usize, 0..6_u8, 0..6_u8), 1..200),
         ) {
             let mut switch = Switch::default();
-            let mut places = HashMap::new();
+            let mut places = BTreeMap::new();
             for (now, (port, to, from)) in (0..).zip(frames) {
                 let from_port = PortNumber(port);
                 let frame = frame(address(to), address(from));

@@ -401,17 +401,19 @@ fn describe(folder: &Path, file: &Path) -> Record {
     Ok(devices(file, parsed))
 }
 
-fn devices(file: &Path, parsed: esi::EsiFile) -> Vec<Entry> {
+fn devices(file: &Path, mut parsed: esi::EsiFile) -> Vec<Entry> {
+    let skipped = std::mem::take(&mut parsed.skipped);
+    let vendor_name = |id| parsed.vendor_name(id).to_owned();
     let entry = |device: esi::DeviceHeader| Entry {
         file: file.to_owned(),
         vendor: device.identity.vendor,
-        vendor_name: parsed.vendor.name.clone(),
+        vendor_name: vendor_name(device.identity.vendor),
         product: device.identity.product,
         revision: device.identity.revision,
         type_name: device.type_name,
         name: device.name,
     };
-    parsed.skipped.into_iter().map(entry).collect()
+    skipped.into_iter().map(entry).collect()
 }
 
 /// Collects every `.xml` file below the folder.

@@ -154,8 +154,11 @@ impl Replay {
             let fits = |sent: &&mut RecordedExchange| {
                 index(&sent.frame) == indices && same_shape(&sent.frame, &frame)
             };
-            let mut recent = sent.iter_mut().rev().take(AHEAD);
-            let own = recent.find(fits);
+            // No answer comes at once: that of a frame sent in the same moment is one to a frame that
+            // was sent before and repeated.
+            let earlier = |sent: &RecordedExchange| sent.frame.at < frame.at;
+            let recent = sent.iter_mut().rev().take(AHEAD);
+            let own = recent.filter(|sent| earlier(sent)).find(fits);
             let own = match own {
                 Some(own) => Some(own),
                 None => sent.last_mut(),

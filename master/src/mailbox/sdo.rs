@@ -22,6 +22,8 @@ pub struct CoeClient {
     pub(super) port: Port,
     /// A transfer ended without its last answer, which may still arrive.
     pub(super) unsettled: bool,
+    /// True if the answer to an earlier request may still arrive.
+    late_answer: bool,
     /// The object of the segmented transfer in progress, as far as known.
     pub(super) in_segments: Option<(u16, u8)>,
     /// Another program may have used the mailbox of a device with SoE alone.
@@ -33,6 +35,7 @@ impl CoeClient {
         Self {
             port: Port::new(layout),
             unsettled: true,
+            late_answer: true,
             in_segments: None,
             joins_soe: false,
         }
@@ -278,6 +281,7 @@ impl CoeClient {
         if std::mem::take(&mut self.joins_soe) {
             self.join_soe(w).await?;
         }
+        self.late_answer = self.unsettled;
         if self.unsettled {
             self.port.drain(w, DRAIN).await?;
         }
@@ -508,8 +512,8 @@ impl CoeClient {
             match Message::parse(self.port.message()) {
                 // Segments carry no address, and in an abort among them some devices leave it empty
                 // as well.
-                Ok(Message::Sdo(Answer::Abort { index, code, .. }))
-                    if in_segments || index == transfer.index =>
+                Ok(Message::Sdo(Answer::Abort { index, sub, code }))
+                    if in_segments || !self.late_answer || transfer.may_abort_with(index, sub) =>
                 {
                     self.port.answered();
                     return Err(transfer.failure(CoeCause::Abort(code)));

@@ -53,6 +53,15 @@ impl Transfer {
         }
     }
 
+    /// True if an abort of this object answers this transfer, although an earlier answer may still
+    /// arrive. Slave stacks that write the command as a 16-bit word clear the low byte of the index,
+    /// so the late abort of a neighbouring object with the same subindex is taken, too. Some
+    /// leave the subindex 0, and with complete access they differ in it.
+    pub(super) const fn may_abort_with(&self, index: u16, sub: u8) -> bool {
+        let is_index = index == self.index || index == self.index & 0xff00;
+        is_index && (sub == self.sub || sub == 0 || self.complete)
+    }
+
     pub(super) fn trouble(&self, port: &Port, trouble: TransportError) -> TransferFailure {
         let set_aside = port.forgotten.saturating_sub(self.forgotten);
         self.failure(explain(port, trouble, set_aside))

@@ -8,7 +8,7 @@ use ecaxis_ecat::mailbox::{
     abort_code, error_body, foe,
 };
 
-use crate::config::Machine;
+use crate::config::{Machine, cycle_objects};
 use crate::mailbox::{MailboxLayout, RawMessage};
 
 /// FoE: access denied (ETG.1000.6 Table 93).
@@ -19,14 +19,6 @@ const INFORMATION: [u8; 3] = [1, 3, 5];
 const SOE_READ: u8 = 1;
 /// SoE: the bits of the opcode.
 const SOE_OPCODE: u8 = 0x07;
-
-/// Objects of the CiA 402 profile that the cycle writes, or whose values it is built on. Further
-/// axes have theirs 0x800 higher.
-const DRIVE: [u16; 10] = [
-    0x6040, 0x6060, 0x6071, 0x607a, 0x60b0, 0x60b1, 0x60b2, 0x60b8, 0x60c2, 0x60ff,
-];
-const DRIVES: std::ops::RangeInclusive<u16> = 0x6000..=0x9fff;
-const DRIVE_DISTANCE: u16 = 0x800;
 
 /// The rights of all clients.
 #[derive(Debug)]
@@ -45,15 +37,7 @@ struct CycleObjects {
 
 impl CycleObjects {
     fn contains(&self, index: u16) -> bool {
-        let drive = || {
-            let offset = index.wrapping_sub(*DRIVES.start()) % DRIVE_DISTANCE;
-            DRIVES.contains(&index) && DRIVE.contains(&(DRIVES.start() + offset))
-        };
-        match index {
-            // PDO assignment, synchronisation, PDO contents.
-            0x1c10..=0x1c3f | 0x1600..=0x17ff | 0x1a00..=0x1bff => true,
-            _ => self.outputs.contains(&index) || self.is_drive && drive(),
-        }
+        self.outputs.contains(&index) || cycle_objects::contains(index, self.is_drive)
     }
 }
 

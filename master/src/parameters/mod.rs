@@ -1,6 +1,7 @@
 //! Parameters of a device: found by name or number, and saved to files. `acyclic::parameters` reads and
 //! writes them.
 //!
+//! - [`class`]: what may be copied from one device to another;
 //! - [`dump`]: parameter files;
 //! - [`kept`]: the parameter file of a device of a machine;
 //! - [`lookup`]: finds an object by number or name;
@@ -10,6 +11,7 @@ use ecaxis_esi::{Dictionary, Object, ObjectItem, Writable};
 
 use crate::mailbox::NamedObject;
 
+pub mod class;
 pub mod dump;
 pub mod kept;
 pub mod lookup;

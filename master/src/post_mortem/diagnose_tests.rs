@@ -322,7 +322,7 @@ fn diagnose_names_device_and_cause() {
             report::Cause::NotEnabled {
                 state: ecaxis_axis::State::SwitchOnDisabled,
                 statusword: 0x0240,
-                mode_confirmed: true,
+                waiting: None,
                 code: None,
                 timeout_ms: 5000,
             }

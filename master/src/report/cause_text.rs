@@ -1,5 +1,6 @@
 //! Texts of causes.
 
+use ecaxis_axis::EnableBlocker;
 use ecaxis_axis::cia402::describe;
 
 use crate::config::UnitProblem;
@@ -23,11 +24,15 @@ pub(super) fn al_note(al_status: Option<(u8, u16)>) -> String {
     }
 }
 
-pub(super) fn mode_note(confirmed: bool) -> &'static str {
-    if confirmed {
-        ""
-    } else {
-        ", the drive has not taken over the mode of operation"
+/// Names what an axis waits for, if the Statusword does not show it.
+pub(super) fn blocker_note(waiting: Option<EnableBlocker>) -> String {
+    match waiting {
+        Some(
+            blocker @ (EnableBlocker::Mode { .. }
+            | EnableBlocker::Follows { .. }
+            | EnableBlocker::Position),
+        ) => format!(", {blocker}"),
+        _ => String::new(),
     }
 }
 

@@ -42,10 +42,15 @@ pub enum StateError {
         actual: AlState,
         code: u16,
     },
-    #[error("did not reach {wanted} within {} ms, is in {actual}", timeout.as_millis())]
+    #[error(
+        "did not reach {wanted} within {} ms, is in {actual}{}",
+        timeout.as_millis(), code_of_timeout(*code)
+    )]
     Timeout {
         wanted: AlState,
         actual: AlState,
+        /// Some devices set the AL status code, and not the error bit.
+        code: u16,
         timeout: Duration,
     },
     #[error("no longer answers while it should go to {wanted}")]
@@ -57,7 +62,25 @@ pub enum StateError {
     },
 }
 
+fn code_of_timeout(code: u16) -> String {
+    match code {
+        0 => String::new(),
+        code => format!(
+            "; AL status code 0x{code:04x} ({}), without the error bit",
+            al_status_text(code)
+        ),
+    }
+}
+
 impl StateError {
+    /// Returns the AL status code of a device that did not reach the state; 0: none.
+    pub(crate) const fn code(&self) -> u16 {
+        match self {
+            Self::Refused { code, .. } | Self::Timeout { code, .. } => *code,
+            Self::Gone { .. } | Self::Wire { .. } => 0,
+        }
+    }
+
     pub(crate) fn with_device(self, device: &DeviceRef) -> Error {
         Cause::State(self).with_device(device)
     }

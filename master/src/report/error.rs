@@ -6,8 +6,9 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ecaxis_axis::setpoint::LineShaftEnd;
-use ecaxis_axis::{CommandError, Mode, State, Statusword, Trip};
+use ecaxis_axis::{CommandError, EnableBlocker, Mode, State, Statusword, Trip};
 
+use crate::config::duration::show;
 use crate::config::{LimitConflict, UnitProblem};
 use crate::link::{LinkError, OpenError};
 use crate::mailbox::{DatagramError, EoeError, EoeSetting, IdnElement, InfoError, SdoError};
@@ -16,7 +17,7 @@ use crate::rt::image::{NotMapped, TooLarge};
 use crate::rt::setpoint_generator::GeneratorError;
 use crate::text::rounded;
 
-use super::cause_text::{al_note, by, code_note, list, lost, lost_note, mode_note};
+use super::cause_text::{al_note, blocker_note, by, code_note, list, lost, lost_note};
 use super::error_place::{FailedStep, Location};
 use super::{DeviceRef, DriveReport, EepromError, StateError};
 use ecaxis_ecat::al_state::AlState;
@@ -24,6 +25,13 @@ use ecaxis_ecat::al_status_code::al_status_text;
 use ecaxis_ecat::mailbox::soe::ValueError;
 use ecaxis_esi::address;
 use ecaxis_esi::sii::{SiiError, SiiWarning};
+
+/// Modules that differ, as names of the `modules` key.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ModuleDifference {
+    pub expected: Vec<String>,
+    pub found: Vec<String>,
+}
 
 /// An error of the master: the step and the place at which it occurred, and its cause.
 #[derive(Debug, thiserror::Error)]
@@ -155,6 +163,17 @@ pub enum Cause {
     },
     #[error("the SubDevice at position {position} ({identity}) is not in the machine file")]
     Unexpected { position: u16, identity: String },
+    #[error(
+        "{refusal}; it detects the modules [{}] (0xF050), the file configures [{}]",
+        modules.found.join(", "),
+        modules.expected.join(", ")
+    )]
+    Modules {
+        modules: ModuleDifference,
+        refusal: Box<Cause>,
+    },
+    #[error("{cause}; it was not ready within {}", show(*timeout_ns))]
+    NotReady { timeout_ns: u64, cause: Box<Cause> },
     #[error("identify: the file `{esi}` describes {expected}, the device is {found}")]
     Identity {
         esi: String,
@@ -261,13 +280,22 @@ pub enum Cause {
     #[error(
         "does not reach Operation enabled within {timeout_ms} ms: stays in {state} \
          (Statusword 0x{statusword:04x}: {}){}{}",
-        Statusword::from_bits_retain(*statusword), mode_note(*mode_confirmed), code_note(*code)
+        Statusword::from_bits_retain(*statusword), blocker_note(*waiting), code_note(*code)
     )]
     NotEnabled {
         state: State,
         statusword: u16,
-        mode_confirmed: bool,
+        /// What the axis waits for, if it knows more than the state.
+        waiting: Option<EnableBlocker>,
         code: Option<u16>,
+        timeout_ms: u64,
+    },
+    #[error(
+        "does not reach Operation enabled within {timeout_ms} ms: node {id} on its CAN network is {state}"
+    )]
+    NodeNotOperational {
+        id: u8,
+        state: NodeState,
         timeout_ms: u64,
     },
     #[error(
@@ -381,6 +409,10 @@ pub enum Cause {
     ClockNotSettled { difference_ns: i32 },
     #[error("could not be brought to rest and disabled: stays in {state}")]
     NotDisabled { state: State },
+    #[error(
+        "the drive has left Operation enabled for {state}, and no command, stop, trip or fault is recorded"
+    )]
+    PowerLostWithoutCause { state: State },
     #[error("emergency stop: {condition}")]
     EmergencyStop { condition: String },
     #[error(
@@ -475,6 +507,15 @@ impl Error {
         }
     }
 
+    /// Replaces the cause.
+    #[must_use]
+    pub(crate) fn map_cause(self, map: impl FnOnce(Box<Cause>) -> Cause) -> Self {
+        Self {
+            cause: Box::new(map(self.cause)),
+            ..self
+        }
+    }
+
     /// Removes the device if the error is part of a text that names it.
     #[must_use]
     pub fn without_device(self, device: &DeviceRef) -> Self {
@@ -554,6 +595,7 @@ impl Error {
                 | Cause::EmergencyStop { .. }
                 | Cause::Controller
                 | Cause::NotDisabled { .. }
+                | Cause::PowerLostWithoutCause { .. }
         )
     }
 }

@@ -139,6 +139,12 @@ fn describe_cause<'m>(cause: StopCause, axis: &impl Fn(AxisIndex) -> &'m str) ->
         StopCause::LeftOp { al_status } => {
             format!("stop: a SubDevice has left Op, AL status 0x{al_status:02x}")
         }
+        StopCause::PowerLost { axis: at, state } => {
+            format!(
+                "stop: the drive of `{}` is in {state} without a cause",
+                axis(at)
+            )
+        }
         StopCause::Powered { axis: at } => {
             format!("stop: the drive of `{}` keeps its power", axis(at))
         }

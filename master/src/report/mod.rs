@@ -25,7 +25,7 @@ pub use device_log::DeviceLog;
 pub use diagnosis_message::{DiagnosisKind, DiagnosisMessage};
 pub use drive_report::{DriveReport, SercosDiagnosis};
 pub use emergencies::{EmergencyLine, EmergencyLog, EmergencyReport};
-pub use error::{Cause, Error};
+pub use error::{Cause, Error, ModuleDifference};
 pub use error_place::{FailedStep, Location};
 pub use events::EventLine;
 pub use progress::{

@@ -91,7 +91,7 @@ pub enum Progress {
     GroupWaits {
         group: String,
     },
-    /// A stopped group has been reset and can be enabled again.
+    /// The stop of a group has ended: it was reset, or it has no axes and its devices are in Op.
     GroupReleased {
         group: String,
     },
@@ -112,6 +112,8 @@ pub enum Progress {
         home: Option<Home>,
         /// It is optional and was absent until now.
         first: bool,
+        /// Its group has axes, which must be reset.
+        has_axes: bool,
     },
     /// The status of the ring of a machine with cable redundancy; when the cycle begins.
     RingStatus(&'static RingStatus),

@@ -9,6 +9,7 @@ use super::gantry::Leader;
 use super::gateway::NodePlace;
 use super::image::{AxisBits, SignalBits};
 use super::overrides::Rates;
+use super::power_watch::PowerWatch;
 use super::setpoint_generator::SetpointGenerator;
 use crate::clock::Nanos;
 
@@ -47,6 +48,9 @@ pub struct RtAxis {
     pub(super) acted: bool,
     /// The override of this cycle.
     pub(super) rates: Rates,
+    /// The present hold has stopped the search for home.
+    pub(super) stopped_by_hold: bool,
+    pub(super) power: PowerWatch,
     /// The first half of the gantry whose second half the axis is, while they are coupled.
     pub(super) leader: Option<Leader>,
 }
@@ -74,6 +78,8 @@ impl RtAxis {
             reset: false,
             acted: false,
             rates: Rates::WHOLE,
+            stopped_by_hold: false,
+            power: PowerWatch::default(),
             leader: None,
         }
     }
@@ -101,6 +107,14 @@ impl RtAxis {
         }
         self.ordered |= command == Command::Enable;
         self.axis.command(command)?;
+        match command {
+            Command::Enable => self.power.want(),
+            Command::Disable
+            | Command::QuickStop
+            | Command::EmergencyStop
+            | Command::DisableVoltage => self.power.end(),
+            _ => {}
+        }
         // These commands do not affect the set-point.
         let aside = matches!(
             command,

@@ -1,5 +1,6 @@
 //! Counts bad cycles and decides when they stop the machine or a group.
 
+use ecaxis_axis::State;
 use ecaxis_ecat::al_state::AlState;
 use ecaxis_ecat::index::{AxisIndex, DeviceIndex, GroupIndex, IndexVec};
 
@@ -44,6 +45,8 @@ pub enum StopCause {
     Unsupervised,
     /// The drive of this axis keeps power although it was commanded to remove it.
     Powered { axis: AxisIndex },
+    /// The drive of this axis left Operation enabled, and no cause is recorded.
+    PowerLost { axis: AxisIndex, state: State },
     /// At least one SubDevice is no longer in Op.
     LeftOp { al_status: u8 },
     /// An optional device was absent as the machine started.
@@ -59,7 +62,8 @@ impl StopCause {
             | Self::Trip { axis, .. }
             | Self::FollowLost { axis }
             | Self::NodeLost { axis, .. }
-            | Self::Powered { axis } => Some(axis),
+            | Self::Powered { axis }
+            | Self::PowerLost { axis, .. } => Some(axis),
             _ => None,
         }
     }

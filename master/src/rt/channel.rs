@@ -8,6 +8,7 @@ use super::common_time::CommonTimeStatus;
 use super::controller::OutputRef;
 use super::cycle::StartState;
 use super::exchange::SubDeviceDiagnostics;
+use super::gateway::{NodeCommand, NodeState};
 use super::heartbeat::Heartbeat;
 use super::line_shaft::LineShaftStatus;
 use super::reaction_group::GroupStatus;
@@ -77,6 +78,13 @@ pub enum RtCommand {
     /// Stops the bus monitor: the segment is about to leave Op, so wrong working counters are
     /// expected.
     StopBusMonitor,
+    /// Commands the NMT state of a node behind a gateway. Refused while its axis has power.
+    Node {
+        gateway: DeviceIndex,
+        /// The index of the node in its gateway.
+        node: usize,
+        command: NodeCommand,
+    },
     /// Ends the exchange of process data between gateways and their nodes.
     EndGateways,
     /// Brings every axis of the machine to rest within its limits, then disables it.
@@ -167,6 +175,8 @@ pub struct Snapshot {
     pub inputs_fresh: bool,
     pub al_status: Option<(u8, u16)>,
     pub axes: IndexVec<AxisIndex, AxisStatus>,
+    /// The state of the node of each axis behind a gateway.
+    pub nodes: IndexVec<AxisIndex, Option<NodeState>>,
     pub generators: IndexVec<AxisIndex, GeneratorState>,
     pub line_shafts: IndexVec<LineShaftIndex, LineShaftStatus>,
     /// The program's input signals, in the order of [`super::cycle::Signals::inputs`]. Each value
@@ -175,6 +185,8 @@ pub struct Snapshot {
     /// The controller has called `finish`.
     pub finished: bool,
     pub diagnoses: IndexVec<DeviceIndex, SubDeviceDiagnostics>,
+    /// For each device, true from its loss to the reset of its group: its outputs are off.
+    pub locked_outputs: IndexVec<DeviceIndex, bool>,
     /// The first cause, once the machine is stopping.
     pub stopping: Option<StopCause>,
     /// A failure during a requested stop.

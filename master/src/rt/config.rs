@@ -39,6 +39,8 @@ pub struct RtConfig {
     pub line_shafts: Vec<LineShaft>,
     /// Inputs that are copied to outputs in every cycle.
     pub copies: Vec<ProcessDataCopy>,
+    /// Outputs that have their initial value from the loss of their device to the reset of its group.
+    pub output_locks: Vec<ProcessDataCopy>,
     /// Outputs that repeat other outputs of their device.
     pub repeats: Vec<ProcessDataCopy>,
 }

@@ -1,5 +1,6 @@
 //! User-supplied control loops inside the cycle.
 
+use ecaxis_axis::setpoint::Rate;
 use ecaxis_axis::{AxisStatus, Command, CommandError};
 use ecaxis_ecat::index::{AxisIndex, GroupIndex, IndexVec};
 
@@ -7,6 +8,7 @@ use super::axis::RtAxis;
 use super::bus_monitor::StopCause;
 use super::cycle::Signals;
 use super::gantry::{self, Gantry};
+use super::overrides::{Overrides, check_hold};
 use super::reaction_group::{ReactionGroup, check_permitted};
 
 /// A reference to an axis of a machine.
@@ -52,6 +54,7 @@ pub struct CycleContext<'a> {
     pub(super) axes: &'a mut IndexVec<AxisIndex, RtAxis>,
     pub(super) gantries: &'a mut [Gantry],
     pub(super) groups: &'a mut IndexVec<GroupIndex, ReactionGroup>,
+    pub(super) overrides: &'a Overrides,
     pub(super) inputs: &'a [f64],
     pub(super) signals: &'a Signals,
     pub(super) outputs: &'a mut [u8],
@@ -102,6 +105,12 @@ impl CycleContext<'_> {
         group.stop().map(|stop| stop.cause)
     }
 
+    /// Returns the override of an axis in this cycle. A held axis accepts no set-point that moves it.
+    #[must_use]
+    pub fn rate(&self, axis: AxisRef) -> Rate {
+        self.overrides.rate(self.axes[axis.0].group)
+    }
+
     /// Returns the status of an axis with this cycle's actual values.
     #[must_use]
     pub fn axis(&self, axis: AxisRef) -> AxisStatus {
@@ -114,6 +123,7 @@ impl CycleContext<'_> {
     /// The reason for the rejection. A rejected command changes nothing.
     pub fn command(&mut self, axis: AxisRef, command: Command) -> Result<(), CommandError> {
         check_permitted(self.groups, self.axes[axis.0].group, command)?;
+        check_hold(self.rate(axis), command)?;
         if !self.guarded && command == Command::Enable {
             return Err(CommandError::NotInOp);
         }
@@ -124,7 +134,8 @@ impl CycleContext<'_> {
     /// decelerates and holds.
     ///
     /// # Errors
-    /// Fails if the step would exceed the limits or leave the range. The axis then decelerates.
+    /// Fails if the step would exceed the limits or leave the range, or if the axis is held and the
+    /// set-point moves it. The axis then decelerates.
     pub fn set_point(&mut self, axis: AxisRef, position: f64) -> Result<(), CommandError> {
         if self.stopping() {
             return Err(CommandError::Stopping);
@@ -133,7 +144,12 @@ impl CycleContext<'_> {
             return Err(CommandError::GroupStopped);
         }
         gantry::check_motion(self.gantries, axis.0)?;
-        self.axes[axis.0].axis.set_point(position)
+        let held = self.rate(axis).is_held();
+        let axis = &mut self.axes[axis.0].axis;
+        if held && position != axis.status().target_position {
+            return Err(CommandError::Held);
+        }
+        axis.set_point(position)
     }
 
     /// Adds a torque feed-forward to the set-point of this cycle, in percent of rated torque: 0x60B2

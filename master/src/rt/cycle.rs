@@ -356,6 +356,25 @@ impl Engine {
         if let Some(cause) = self.guard.left_op() {
             self.stop(None, cause);
         }
+        self.lock_outputs();
+    }
+
+    /// Locks the outputs of the devices that are lost, until the reset of their group. RT: O(devices)
+    /// while a group is stopped.
+    fn lock_outputs(&mut self) {
+        for (index, group) in self.groups.enumerate() {
+            if group.stop().is_none() {
+                continue;
+            }
+            let group_lost = self.guard.lost(index).is_some();
+            for device in self.guard.devices_of(index) {
+                let fresh =
+                    self.exchange.device_answers().get(device) == Some(&DeviceAnswer::Fresh);
+                if self.guard.device_lost(device) || group_lost && !fresh {
+                    self.exchange.lock_outputs(device);
+                }
+            }
+        }
     }
 
     fn observe(&mut self) {
@@ -378,7 +397,9 @@ impl Engine {
                 slot.heard = Some(self.next);
             }
             slot.arrived.0 |= fresh;
-            slot.arrived.1 |= self.exchange.came_late(slot.device);
+            // The frame came back, and at most one of several devices missed its targets.
+            let shared = answer == Some(&DeviceAnswer::Unknown);
+            slot.arrived.1 |= shared || self.exchange.came_late(slot.device);
             slot.acted = !due;
             if due {
                 let (fresh, late) = std::mem::take(&mut slot.arrived);
@@ -393,6 +414,9 @@ impl Engine {
         }
         for (to, signal) in self.inputs.iter_mut().zip(&self.signals.inputs) {
             *to = signal.get(image);
+        }
+        if self.guarding {
+            self.overrides.read(&self.inputs);
         }
         let inputs = &self.inputs;
         // A missing or NaN input counts as an active emergency stop.
@@ -420,6 +444,7 @@ impl Engine {
             axes: &mut self.axes,
             gantries: &mut self.gantries,
             groups: &mut self.groups,
+            overrides: &self.overrides,
             inputs: &self.inputs,
             signals: &self.signals,
             outputs: self.exchange.outputs_mut(),
@@ -463,6 +488,12 @@ impl Engine {
         for gantry in &self.gantries {
             gantry.publish(&mut snapshot.axes);
         }
+        for (to, slot) in snapshot.nodes.iter_mut().zip(&self.axes) {
+            let node = slot
+                .node
+                .and_then(|at| Some((self.gateways.get(at.gateway)?, at.node)));
+            *to = node.map(|(gateway, node)| gateway.state(node));
+        }
         for (to, slot) in snapshot.generators.iter_mut().zip(&self.axes) {
             *to = slot.generator.state();
         }
@@ -472,6 +503,10 @@ impl Engine {
         snapshot.late_wake_ups = self.late_wake_ups;
         snapshot.finished = self.finished;
         snapshot.inputs.copy_from_slice(&self.inputs);
+        let locked = self.exchange.locked().iter();
+        for (to, locked) in snapshot.locked_outputs.iter_mut().zip(locked) {
+            *to = *locked;
+        }
         for (to, diagnosis) in snapshot.diagnoses.iter_mut().zip(self.exchange.diagnoses()) {
             *to = *diagnosis;
         }
@@ -580,12 +615,14 @@ pub fn first_snapshot(
         inputs_fresh: false,
         al_status: None,
         axes: axes.iter().map(|slot| slot.axis.status()).collect(),
+        nodes: vec![None; axes.len()].into(),
         generators: vec![GeneratorState::None; axes.len()].into(),
         line_shafts: vec![LineShaftStatus::default(); line_shafts].into(),
         inputs: vec![0.0; signals.inputs.len()],
         late_wake_ups: 0,
         finished: false,
         diagnoses: vec![SubDeviceDiagnostics::default(); devices].into(),
+        locked_outputs: vec![false; devices].into(),
         stopping: None,
         failure: None,
         stop_ended: false,

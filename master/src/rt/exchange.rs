@@ -89,6 +89,11 @@ pub struct Exchange {
     /// Copies of inputs to outputs, each with the device of the inputs.
     copies: Vec<(DeviceIndex, BitCopy)>,
     /// Copies of outputs to outputs.
+    /// The outputs at the start of the run.
+    initial_outputs: Vec<u8>,
+    /// The devices whose outputs have their initial values, as `output_locks` lists them.
+    locked: IndexVec<DeviceIndex, bool>,
+    output_locks: Vec<(DeviceIndex, BitCopy)>,
     repeats: Vec<BitCopy>,
 }
 
@@ -156,7 +161,10 @@ impl Exchange {
             cycle: 0,
             outputs: vec![0; plan.len],
             inputs: vec![0; plan.len],
+            initial_outputs: vec![0; plan.len],
+            locked: vec![false; members.len()].into(),
             copies: plan.copies.clone(),
+            output_locks: plan.output_locks.clone(),
             repeats: plan.repeats.clone(),
         };
         exchange.stage();
@@ -171,6 +179,32 @@ impl Exchange {
         } else {
             ExchangeMode::Pipelined
         }
+    }
+
+    /// Takes the present outputs as their initial values. Call it before the first cycle.
+    #[allow(clippy::disallowed_methods, reason = "runs before the loop")]
+    pub fn keep_initial_outputs(&mut self) {
+        self.initial_outputs.clone_from(&self.outputs);
+    }
+
+    /// Gives the outputs of a lost device their initial values, until its group is reset. RT.
+    pub fn lock_outputs(&mut self, device: DeviceIndex) {
+        if let Some(locked) = self.locked.get_mut(device) {
+            *locked = true;
+        }
+    }
+
+    /// Gives the outputs of a group back to their owners. RT: O(members).
+    pub fn unlock_outputs(&mut self, group: GroupIndex) {
+        for (locked, own) in self.locked.iter_mut().zip(&self.groups) {
+            *locked &= *own != group;
+        }
+    }
+
+    /// Returns for each device whether its outputs are locked.
+    #[must_use]
+    pub fn locked(&self) -> &IndexVec<DeviceIndex, bool> {
+        &self.locked
     }
 
     /// Returns the outputs of the next cycle.
@@ -350,12 +384,17 @@ impl Exchange {
         }
     }
 
-    /// Copies inputs to outputs, then outputs to those that repeat them. A copy whose source device
-    /// has not answered in this cycle holds its last value.
+    /// Copies inputs to outputs, locks the outputs of lost devices, then copies outputs to those that
+    /// repeat them. A copy whose source device has not answered in this cycle holds its last value.
     fn copy_process_data(&mut self) {
         for &(source, copy) in &self.copies {
             if self.device_answers.get(source) == Some(&DeviceAnswer::Fresh) {
                 copy.apply(&self.inputs, &mut self.outputs);
+            }
+        }
+        for &(device, lock) in &self.output_locks {
+            if self.locked.get(device) == Some(&true) {
+                lock.apply(&self.initial_outputs, &mut self.outputs);
             }
         }
         for repeat in &self.repeats {

@@ -2,15 +2,16 @@
 //!
 //! The first half has the plan. While the gantry is coupled, the second half takes the set-point of
 //! the first in the same cycle, plus a constant offset. The offset is the one at the coupling. If
-//! both halves are homed, it is reduced to 0 first: the gantry is squared.
+//! both halves are homed, it is reduced to 0 first: the gantry is squared, at the override of the
+//! axes. While they are held, it waits.
 //!
 //! Both halves always stop by the same method, the harder one of both. The skew is compared with its
 //! limit in every cycle, as it is and as it will be when the faster half has stopped.
 
-use ecaxis_axis::setpoint::{Goal, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint};
+use ecaxis_axis::setpoint::{Goal, JerkLimited, Motion, MotionLimits, MoveRequest, Rate, Setpoint};
 use ecaxis_axis::{
-    Axis, AxisConfig, AxisStatus, Command, CommandError, HomingError, HomingStatus, Mode,
-    StopMethod, Trip,
+    Axis, AxisConfig, AxisStatus, Command, CommandError, EnableBlocker, HomingError, HomingStatus,
+    Mode, State, StopMethod, Trip,
 };
 use ecaxis_ecat::index::{AxisIndex, IndexVec};
 
@@ -83,6 +84,8 @@ pub struct Gantry {
     offset: Motion,
     /// The difference of positions that counts as skew 0.
     square: f64,
+    /// The lower override of both halves.
+    rate: Rate,
 }
 
 /// The part of the limits with which a gantry is squared.
@@ -104,6 +107,7 @@ impl Gantry {
                 acceleration: 0.0,
             },
             square: 0.0,
+            rate: Rate::WHOLE,
         }
     }
 
@@ -194,7 +198,7 @@ impl Gantry {
                 let result = first.command(command);
                 result.and(second.command(command))
             }
-            Command::Stop => {
+            Command::Stop | Command::HoldHoming => {
                 if let Coupling::Squaring(plan) = &mut self.coupling {
                     stop_squaring(plan, self.offset, first.axis.config().limits.motion());
                 }
@@ -230,6 +234,7 @@ impl Gantry {
     /// after the commands and before the axes act. RT: O(1).
     pub(super) fn update(&mut self, [first, second]: [&mut RtAxis; 2], dt_s: f64) {
         second.leader = None;
+        self.rate = first.rates.own.min(second.rates.own).min(Rate::WHOLE);
         let status = [first.axis.status(), second.axis.status()];
         let [a, b] = &status;
         if let Coupling::Squaring(_) | Coupling::Coupled = self.coupling
@@ -284,7 +289,7 @@ impl Gantry {
         let offset = b.target_position - a.target_position;
         let limit = self.config.max_skew;
         self.offset = Motion::at(offset);
-        if !(a.homed && b.homed) {
+        if !(a.homed() && b.homed()) {
             self.square = offset;
             self.coupling = Coupling::Coupled;
             return Ok(());
@@ -323,7 +328,7 @@ impl Gantry {
             if a.stop.is_some() || b.stop.is_some() {
                 stop_squaring(plan, self.offset, first.axis.config().limits.motion());
             }
-            self.offset = plan.advance(self.offset, dt_s);
+            self.offset = plan.advance(self.offset, self.rate, dt_s);
             if self.offset.stands_at(0.0) {
                 self.coupling = Coupling::Coupled;
             }
@@ -331,7 +336,9 @@ impl Gantry {
             // A loss may have left a velocity.
             self.offset = Motion::at(self.offset.position);
         }
-        second.leader = Some(Leader {
+        // Without set-points of its own, the first half shows where it is: perhaps a load that falls.
+        let leads = a.enabled && a.state == State::OperationEnabled;
+        second.leader = leads.then_some(Leader {
             axis: self.config.axes[0],
             offset: self.offset,
         });
@@ -388,12 +395,18 @@ impl Gantry {
             _ => true,
         };
         status.ready &= !busy && second.ready;
-        status.moving |= matches!(self.coupling, Coupling::Squaring(_));
+        let squares = matches!(self.coupling, Coupling::Squaring(_));
+        status.moving |= squares;
+        if squares && self.rate.is_held() {
+            status.waiting = Some(EnableBlocker::Held);
+        }
         // A second half is not in a target of its own while the gantry has a velocity.
         status.in_target &= !status.moving;
         status.in_target &= status.target_velocity != 0.0 || second.in_target;
         status.at_rest &= second.at_rest;
-        status.homed &= second.homed;
+        if status.homed() {
+            status.validity = second.validity;
+        }
         // The other half is aborted as a consequence.
         let cause = |homing: &HomingStatus| {
             homing.is_failed() && *homing != HomingStatus::Failed(HomingError::Aborted)
@@ -457,13 +470,19 @@ fn can_couple(status: &AxisStatus) -> bool {
 /// Stops each half by the method of the other. A half that moves without the other, which has lost
 /// its power, stops by quick stop.
 fn stop_alike([first, second]: [&mut RtAxis; 2], [a, b]: &[AxisStatus; 2]) {
-    for (half, own, other) in [(first, a, b), (second, b, a)] {
-        if !own.enabled {
+    let ended = [second.power.has_ended(), first.power.has_ended()];
+    for ((half, own, other), ended) in [(first, a, b), (second, b, a)].into_iter().zip(ended) {
+        // A half has no cause of its own: without one of the other half, its loss of power fails
+        // the machine.
+        if ended {
+            half.power.end();
+        }
+        if !own.powered {
             continue;
         }
         if let Some(stop) = other.stop {
             half.stop_by(stop.method);
-        } else if !other.enabled && !own.at_rest {
+        } else if !other.powered && !own.at_rest {
             half.stop_by(StopMethod::QuickStop);
         }
     }
@@ -530,3 +549,7 @@ fn homing_way(half: &mut HomingHalf, status: &AxisStatus, axis: &Axis, dt_s: f64
     };
     if way.abs() <= possible { way } else { 0.0 }
 }
+
+#[cfg(test)]
+#[path = "gantry_tests.rs"]
+mod tests;

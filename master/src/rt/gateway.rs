@@ -90,6 +90,23 @@ impl std::fmt::Display for NodeState {
     }
 }
 
+/// A command for the NMT state of a node (CiA 301), with its code in the control word.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub enum NodeCommand {
+    PreOperational = 0,
+    Start = 1,
+    Reset = 2,
+    Stop = 4,
+}
+
+impl NodeCommand {
+    /// Returns true for a state in which the node stays until another command.
+    const fn rests(self) -> bool {
+        matches!(self, Self::PreOperational | Self::Stop)
+    }
+}
+
 const TOGGLE: u8 = 0x80;
 const COMMAND: u8 = 0x70;
 const EXTENSION: u8 = 0x0f;
@@ -100,8 +117,6 @@ const START: [u8; 2] = [0x01, 0];
 const END: [u8; 2] = [0x00, 128];
 const GET_NODE_STATE: u8 = 0x10;
 const GET_GENERAL_STATUS: u8 = 0x20;
-/// Set NMT state OPERATIONAL, of one node.
-const START_NODE: u8 = 0x01;
 
 /// The general status of the CANopen module (manual §6.2.2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -151,6 +166,10 @@ pub struct Gateway {
     reached: Box<[bool]>,
     /// The times that each node was lost.
     losses: Box<[u32]>,
+    /// The last command to each node: until it is acknowledged, or as long as the node rests by it.
+    commanded: Box<[Option<NodeCommand>]>,
+    /// The nodes whose command is not acknowledged yet.
+    pending: Box<[bool]>,
     /// The node of the next question; beyond the last: the general status, then the module.
     asked: usize,
     /// The general status at the last answer, and all bits of this run.
@@ -175,6 +194,8 @@ impl Gateway {
             states: vec![NodeState::default(); config.nodes.len()].into(),
             reached: vec![false; config.nodes.len()].into(),
             losses: vec![0; config.nodes.len()].into(),
+            commanded: vec![None; config.nodes.len()].into(),
+            pending: vec![false; config.nodes.len()].into(),
             asked: 0,
             general: GeneralStatus::default(),
             general_seen: GeneralStatus::default(),
@@ -217,6 +238,44 @@ impl Gateway {
     #[must_use]
     pub fn general_seen(&self) -> GeneralStatus {
         self.general_seen
+    }
+
+    /// Commands the NMT state of a node. The caller has checked that its axis has no power. The node
+    /// is not lost until it is Operational again.
+    pub fn command(&mut self, node: usize, command: NodeCommand) {
+        let pending = self.pending.get_mut(node);
+        let known = pending.zip(self.commanded.get_mut(node));
+        if let Some((pending, commanded)) = known {
+            (*pending, *commanded) = (true, Some(command));
+        }
+        if let Some(reached) = self.reached.get_mut(node) {
+            *reached = false;
+        }
+    }
+
+    /// Takes the acknowledgement of an NMT command to a node.
+    fn take_command(&mut self, node: usize, code: u8) {
+        let Some(command) = self.commanded.get(node).copied().flatten() else {
+            return;
+        };
+        if command as u8 != code {
+            return;
+        }
+        if let Some(pending) = self.pending.get_mut(node) {
+            *pending = false;
+        }
+        if let Some(commanded) = self.commanded.get_mut(node).filter(|_| !command.rests()) {
+            *commanded = None;
+        }
+        self.set_state(
+            node,
+            match command {
+                NodeCommand::PreOperational => NodeState::PreOperational,
+                NodeCommand::Stop => NodeState::Stopped,
+                NodeCommand::Reset => NodeState::Resetting,
+                NodeCommand::Start => NodeState::Unknown,
+            },
+        );
     }
 
     /// Ends the exchange of process data with all nodes. The commands to the drives must have
@@ -264,6 +323,8 @@ impl Gateway {
         if !running {
             (self.command, self.waiting) = (None, 0);
             self.reached.fill(false);
+            self.commanded.fill(None);
+            self.pending.fill(false);
             // The states at the end of a run stay for its summary.
             if self.stage != Stage::Ended {
                 self.stage = Stage::Starting;
@@ -308,8 +369,9 @@ impl Gateway {
         {
             self.set_state(node, NodeState::InError);
         }
-        for (reached, state) in self.reached.iter_mut().zip(&self.states) {
-            *reached |= *state == NodeState::Operational;
+        let nodes = self.states.iter().zip(&self.commanded);
+        for (reached, (state, commanded)) in self.reached.iter_mut().zip(nodes) {
+            *reached |= *state == NodeState::Operational && commanded.is_none();
         }
     }
 
@@ -339,7 +401,8 @@ impl Gateway {
             (Stage::Running, GET_NODE_STATE) => {
                 // The gateway starts most nodes itself: only a node that stays there is started.
                 let stays = waits && self.state(self.asked) == state;
-                start = Some([START_NODE, of]).filter(|_| stays);
+                let rests = self.commanded.get(self.asked).is_some_and(Option::is_some);
+                start = Some([NodeCommand::Start as u8, of]).filter(|_| stays && !rests);
                 self.set_state(self.asked, state);
                 self.asked += 1;
             }
@@ -348,15 +411,29 @@ impl Gateway {
                 self.general_seen.0 |= self.general.0;
                 self.asked += 1;
             }
-            (Stage::Running, _) => {}
+            (Stage::Running, _) => {
+                if let Some(node) = self.config.nodes.iter().position(|node| *node == of) {
+                    self.take_command(node, code);
+                }
+            }
             _ => self.stage = Stage::Running,
         }
+        let mut nodes = self
+            .config
+            .nodes
+            .iter()
+            .zip(&self.commanded)
+            .zip(&self.pending);
+        let commanded = nodes.find_map(|((node, commanded), pending)| {
+            let command = commanded.filter(|_| *pending)?;
+            Some([command as u8, *node])
+        });
         let next = match self.config.nodes.get(self.asked) {
             Some(node) => [GET_NODE_STATE, *node],
             None if self.asked == self.config.nodes.len() => [GET_GENERAL_STATUS, 0],
             None => [GET_NODE_STATE, 0],
         };
-        self.issue(start.unwrap_or(next), status);
+        self.issue(commanded.or(start).unwrap_or(next), status);
     }
 
     fn set_state(&mut self, node: usize, state: NodeState) {

@@ -320,3 +320,77 @@ proptest! {
         prop_assert_eq!(late, 0);
     }
 }
+
+/// A node that is stopped by command rests; it is neither lost nor started again.
+#[test]
+fn commanded_node_rests_until_it_is_started() {
+    for (command, code, state) in [
+        (NodeCommand::Stop, 4, NodeState::Stopped),
+        (NodeCommand::PreOperational, 0, NodeState::PreOperational),
+    ] {
+        let (mut gateway, mut peer) = (gateway(), Peer::new());
+        for _ in 0..10 {
+            peer.cycle(&mut gateway);
+        }
+        gateway.command(1, command);
+        for _ in 0..3 {
+            peer.cycle(&mut gateway);
+            assert_eq!(gateway.lost(1), None);
+        }
+        assert!(peer.commands.contains(&[code, 2]), "{:?}", peer.commands);
+        peer.states[1] = code;
+        peer.commands.clear();
+        for _ in 0..60 {
+            peer.cycle(&mut gateway);
+            assert_eq!(gateway.lost(1), None);
+        }
+        assert_eq!(gateway.state(1), state);
+        assert!(!peer.commands.contains(&[1, 2]), "{:?}", peer.commands);
+        gateway.command(1, NodeCommand::Start);
+        for _ in 0..3 {
+            peer.cycle(&mut gateway);
+        }
+        assert!(peer.commands.contains(&[1, 2]), "{:?}", peer.commands);
+        peer.states[1] = 1;
+        for _ in 0..20 {
+            peer.cycle(&mut gateway);
+        }
+        assert_eq!(
+            (gateway.state(1), gateway.lost(1)),
+            (NodeState::Operational, None)
+        );
+        // From now on it is supervised again.
+        peer.states[1] = 0;
+        for _ in 0..20 {
+            peer.cycle(&mut gateway);
+        }
+        assert_eq!(gateway.lost(1), Some(NodeState::PreOperational));
+        assert_eq!(gateway.nodes().map(|n| n.2).collect::<Vec<_>>(), [0, 1, 0]);
+    }
+}
+
+/// A reset is sent once, and the node is started as after its power-on.
+#[test]
+fn reset_node_is_supervised_again_once_it_is_operational() {
+    let (mut gateway, mut peer) = (gateway(), Peer::new());
+    for _ in 0..10 {
+        peer.cycle(&mut gateway);
+    }
+    gateway.command(2, NodeCommand::Reset);
+    peer.states[2] = 2;
+    for _ in 0..30 {
+        peer.cycle(&mut gateway);
+        assert_eq!(gateway.lost(2), None);
+    }
+    let resets = peer.commands.iter().filter(|command| **command == [2, 100]);
+    assert_eq!(resets.count(), 1, "{:?}", peer.commands);
+    peer.states[2] = 1;
+    for _ in 0..20 {
+        peer.cycle(&mut gateway);
+    }
+    peer.states[2] = 6;
+    for _ in 0..20 {
+        peer.cycle(&mut gateway);
+    }
+    assert_eq!(gateway.lost(2), Some(NodeState::Missing));
+}

@@ -54,6 +54,7 @@ pub mod line_shaft;
 pub mod overrides;
 pub mod phase;
 pub mod position_output;
+mod power_watch;
 pub mod reaction_group;
 pub mod samples;
 pub mod setpoint_cell;

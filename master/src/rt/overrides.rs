@@ -3,8 +3,8 @@
 //! The rate of an axis is the product of the machine's factor and its group's, at most [`MAX_RATE`].
 //! It is 0 while one of both is held. Stops do not use the rate.
 
-use ecaxis_axis::setpoint::TableRate;
-use ecaxis_axis::{MAX_RATE, MIN_RATE};
+use ecaxis_axis::setpoint::{Rate, TableRate};
+use ecaxis_axis::{Command, CommandError, MAX_RATE};
 use ecaxis_ecat::index::{GroupIndex, IndexVec};
 
 use super::config::Condition;
@@ -69,6 +69,17 @@ pub struct Override {
     pub held: bool,
 }
 
+impl Override {
+    /// Returns the rate of the axes of a group. `self` is the override of the machine. RT.
+    #[must_use]
+    pub fn rate(self, group: Self) -> Rate {
+        if self.held || group.held {
+            return Rate::HELD;
+        }
+        Rate::new((self.factor * group.factor).min(MAX_RATE))
+    }
+}
+
 impl Default for Override {
     fn default() -> Self {
         Self {
@@ -93,15 +104,15 @@ pub(super) struct Overrides {
 /// The rates of one axis in one cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rates {
-    pub own: f64,
-    /// The lowest rate of all axes on lines.
-    pub line: f64,
+    pub own: Rate,
+    /// The lowest rate of all axes on the line of the axis.
+    pub line: Rate,
 }
 
 impl Rates {
     pub const WHOLE: Self = Self {
-        own: 1.0,
-        line: 1.0,
+        own: Rate::WHOLE,
+        line: Rate::WHOLE,
     };
 }
 
@@ -166,17 +177,36 @@ impl Overrides {
     }
 
     /// Returns the rate of the axes of a group. RT.
-    pub fn rate(&self, group: GroupIndex) -> f64 {
+    pub fn rate(&self, group: GroupIndex) -> Rate {
         let machine = self.of(GroupIndex::MACHINE);
-        let own = match group {
-            GroupIndex::MACHINE => Override::default(),
-            group => self.of(group),
-        };
-        if machine.held || own.held {
-            return 0.0;
+        match group {
+            GroupIndex::MACHINE => machine.rate(Override::default()),
+            group => machine.rate(self.of(group)),
         }
-        let rate = (machine.factor * own.factor).min(MAX_RATE);
-        if rate < MIN_RATE { 0.0 } else { rate }
+    }
+}
+
+/// Checks whether an axis with this rate may receive a command. A held axis accepts motions that
+/// wait. The search for home by a drive cannot. RT.
+pub(super) fn check_hold(rate: Rate, command: Command) -> Result<(), CommandError> {
+    match command {
+        Command::Home { .. } if rate.is_held() => Err(CommandError::Held),
+        Command::Home { .. }
+        | Command::Torque { .. }
+        | Command::Enable
+        | Command::Disable
+        | Command::ResetFault
+        | Command::Stop
+        | Command::HoldHoming
+        | Command::QuickStop
+        | Command::DisableVoltage
+        | Command::EmergencyStop
+        | Command::ArmProbe { .. }
+        | Command::DisarmProbe { .. }
+        | Command::SetMode(_)
+        | Command::MoveTo { .. }
+        | Command::MoveBy { .. }
+        | Command::Velocity { .. } => Ok(()),
     }
 }
 
@@ -198,8 +228,8 @@ mod tests {
         ] {
             all.set_factor(GroupIndex::MACHINE, machine);
             all.set_factor(ONE, group);
-            assert_eq!(all.rate(ONE), expected);
-            assert_eq!(all.rate(GroupIndex::MACHINE), machine);
+            assert_eq!(all.rate(ONE).value(), expected);
+            assert_eq!(all.rate(GroupIndex::MACHINE).value(), machine);
         }
         for invalid in [f64::NAN, -0.1, 1.21] {
             all.set_factor(ONE, invalid);
@@ -207,10 +237,12 @@ mod tests {
         assert_eq!(all.of(ONE).factor, 1.0);
         all.set_factor(GroupIndex::MACHINE, 0.8);
         all.set_hold(ONE, true);
-        assert_eq!([all.rate(ONE), all.rate(GroupIndex::MACHINE)], [0.0, 0.8]);
+        let rates =
+            |all: &Overrides| [ONE, GroupIndex::MACHINE].map(|group| all.rate(group).value());
+        assert_eq!(rates(&all), [0.0, 0.8]);
         all.set_hold(ONE, false);
         all.set_hold(GroupIndex::MACHINE, true);
-        assert_eq!([all.rate(ONE), all.rate(GroupIndex::MACHINE)], [0.0, 0.0]);
+        assert_eq!(rates(&all), [0.0, 0.0]);
     }
 
     #[test]
@@ -245,7 +277,7 @@ mod tests {
             (&[], 0.0),
         ] {
             all.read(inputs);
-            let rate = all.rate(GroupIndex::MACHINE);
+            let rate = all.rate(GroupIndex::MACHINE).value();
             assert!((rate - expected).abs() < 1e-12, "{inputs:?}: {rate}");
         }
     }

@@ -27,10 +27,11 @@ pub struct PositionTrigger {
 }
 
 impl PositionTrigger {
-    /// Returns true if the output is on. Without power it is off. RT: O(ranges).
+    /// Returns true if the output is on. Without power, and while positions refer to nothing, it is
+    /// off. RT: O(ranges).
     #[must_use]
     pub fn is_on(&self, status: &AxisStatus) -> bool {
-        if !status.enabled {
+        if !(status.enabled && status.validity.is_defined()) {
             return false;
         }
         let (position, velocity, acceleration) = if self.actual {

@@ -7,8 +7,8 @@
 
 use ecaxis_axis::group::LinePath;
 use ecaxis_axis::setpoint::{
-    self, Cam, Gear, GearConfig, GearInMode, Goal, JerkLimited, LineShaftEnd, Motion, Playback,
-    PositionWave, RateCourse, Setpoint, SetpointError, Table,
+    self, Cam, Gear, GearConfig, GearInMode, Goal, JerkLimited, LineShaftEnd, Master, Motion,
+    Playback, PositionWave, Rate, RateCourse, Setpoint, SetpointError, Table,
 };
 use ecaxis_axis::{Axis, AxisStatus, Command, CommandError, HomingStatus};
 use ecaxis_ecat::index::{AxisIndex, LineShaftIndex};
@@ -223,7 +223,7 @@ impl SetpointGenerator {
         start: GeneratorRequest,
         axis: &AxisStatus,
         master: Result<Motion, GeneratorError>,
-        rate: f64,
+        rate: Rate,
     ) {
         self.slipping_s = 0.0;
         let master = match master {
@@ -237,7 +237,7 @@ impl SetpointGenerator {
             }),
             // From rest, slower moves of the same duration still arrive together.
             GeneratorRequest::Move(planned) => Ok(Source::Single {
-                source: setpoint::Source::JerkLimited(planned.slowed(rate)),
+                source: setpoint::Source::JerkLimited(planned.slowed(rate.value())),
                 line: None,
             }),
             GeneratorRequest::Wave(wave) => Ok(Source::Single {
@@ -300,11 +300,12 @@ impl SetpointGenerator {
 
     /// Lets the time of the table pass, in every cycle of the bus. So all tables of a group have a
     /// common time, however often their axes step. RT: O(rows in a cycle).
-    pub fn play(&mut self, tables: &[Table], rate: f64, cycle_s: f64) {
+    pub fn play(&mut self, tables: &[Table], rate: Rate, cycle_s: f64) {
         if let Some(Source::Table { table, playback }) = &mut self.source
             && let Some(table) = tables.get(*table)
         {
-            let _ = playback.advance(table, playback.motion(), cycle_s, rate);
+            let last = playback.motion();
+            playback.with_table(table).advance(last, rate, cycle_s);
         }
     }
 
@@ -445,7 +446,7 @@ impl SetpointGenerator {
     pub fn advance(
         &mut self,
         axis: &mut Axis,
-        master: Result<Motion, GeneratorError>,
+        master: Result<Master, GeneratorError>,
         rates: Rates,
         dt_s: f64,
     ) -> bool {
@@ -468,6 +469,7 @@ impl SetpointGenerator {
             }
             return false;
         }
+        let own = rates.own.min(Rate::WHOLE);
         let before = self.resume_motion(axis, dt_s);
         let disturbed = self.given.is_some_and(|given| given != before);
         let mut superimposed = self.superimposed;
@@ -477,9 +479,9 @@ impl SetpointGenerator {
             Source::Single { source, line } => {
                 let rate = match line {
                     Some(_) => rates.line,
-                    None => rates.own.min(1.0),
+                    None => own,
                 };
-                let next = source.advance_at(rate, below, dt_s);
+                let next = source.advance(below, rate, dt_s);
                 if let setpoint::Source::Wave(wave) = source {
                     interrupted |= wave.interrupted();
                 }
@@ -492,14 +494,17 @@ impl SetpointGenerator {
                 (next, playback.finished(next), GeneratorState::Running)
             }
             Source::Gear { gear, .. } => {
-                gear.set_rate(rates.own.min(1.0), dt_s);
-                let next = gear.advance(master, before, dt_s);
+                let next = gear.with_master(master).advance(before, own, dt_s);
                 let state = if gear.engaged() {
                     GeneratorState::Engaged
                 } else {
                     GeneratorState::Running
                 };
-                if self.state == GeneratorState::Engaged && state == GeneratorState::Running {
+                if own.is_held() {
+                    // It waits, or follows its master to rest.
+                    self.slipping_s = 0.0;
+                } else if self.state == GeneratorState::Engaged && state == GeneratorState::Running
+                {
                     self.slipping_s = dt_s;
                 } else if self.slipping_s > 0.0 && state == GeneratorState::Running {
                     self.slipping_s += dt_s;
@@ -511,8 +516,11 @@ impl SetpointGenerator {
         };
         if let Some(Superimposed { gear, below }) = &mut superimposed {
             *below = next;
-            gear.set_rate(rates.own.min(1.0), dt_s);
-            next = gear.advance(next, before, dt_s);
+            let master = Master {
+                motion: next,
+                comes_to_rest: true,
+            };
+            next = gear.with_master(master).advance(before, own, dt_s);
             finished &= gear.engaged() && next.velocity == 0.0;
             if gear.engaged() {
                 state = GeneratorState::Engaged;

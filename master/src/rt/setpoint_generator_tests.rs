@@ -66,7 +66,10 @@ impl Rig {
         };
         self.axis.observe(&inputs, DT);
         self.before = self.axis.status().target_position;
-        let master = Ok(master.unwrap_or_default());
+        let master = Ok(Master {
+            motion: master.unwrap_or_default(),
+            comes_to_rest: false,
+        });
         let _ = self
             .generator
             .advance(&mut self.axis, master, Rates::WHOLE, DT);
@@ -77,7 +80,7 @@ impl Rig {
     fn begin(&mut self, start: GeneratorRequest, master: Option<Motion>) {
         let status = self.axis.status();
         let master = Ok(master.unwrap_or_default());
-        self.generator.begin(start, &status, master, 1.0);
+        self.generator.begin(start, &status, master, Rate::WHOLE);
     }
 
     fn part(&self, target: f64, speed: f64) -> LineAxis {

@@ -4,11 +4,11 @@ use std::borrow::Cow;
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use ecaxis_esi::sii::{self, SiiOptions};
-use ecaxis_esi::{Device, Slots};
+use ecaxis_esi::{Device, SDO_OF_MACHINE_FILE, Slots, StartupSdo};
 
 use ecaxis_sim::{
     DeviceOptions, FaultScript, FirmwareOptions, PlantParams, SecondPort, Segment, SegmentOptions,
-    SimDevice, Topology,
+    SimDevice, StartupWrite, Topology,
 };
 
 use super::{Cause, Error, Options};
@@ -221,16 +221,21 @@ const DRIFTS_PPM: [f64; 4] = [18.0, -23.0, 7.0, -11.0];
 /// files. Other simulated devices store a file written in Bootstrap like any other file.
 const DEMONSTRATION: u32 = 0x0e0a;
 
-/// Returns the device with the modules that the file assigns to its slots. If a mode selects the
+/// Returns the device with the modules that the file puts into its slots. If a mode selects the
 /// module, the device is returned unchanged: it takes the configured module list.
-fn with_configured_modules(device: &DeviceConfig) -> Cow<'_, Device> {
-    let selection = &device.selection;
+fn with_plugged_modules(device: &DeviceConfig) -> Cow<'_, Device> {
     let Some(slots) = &device.device.slots else {
         return Cow::Borrowed(&device.device);
     };
-    if selection.mode.is_some() || !device.modules_named {
-        return Cow::Borrowed(&device.device);
-    }
+    let selection = &device.selection;
+    let plugged = match &device.sim.modules {
+        Some(modules) => modules.clone(),
+        None if selection.mode.is_none() && device.modules_named => {
+            let configured = selection.modules.iter();
+            configured.map(|m| (m.place, m.ident)).collect()
+        }
+        None => return Cow::Borrowed(&device.device),
+    };
     let mut hardware = Device::clone(&device.device);
     let mut places = Vec::new();
     for slot in &slots.slots {
@@ -239,14 +244,12 @@ fn with_configured_modules(device: &DeviceConfig) -> Cow<'_, Device> {
             let mut place = slot.clone();
             place.max_instances = 1;
             place.min_instances = place.min_instances.min(1);
-            let module = selection.modules.iter().find(|m| m.place == places.len());
+            let module = plugged.iter().find(|(at, _)| *at == places.len());
             place.module_idents.iter_mut().for_each(|(_, d)| *d = false);
-            if let Some(module) = module {
+            if let Some((_, module)) = module {
                 // The module may fit only by its class, so its ident is added.
-                place
-                    .module_idents
-                    .retain(|(ident, _)| *ident != module.ident);
-                place.module_idents.push((module.ident, true));
+                place.module_idents.retain(|(ident, _)| ident != module);
+                place.module_idents.push((*module, true));
             }
             places.push(place);
         }
@@ -273,6 +276,15 @@ fn with_own_numbers(image: &[u8], serial: u32, alias: u16) -> Vec<u8> {
     image
 }
 
+fn startup_write(sdo: &StartupSdo) -> StartupWrite {
+    StartupWrite {
+        index: sdo.index,
+        sub: sdo.sub,
+        complete_access: sdo.complete_access,
+        data: sdo.data.clone(),
+    }
+}
+
 fn sim_device(
     machine: &Machine,
     device: &DeviceConfig,
@@ -295,6 +307,7 @@ fn sim_device(
         // A slow device also reads AL control soon.
         state_notice_ns: Some(usual.state_change_ns / 4),
         gateway: device.sim.gateway.clone(),
+        quirks: device.sim.quirks,
         firmware: (device.device.identity.vendor == DEMONSTRATION).then(FirmwareOptions::default),
         ..usual
     };
@@ -316,10 +329,15 @@ fn sim_device(
             plants[0].track = device.sim.track.track;
         }
         device.sim.motor.apply(&mut plants[number]);
+        plants[number].quirks = device.sim.quirks;
     }
     options.plant = plants.remove(0);
     options.further_plants = plants;
-    let hardware = with_configured_modules(device);
+    let hardware = with_plugged_modules(device);
+    options.modules_are_hardware = matches!(hardware, Cow::Owned(_));
+    let own = device.selection.startup.iter();
+    let own = own.filter(|sdo| sdo.origin == SDO_OF_MACHINE_FILE);
+    options.startup = own.map(startup_write).collect();
     if let Some(image) = &device.sii {
         options.serial = device.serial.unwrap_or(image.sii.serial);
         options.sii = Some(with_own_numbers(

@@ -129,6 +129,7 @@ impl RunBuilder<'_> {
                 let mut exchange =
                     Exchange::new(&bus.image, bus.dc.as_ref(), &members, config.exchange);
                 preset_outputs(machine, &bus, &mut exchange);
+                exchange.keep_initial_outputs();
                 exchange.stage();
                 let bus_status = exchange.bus_status();
                 for (device, _) in bus.devices.enumerate().filter(|(_, d)| !d.present) {
@@ -210,6 +211,8 @@ impl RunBuilder<'_> {
                     buttons: Buttons::default(),
                     mailbox_gateway: None,
                     resets: None,
+                    inquiries: None,
+                    inquired: None,
                     ethernet: Ethernet::new(
                         network,
                         ethernet,

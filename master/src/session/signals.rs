@@ -76,6 +76,7 @@ pub fn stop_on_signals(
         let mut first: Option<Instant> = None;
         loop {
             let hung_up = tokio::select! {
+                biased;
                 _ = interrupt.recv() => false,
                 _ = terminate.recv() => false,
                 () = received(&mut hang_up) => true,

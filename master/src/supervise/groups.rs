@@ -6,9 +6,9 @@ use std::sync::Arc;
 use ecaxis_ecat::index::{AxisIndex, GroupIndex};
 
 use super::Supervisor;
-use crate::config::{Action, Step};
+use super::failure_reader::{Findings, Inquiry, StopDetails};
+use crate::config::{Action, OutputRef, Step};
 use crate::post_mortem::Witnessed;
-use crate::post_mortem::snapshot::Depth;
 use crate::report::{Cause, Error, GroupStop, Progress};
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::Snapshot;
@@ -25,6 +25,14 @@ pub struct StoppedGroup {
     pub released: bool,
     /// All devices of the group are optional, and no axis had power: no failure.
     pub idle: bool,
+}
+
+/// A stop whose devices are being read.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct InquiredStop {
+    group: GroupIndex,
+    number: u32,
+    idle: bool,
 }
 
 impl Supervisor {
@@ -46,8 +54,43 @@ impl Supervisor {
         last.filter(|stop| !stop.released)
     }
 
-    /// Reports groups that stopped or were released since the last call.
-    pub(super) async fn report_stopped_groups(&mut self, snapshot: &Snapshot) {
+    /// Returns the groups that have stopped, as far as this is reported.
+    pub(super) fn stopped_groups(&self) -> Vec<GroupIndex> {
+        let stops = self.stopped.iter().filter(|stop| !stop.released);
+        stops.map(|stop| stop.group).collect()
+    }
+
+    /// Returns the error that stopped the last group without this axis.
+    pub(super) fn stop_of_others(&self, axis: AxisIndex) -> Option<Arc<Error>> {
+        let own = self.group_of(axis);
+        let mut others = self.stopped.iter().rev();
+        let last = others.find(|stop| !stop.released && stop.group != own)?;
+        Some(Arc::clone(&last.cause))
+    }
+
+    /// Reports groups that stopped or were released since the last call. The devices of a stopped
+    /// group are read meanwhile. Returns true once every stop is reported.
+    pub(super) async fn report_stopped_groups(&mut self, snapshot: &Snapshot) -> bool {
+        loop {
+            let Some(mut inquiries) = self.inquiries.take() else {
+                return true;
+            };
+            let findings = inquiries.findings.try_recv().ok();
+            self.inquiries = Some(inquiries);
+            if let Some(findings) = findings {
+                self.take_findings(findings).await;
+            } else if self.inquired.is_some() {
+                return false;
+            }
+            if !self.inquire_next(snapshot) {
+                return true;
+            }
+        }
+    }
+
+    /// Reports released groups. Requests the cause of the next stop that is not reported. Returns
+    /// false if there is none.
+    fn inquire_next(&mut self, snapshot: &Snapshot) -> bool {
         // Followers come last: the stop of the group they followed explains theirs.
         let follows = |now: &GroupStatus| matches!(now.stopped, Some(StopCause::FollowLost { .. }));
         let groups = snapshot.groups.enumerate();
@@ -66,31 +109,54 @@ impl Supervisor {
                 self.report(Progress::GroupReleased { group });
             }
             // A stop that has already ended has no cause any more.
-            if let Some(cause) = now.stopped
-                && now.stops != reported
-            {
-                let idle = self.machine.is_optional(group) && !now.powered;
-                let cause = self.explain_stop(cause, Some(group), snapshot).await;
-                let cause = Arc::new(cause);
-                let witnessed = Witnessed {
-                    looks: self.look(Depth::Brief).await,
-                    group: Some(group),
-                };
-                self.stopped.push(StoppedGroup {
-                    group,
-                    number: now.stops,
-                    cause: Arc::clone(&cause),
-                    witnessed,
-                    released: false,
-                    idle,
-                });
-                let group = self.group_name(group);
-                self.report(match idle {
-                    true => Progress::GroupWaits { group },
-                    false => Progress::GroupStopped { group, cause },
-                });
-            }
+            let Some(cause) = now.stopped.filter(|_| now.stops != reported) else {
+                continue;
+            };
+            let stop = StopDetails {
+                cause,
+                group: Some(group),
+                stopped: self.stopped_groups(),
+                followed: cause.axis().and_then(|axis| self.stop_of_others(axis)),
+            };
+            self.inquired = Some(InquiredStop {
+                group,
+                number: now.stops,
+                idle: self.machine.is_optional(group) && !now.powered,
+            });
+            let snapshot = snapshot.clone();
+            let inquiries = self.inquiries.as_ref().map(|port| &port.inquiries);
+            // There is one inquiry at a time, so it has room.
+            let sent =
+                inquiries.is_some_and(|port| port.try_send(Inquiry { stop, snapshot }).is_ok());
+            return sent;
         }
+        false
+    }
+
+    async fn take_findings(&mut self, findings: Findings) {
+        let Some(InquiredStop {
+            group,
+            number,
+            idle,
+        }) = self.inquired.take()
+        else {
+            return;
+        };
+        self.note_error_code(&findings.explanation).await;
+        let cause = Arc::new(findings.explanation.error);
+        self.stopped.push(StoppedGroup {
+            group,
+            number,
+            cause: Arc::clone(&cause),
+            witnessed: findings.witnessed,
+            released: false,
+            idle,
+        });
+        let group = self.group_name(group);
+        self.report(match idle {
+            true => Progress::GroupWaits { group },
+            false => Progress::GroupStopped { group, cause },
+        });
     }
 
     /// Returns the stops for the summary.
@@ -103,6 +169,33 @@ impl Supervisor {
                 released: stop.released,
             })
             .collect()
+    }
+
+    /// Fails if a device of these outputs was lost and its group is not reset yet: its outputs are off.
+    pub(super) async fn ensure_unlocked(
+        &mut self,
+        step: &Step,
+        values: &[(OutputRef, f64)],
+    ) -> Result<(), Error> {
+        let machine = Arc::clone(&self.machine);
+        let snapshot = self.poll_snapshot().await?;
+        let mut devices = values
+            .iter()
+            .filter_map(|(output, _)| Some(machine.outputs.get(output.0)?.device));
+        let locked = devices.find(|device| snapshot.locked_outputs.get(*device) == Some(&true));
+        let Some(device) = locked else {
+            return Ok(());
+        };
+        self.report_stopped_groups(&snapshot).await;
+        match self.stop_of(machine.group_of(device)) {
+            Some(stop) => Err(Cause::GroupStopped {
+                group: self.group_name(stop.group),
+                cause: Arc::clone(&stop.cause),
+            }
+            .with_device(&self.bus.devices[device].at)
+            .with_step(step)),
+            None => Ok(()),
+        }
     }
 
     /// Fails with the cause of the first of these axes whose group is stopped.

@@ -39,7 +39,8 @@ use clock_tree::ClockTree;
 use common_start::AlignmentWait;
 pub(crate) use common_start::CommonStart;
 pub use common_start::MAX_START_DELAY;
-use groups::StoppedGroup;
+use failure_reader::InquiryPort;
+use groups::{InquiredStop, StoppedGroup};
 pub(crate) use limits::{MissedTargets, ReportedLimits};
 pub(crate) use program::Buttons;
 pub use program::ProgramControl;
@@ -52,6 +53,7 @@ mod common_start;
 mod coordinated;
 pub(crate) mod diagnosis_history;
 mod explain;
+mod failure_reader;
 mod groups;
 mod limits;
 pub mod operator;
@@ -139,6 +141,9 @@ pub struct Supervisor {
     pub(crate) mailbox_gateway: Option<LivePublisher>,
     /// The resets of Sercos drives.
     pub(crate) resets: Option<ResetQueue>,
+    /// The task that reads the devices of stopped groups, and the stop that it explains.
+    pub(crate) inquiries: Option<InquiryPort>,
+    pub(crate) inquired: Option<InquiredStop>,
     /// The virtual switch between devices with EoE and an interface of this computer.
     pub ethernet: Ethernet,
     /// The propagation delays in the closed ring, with cable redundancy.
@@ -170,18 +175,21 @@ impl Supervisor {
         let latch = Arc::<Mutex<()>>::default();
         let ethernet = self.ethernet.serve();
         // The futures are large, and nothing needs them on the stack.
-        let (delays, offset, returns, resets) = (
+        let (delays, offset, returns, resets, inquiries) = (
             Box::pin(self.keep_delays(Arc::clone(&latch))),
             Box::pin(self.keep_offset()),
             Box::pin(self.return_devices(latch)),
             Box::pin(self.open_resets().run()),
+            Box::pin(self.open_inquiries().run()),
         );
         let work = async {
             let aside = async {
-                tokio::join!(delays, offset, returns, resets, ethernet);
+                tokio::join!(delays, offset, returns, resets, inquiries, ethernet);
                 std::future::pending::<Infallible>().await
             };
             tokio::select! {
+                // A random order would number datagrams at random.
+                biased;
                 done = Box::pin(self.run_inner()) => done,
                 never = aside => match never {},
             }
@@ -428,12 +436,16 @@ impl Supervisor {
         (brakes.fold(0.0, f64::max) * 1e9) as Nanos
     }
 
-    /// Waits for the next snapshot and reports stopped groups, for which it reads their devices.
+    /// Waits for the next snapshot and reports stopped groups. While their devices are read, it waits
+    /// for later snapshots.
     /// Fails if the cycle has stopped the machine.
     async fn poll_and_query(&mut self) -> Result<Snapshot, Error> {
-        let snapshot = self.poll_snapshot().await?;
-        self.report_stopped_groups(&snapshot).await;
-        Ok(snapshot)
+        loop {
+            let snapshot = self.poll_snapshot().await?;
+            if self.report_stopped_groups(&snapshot).await {
+                return Ok(snapshot);
+            }
+        }
     }
 
     /// Waits for the next snapshot without any device access. Fails if the cycle has stopped the
@@ -475,7 +487,7 @@ impl Supervisor {
         if let Some(cause) = snapshot.stopping
             && cause != StopCause::Requested
         {
-            return Err(self.explain_stop(cause, None, &snapshot).await);
+            return Err(self.explain_stop(cause, &snapshot).await);
         }
         self.follow_start(&snapshot)?;
         self.watch_buttons(&snapshot);

@@ -433,6 +433,7 @@ impl Turn<'_, '_> {
                 Err(Error::from(Cause::Alarm { text: text.clone() }).with_step(step))
             }
             Action::Set { values } => {
+                self.ensure_unlocked(step, values).await?;
                 let commands = values
                     .iter()
                     .map(|&(output, value)| RtCommand::Output { output, value });

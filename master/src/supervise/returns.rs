@@ -231,7 +231,7 @@ impl RunningSegment {
         unknown.reopen_ports(self, &lost).await?;
         if !without_address.is_empty() || unknown.look_again(self, &lost) {
             let found = self
-                .survey((&without_address, lost.len()), searches, unknown)
+                .survey((&without_address, &lost), searches, unknown)
                 .await?;
             present.extend(found);
         }
@@ -295,15 +295,11 @@ impl RunningSegment {
     /// Fails for devices that must not return by themselves. Nothing is written to them.
     fn check_permitted(&self, index: DeviceIndex, lost: &[DeviceIndex]) -> Result<(), Error> {
         let machine = &self.machine;
-        let why = if machine.outputs.iter().any(|signal| signal.device == index) {
-            "its outputs would be switched on without a command; restart the bus"
-        } else if machine.devices[index].selection.dc.is_some()
-            && self.running_sync(index, lost).is_none()
-        {
-            "no other device in Op has SYNC0, whose pulses it could join; restart the bus"
-        } else {
+        let clocked = machine.devices[index].selection.dc.is_some();
+        if !clocked || self.running_sync(index, lost).is_some() {
             return Ok(());
-        };
+        }
+        let why = "no other device in Op has SYNC0, whose pulses it could join; restart the bus";
         Err(Cause::Scan(why.to_owned()).with_device(&self.devices[index].at))
     }
 

@@ -1,6 +1,7 @@
 //! The way back from Op: standstill, then SafeOp, PreOp and Init.
 
-use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_axis::Trip;
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 use ecaxis_ecat::registers;
 
 use super::{BROADCAST_WAIT, Supervisor, TICK};
@@ -10,7 +11,7 @@ use crate::clock::{self, Nanos};
 use crate::post_mortem::snapshot;
 use crate::report::{Cause, Error, Progress};
 use crate::rt::bus_monitor::StopCause;
-use crate::rt::channel::RtCommand;
+use crate::rt::channel::{RtCommand, Snapshot};
 
 /// The time within which a gateway acknowledges the end of the exchange, in ns.
 const GATEWAY_END_NS: Nanos = 100_000_000;
@@ -143,6 +144,22 @@ impl Supervisor {
         }
     }
 
+    /// Reports the axes that lost their power before they were at rest. The error of the run names the
+    /// first cause alone.
+    fn report_axes_without_rest(&mut self, snapshot: &Snapshot) {
+        let groups = snapshot.groups.iter().filter_map(|group| group.stopped);
+        let causes = groups.chain(snapshot.failure).chain(snapshot.stopping);
+        let reported: Vec<AxisIndex> = causes.filter_map(|cause| cause.axis()).collect();
+        for (axis, status) in snapshot.axes.enumerate() {
+            if let Some(trip @ Trip::NotStopped { .. }) = status.trip
+                && !reported.contains(&axis)
+            {
+                let at = self.device_of(axis);
+                self.report(Progress::Warning(format!("{at}: {trip}")));
+            }
+        }
+    }
+
     /// Waits until nothing more can stop any axis. Each axis ends its stop in bounded time.
     async fn wait_for_standstill(&mut self, failed: bool) -> Result<(), Error> {
         loop {
@@ -162,11 +179,12 @@ impl Supervisor {
             clock::delay(TICK).await;
         }
         let snapshot = self.outer.snapshots.read().clone();
+        self.report_axes_without_rest(&snapshot);
         // The machine may have failed at the same time as the requested stop.
         let unsaid = snapshot.stopping.filter(|_| !failed);
         let mut causes = snapshot.failure.into_iter().chain(unsaid);
         if let Some(failure) = causes.find(StopCause::is_failure) {
-            return Err(self.explain_stop(failure, None, &snapshot).await);
+            return Err(self.explain_stop(failure, &snapshot).await);
         }
         // Axes of a stopped group may not answer; their group's stop has been reported.
         let mut axes = snapshot.axes.enumerate();

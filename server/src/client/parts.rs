@@ -74,6 +74,11 @@ impl Client {
                 output,
                 value,
             } => self.output(&device, &output, value),
+            Op::Node {
+                device,
+                node,
+                action,
+            } => self.node(&device, node, action),
             Op::SimInput { input, value } => self.sim_input(&input, value),
             Op::Override { factor, group } if (0.0..=MAX_RATE).contains(&factor) => {
                 let group = self.group(group.as_deref())?;
@@ -231,15 +236,57 @@ impl Client {
             of == device && (own.eq_ignore_ascii_case(name) || address.eq_ignore_ascii_case(name))
         });
         let Some((output, _)) = found else {
-            let message = format!("`{device}` has no output `{name}` that a client may set");
-            return Err(
-                OpError::new(ErrorCode::UnknownName, message).help("`machine` lists the outputs")
-            );
+            return Err(self.refused_output(device, name));
         };
         let output = *output;
         Ok(vec![Work::Request(MachineRequest::SetOutput {
             output,
             value,
+        })])
+    }
+
+    /// Returns why clients may not set an output: its owner, or that there is none.
+    fn refused_output(&self, device: &str, name: &str) -> OpError {
+        let message = format!("`{device}` has no output `{name}` that a client may set");
+        let unknown = OpError::new(ErrorCode::UnknownName, message);
+        match self.hub.machine.check_client_output(device, name) {
+            Err(error) => {
+                let (message, hint) = error.parts();
+                OpError::new(ErrorCode::UnknownName, message).help(hint)
+            }
+            Ok(()) => unknown.help("`machine` lists the outputs"),
+        }
+    }
+
+    fn node(&self, device: &str, id: u8, action: NodeAction) -> Result<Vec<Work>, OpError> {
+        let machine = &self.hub.machine;
+        let mut devices = machine.devices.enumerate();
+        let found = devices.find(|(_, known)| known.name == device);
+        let setup = found.and_then(|(index, known)| Some((index, known.gateway.as_ref()?)));
+        let Some((gateway, setup)) = setup else {
+            let message = format!("no gateway with nodes is named `{device}`");
+            return Err(
+                OpError::new(ErrorCode::UnknownName, message).help("`machine` lists the devices")
+            );
+        };
+        let Some(node) = setup.nodes.iter().position(|node| node.id == id) else {
+            let ids = setup.nodes.iter().map(|node| node.id.to_string());
+            let ids = ids.collect::<Vec<_>>().join(", ");
+            let message = format!("`{device}` has no node {id}");
+            return Err(
+                OpError::new(ErrorCode::UnknownName, message).help(format!("its nodes are {ids}"))
+            );
+        };
+        let command = match action {
+            NodeAction::Start => NodeCommand::Start,
+            NodeAction::Stop => NodeCommand::Stop,
+            NodeAction::PreOperational => NodeCommand::PreOperational,
+            NodeAction::Reset => NodeCommand::Reset,
+        };
+        Ok(vec![Work::Request(MachineRequest::Node {
+            gateway,
+            node,
+            command,
         })])
     }
 

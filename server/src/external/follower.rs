@@ -1,6 +1,6 @@
 //! An axis that follows the set-points of the cyclic area.
 
-use ecaxis_axis::setpoint::{Gear, GearConfig, GearInMode, Motion};
+use ecaxis_axis::setpoint::{Gear, GearConfig, GearInMode, Master, Motion, Rate, Setpoint};
 use ecaxis_axis::{Command, CommandError};
 use ecaxis_master::rt::controller::CycleContext;
 
@@ -185,7 +185,13 @@ impl Follower {
         let position = match &mut self.gear {
             None => self.path.position,
             Some(gear) => {
-                let next = gear.advance(self.path, at, machine.dt_s());
+                let master = Master {
+                    motion: self.path,
+                    comes_to_rest: false,
+                };
+                // A held axis refuses the set-point.
+                let mut following = gear.with_master(master);
+                let next = following.advance(at, Rate::WHOLE, machine.dt_s());
                 self.regular += u32::from(gear.engaged());
                 // The velocity of the set-points is regular again, too.
                 if gear.engaged() && self.regular >= REGULAR {

@@ -57,10 +57,10 @@ impl Hub {
         self.lock().step.clone()
     }
 
-    /// Remembers the value of an output.
-    pub fn set_output(&self, index: usize, value: f64) {
+    /// Remembers the value of an output; `None`: no client has set it, or its device was lost.
+    pub fn set_output(&self, index: usize, value: Option<f64>) {
         if let Some(output) = self.lock().outputs.get_mut(index) {
-            *output = Some(value);
+            *output = value;
         }
     }
 

@@ -392,3 +392,65 @@ fn a_client_presses_inputs_of_the_simulated_bus() {
     let refused = client.refused("sim_input", json!({"input": "start", "value": 2.0}));
     assert!(refused["message"].as_str().unwrap().contains("not a value"));
 }
+
+/// A client could cut the power of a drive behind a gateway, move its target and reset its node with
+/// `output`.
+#[test]
+fn nodes_and_control_words_of_gateways_are_commanded_by_requests_only() {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/mixed.toml");
+    let machine = ecaxis_master::config::load(&path).unwrap();
+    let server = Server::in_virtual_time(machine);
+    let mut client = server.owner("test");
+    client.done("enable", json!({"axis": "feed"}));
+    for (output, owner) in [
+        (
+            "Output byte 0000",
+            "is the control word of `gateway` in line",
+        ),
+        (
+            "Output byte 0001",
+            "is the control word of `gateway` in line",
+        ),
+        ("Output byte 0002", "carries 0x6040 of node 1 in line"),
+        ("Output byte 0005", "carries 0x607A of node 1 in line"),
+    ] {
+        let keys = json!({"device": "gateway", "output": output, "value": 64});
+        let error = client.refused("output", keys);
+        let text = error["message"].as_str().unwrap();
+        assert!(
+            text.contains(owner) && text.contains("a client may not write it"),
+            "{error}"
+        );
+    }
+    let node =
+        |action: &str| json!({"device": "gateway", "node": 1, "action": action, "wait": true});
+    for action in ["stop", "pre_operational", "reset", "start"] {
+        let error = client.refused("node", node(action));
+        let text = error["message"].as_str().unwrap();
+        assert!(text.contains("`feed`: the axis has power"), "{error}");
+    }
+    for (keys, part) in [
+        (json!({"device": "x", "node": 1, "action": "stop"}), "`x`"),
+        (
+            json!({"device": "gateway", "node": 9, "action": "stop"}),
+            "no node 9",
+        ),
+    ] {
+        let error = client.refused("node", keys);
+        assert!(error["message"].as_str().unwrap().contains(part), "{error}");
+    }
+    for action in ["stop", "pre_operational", "reset"] {
+        client.done("disable", json!({"axis": "feed"}));
+        client.done("node", node(action));
+        client.advance(2.0);
+        // The node is not lost: its axis and the others go on.
+        let feed = client.axis("feed");
+        assert_eq!(feed["trip"], json!(null), "{action}: {feed}");
+        if action != "reset" {
+            client.done("node", node("start"));
+        }
+        client.advance(1.0);
+        client.done("enable", json!({"axis": "feed"}));
+        client.done("move", json!({"axis": "feed", "by": 1.0}));
+    }
+}

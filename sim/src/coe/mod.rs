@@ -5,6 +5,7 @@
 //! * `datatype`: data types, their codes and ranges
 //! * `objects`: reading and writing with access rights and complete access
 //! * `pdo`: PDO assignment and mapping, modules
+//! * `startup`: start-up downloads that are accepted whatever the dictionary says
 //! * `sdo`: the SDO server: expedited, normal and segmented transfers
 //! * `info`: SDO Information: the list of objects
 //! * `history`: the diagnosis history
@@ -20,6 +21,7 @@ pub mod object_dictionary;
 mod objects;
 pub mod pdo;
 mod sdo;
+pub mod startup;
 mod word;
 
 pub use abort::Abort;
@@ -42,6 +44,8 @@ mod service {
 pub(crate) struct CoeServices {
     pub(crate) sdo_info: bool,
     pub(crate) segmented: bool,
+    /// An abort has the index without its low byte.
+    pub(crate) abort_index_word: bool,
     /// Maximum bytes of a segmented transfer.
     pub(crate) buffer: usize,
 }

@@ -40,6 +40,8 @@ pub struct Item {
     pub max: Option<Bytes>,
     /// The only values that a client may write.
     pub choices: Option<&'static [i64]>,
+    /// A client's write is confirmed and changes nothing.
+    pub ignores_writes: bool,
     place: WordRef,
 }
 
@@ -97,7 +99,13 @@ impl ObjectStore {
                 }
                 store.describe(object.index, object.code, &object.name);
                 for item in &object.items {
-                    let data_type = data_type(&item.type_name, item.bit_len);
+                    // ETG.1000.6: subindex 0 of an object with subindices is an UNSIGNED8. Some
+                    // files describe it with the 16 bits that it takes under complete access.
+                    let is_count = item.sub == 0 && object.code != ObjectCode::Var;
+                    let (bit_len, data_type) = match item.bit_len {
+                        16 if is_count => (8, datatype::unsigned(8)),
+                        bits => (bits, data_type(&item.type_name, bits)),
+                    };
                     store.insert(
                         Item {
                             index: object.index,
@@ -107,10 +115,10 @@ impl ObjectStore {
                             } else {
                                 item.name.to_string()
                             },
-                            bit_len: item.bit_len,
+                            bit_len,
                             bit_offset: item.bit_offset,
                             data_type,
-                            kind: datatype::kind(data_type, item.bit_len),
+                            kind: datatype::kind(data_type, bit_len),
                             access: item.access,
                             mapping: item.pdo_mapping,
                             backup: item.backup,
@@ -120,6 +128,7 @@ impl ObjectStore {
                             min: item.min.clone(),
                             max: item.max.clone(),
                             choices: None,
+                            ignores_writes: false,
                             place: WordRef::new(0, 0, false),
                         },
                         &item.default,
@@ -275,6 +284,7 @@ impl ObjectStore {
                 min: None,
                 max: None,
                 choices: None,
+                ignores_writes: false,
                 place: WordRef::new(0, 0, false),
             },
             default,
@@ -369,6 +379,13 @@ impl ObjectStore {
     pub fn set_choices(&mut self, slot: EntryHandle, choices: &'static [i64]) {
         if let Some(item) = self.items.get_mut(slot.n as usize) {
             item.choices = Some(choices);
+        }
+    }
+
+    /// Makes the item keep its value when a CoE client writes it.
+    pub fn ignore_writes(&mut self, slot: EntryHandle) {
+        if let Some(item) = self.items.get_mut(slot.n as usize) {
+            item.ignores_writes = true;
         }
     }
 

@@ -4,6 +4,7 @@ use ecaxis_esi::model::{ObjectCode, Writable};
 
 use super::object_dictionary::{EntryHandle, Item, ObjectStore};
 use super::pdo::PdoRules;
+use super::startup::StartupWrites;
 use super::{Abort, datatype, history};
 use crate::coe::datatype::Kind;
 use crate::esc::al::AlState;
@@ -29,6 +30,8 @@ pub(crate) struct Dictionary<'a> {
     pub(crate) pdo: &'a mut PdoRules,
     pub(crate) state: AlState,
     pub(crate) complete_access: bool,
+    /// The downloads that are accepted whatever the dictionary says.
+    pub(crate) startup: &'a StartupWrites,
     /// Rejects writes to objects in a PDO that is currently received.
     pub(crate) refuse_mapped: bool,
     /// Injected aborts: index, subindex, code.
@@ -83,7 +86,9 @@ impl Dictionary<'_> {
         if !self.store.has_object(index) {
             return Err(Abort::NO_OBJECT);
         }
-        if !self.complete_access || sub > 1 {
+        let is_supported =
+            self.complete_access || self.startup.capacity(index, sub, true).is_some();
+        if !is_supported || sub > 1 {
             return Err(Abort::UNSUPPORTED_ACCESS);
         }
         if ENUMERATIONS.contains(&index) {
@@ -156,6 +161,16 @@ impl Dictionary<'_> {
     /// Returns the maximum bytes of a download, so that a transfer that cannot succeed is rejected
     /// at once.
     pub(crate) fn capacity(&self, index: u16, sub: u8, complete: bool) -> Result<usize, Abort> {
+        let startup = self.startup.capacity(index, sub, complete);
+        let by_dictionary = self.capacity_by_dictionary(index, sub, complete);
+        match (startup, by_dictionary) {
+            (Some(startup), Ok(capacity)) => Ok(startup.max(capacity)),
+            (Some(startup), Err(Abort::READ_ONLY | Abort::WRONG_STATE)) => Ok(startup),
+            (_, by_dictionary) => by_dictionary,
+        }
+    }
+
+    fn capacity_by_dictionary(&self, index: u16, sub: u8, complete: bool) -> Result<usize, Abort> {
         if self.is_whole(index, sub, complete)? {
             let ends = self.places(index, sub, i64::MAX).map(|(_, item, at)| {
                 at + (item.bit_len as usize).max(if item.sub == 0 { 16 } else { 0 })
@@ -177,41 +192,43 @@ impl Dictionary<'_> {
         complete: bool,
         data: &[u8],
     ) -> Result<(), Abort> {
-        if self.is_whole(index, sub, complete)? {
-            self.write_all(index, sub, data)
-        } else {
-            self.write_item(index, sub, data)
+        let is_startup = self.startup.contains(index, sub, complete, data);
+        match self.is_whole(index, sub, complete)? {
+            true if is_startup => self.overwrite_all(index, sub, data),
+            true => self.write_all(index, sub, data),
+            false => self.write_item(index, sub, data, is_startup),
         }
     }
 
-    fn write_item(&mut self, index: u16, sub: u8, data: &[u8]) -> Result<(), Abort> {
+    /// Writes an item. A start-up download is written as far as the item reaches.
+    fn write_item(
+        &mut self,
+        index: u16,
+        sub: u8,
+        data: &[u8],
+        is_startup: bool,
+    ) -> Result<(), Abort> {
         let (_, item) = self.find(index, sub)?;
-        self.check_access(item)?;
+        if !is_startup {
+            self.check_access(item)?;
+        }
         if let Some(processor) = &mut self.processor
             && processor.serves(index, sub)
         {
             return processor.write(index, data, self.state);
         }
         let (slot, item) = self.find(index, sub)?;
-        let len = item.bit_len.div_ceil(8) as usize;
-        if data.len() > len {
-            return Err(Abort::TOO_LONG);
-        }
-        if data.len() < len && item.kind != Kind::Text {
-            return Err(Abort::TOO_SHORT);
+        if !is_startup {
+            check_length(item, data)?;
         }
         if matches!(index, STORE_PARAMETERS | RESTORE_PARAMETERS) && sub > 0 {
             self.command = Some(command(index, data)?);
             return Ok(());
         }
-        let (min, max) = (item.min.as_deref(), item.max.as_deref());
-        datatype::check(item.kind, item.bit_len, data, min, max)?;
-        if let Some(choices) = item.choices
-            && !choices.contains(&extended(data))
-        {
-            return Err(Abort::VALUE);
+        if !is_startup {
+            check_range(item, data)?;
         }
-        if self.ignored.contains(&(index, sub)) {
+        if item.ignores_writes || self.ignored.contains(&(index, sub)) {
             return Ok(());
         }
         if history::is_acknowledgement(index, sub) {
@@ -265,13 +282,45 @@ impl Dictionary<'_> {
             return Err(refused);
         }
         if list && first == 0 {
-            self.write_item(index, 0, &[0])?;
+            self.write_item(index, 0, &[0], false)?;
             // Moves the count to the end.
             values.rotate_left(1);
         }
         values
             .iter()
-            .try_for_each(|(sub, value)| self.write_item(index, *sub, value))
+            .try_for_each(|(sub, value)| self.write_item(index, *sub, value, false))
+    }
+
+    /// Writes a complete-access start-up download as far as the items reach.
+    fn overwrite_all(&mut self, index: u16, first: u8, data: &[u8]) -> Result<(), Abort> {
+        let places: Vec<_> = self
+            .places(index, first, i64::MAX)
+            .map(|(slot, item, at)| (slot, at, item.bit_len as usize))
+            .collect();
+        for (slot, at, bits) in places {
+            crate::bits::copy(self.store.bytes_mut(slot), 0, data, at, bits);
+        }
+        Ok(())
+    }
+}
+
+fn check_length(item: &Item, data: &[u8]) -> Result<(), Abort> {
+    let len = item.bit_len.div_ceil(8) as usize;
+    if data.len() > len {
+        return Err(Abort::TOO_LONG);
+    }
+    if data.len() < len && item.kind != Kind::Text {
+        return Err(Abort::TOO_SHORT);
+    }
+    Ok(())
+}
+
+fn check_range(item: &Item, data: &[u8]) -> Result<(), Abort> {
+    let (min, max) = (item.min.as_deref(), item.max.as_deref());
+    datatype::check(item.kind, item.bit_len, data, min, max)?;
+    match item.choices {
+        Some(choices) if !choices.contains(&extended(data)) => Err(Abort::VALUE),
+        _ => Ok(()),
     }
 }
 

@@ -2,7 +2,7 @@
 //! of modules, and the resulting bit layout.
 
 use ecaxis_esi::model::{
-    Access, Device, Direction, Module, ObjectCode, Pdo, Slot, SmUse, Writable,
+    Access, Device, Direction, Entry, Module, ObjectCode, Pdo, Slot, SmUse, Writable,
 };
 
 use super::Abort;
@@ -23,6 +23,8 @@ struct KnownPdo {
     index: u16,
     direction: Direction,
     fixed: bool,
+    /// True if one cycle may contain several samples.
+    oversampled: bool,
     exclude: Vec<u16>,
 }
 
@@ -71,7 +73,7 @@ impl DefaultPdos {
             let Some(module) = modules.iter().find(|m| Some(m.ident) == default) else {
                 continue;
             };
-            let module = module.at(slots, slot, position);
+            let module = module.at(device, slots, slot, position);
             all.rx.extend(module.rx_pdos);
             all.tx.extend(module.tx_pdos);
         }
@@ -91,12 +93,83 @@ pub struct PdoRules {
     modules: Vec<ModulePdos>,
     /// The module idents that each slot accepts.
     slots: Vec<Vec<u32>>,
+    /// True if the slots hold hardware, so the detected modules do not follow the configured ones.
+    modules_are_hardware: bool,
     /// The entries (direction, index << 8 | sub) of the ESI's PDOs. They are mappable regardless of
     /// flags.
     known_entries: Vec<(Direction, u32)>,
-    /// The assignments that OpModes and alternative mappings of the ESI name. Their PDOs do not
-    /// exclude each other.
-    named: Vec<Vec<u16>>,
+    /// The default assignments and those that OpModes and alternative mappings of the ESI name.
+    named: Vec<NamedAssignment>,
+    /// True if a MainDevice may write the assignment, and if it may write the mapping.
+    assign: bool,
+    config: bool,
+}
+
+/// The PDOs of one SyncManager that the ESI assigns together, with their samples. They do not
+/// exclude each other.
+#[derive(Debug, Clone)]
+struct NamedAssignment {
+    sm: u8,
+    /// PDO indices and their mapping entries.
+    contents: Vec<(u16, Vec<u32>)>,
+    bits: usize,
+}
+
+impl NamedAssignment {
+    fn new(sm: u8, pdos: &[Pdo]) -> Self {
+        let contents = |pdo: &Pdo| (pdo.index, pdo.entries.iter().map(Entry::mapping).collect());
+        Self {
+            sm,
+            contents: pdos.iter().map(contents).collect(),
+            bits: pdos.iter().map(|pdo| pdo.bit_len() as usize).sum(),
+        }
+    }
+
+    fn contains(&self, pdo: u16) -> bool {
+        self.contents.iter().any(|(index, _)| *index == pdo)
+    }
+
+    fn indices(&self) -> Vec<u16> {
+        self.contents.iter().map(|(index, _)| *index).collect()
+    }
+
+    fn bytes(&self) -> usize {
+        self.bits.div_ceil(8)
+    }
+}
+
+/// Returns a PDO with its samples, or alone if the factor is impossible.
+fn sampled(pdo: &Pdo, factor: u16) -> Vec<Pdo> {
+    pdo.samples(factor).unwrap_or_else(|| vec![pdo.clone()])
+}
+
+/// Returns the samples per cycle of a PDO that no OpMode assigns.
+fn default_factor(pdo: &Pdo) -> u16 {
+    pdo.oversampling.map_or(1, |sampling| sampling.factor)
+}
+
+/// Returns the assignments that OpModes and alternative mappings name.
+fn named_assignments(device: &Device) -> Vec<(u8, Vec<Pdo>)> {
+    let modes = device.dc_modes.iter();
+    let modes = modes.map(|mode| (&mode.sync_managers, &mode.oversampling));
+    let mappings = device.sm_mappings.iter();
+    let mappings = mappings.map(|mapping| (&mapping.sync_managers, &mapping.oversampling));
+    let mut named = Vec::new();
+    for (sync_managers, factors) in modes.chain(mappings) {
+        for (sm, pdos) in sync_managers.iter().filter(|(_, pdos)| !pdos.is_empty()) {
+            let mut all = Vec::new();
+            for index in pdos {
+                let mut own = device.rx_pdos.iter().chain(&device.tx_pdos);
+                let Some(pdo) = own.find(|pdo| pdo.index == *index && !pdo.virtual_) else {
+                    continue;
+                };
+                let factor = factors.iter().find(|(of, _)| of == index);
+                all.extend(sampled(pdo, factor.map_or(1, |(_, factor)| *factor)));
+            }
+            named.push((*sm, all));
+        }
+    }
+    named
 }
 
 impl PdoRules {
@@ -110,11 +183,21 @@ impl PdoRules {
             .and_then(|mailbox| mailbox.coe.as_ref());
         // S-0-0016 and S-0-0024 list the contents of a Sercos drive's telegrams.
         let sercos = device.soe_only().is_some();
-        let (assign, config) = coe.map_or((false, sercos), |coe| (coe.pdo_assign, coe.pdo_config));
-        for pdo in device.rx_pdos.iter().chain(&device.tx_pdos) {
-            rules.learn(store, pdo, config);
+        (rules.assign, rules.config) =
+            coe.map_or((false, sercos), |coe| (coe.pdo_assign, coe.pdo_config));
+        // The objects are those of the PDOs that are not virtual.
+        let mut of_device: Vec<&Pdo> = device.rx_pdos.iter().chain(&device.tx_pdos).collect();
+        of_device.sort_by_key(|pdo| pdo.virtual_);
+        for pdo in of_device {
+            if let Some(first) = sampled(pdo, default_factor(pdo)).first() {
+                rules.learn(store, first);
+            }
         }
-        rules.learn_modules(store, device, modules, config);
+        let named = named_assignments(device);
+        for pdo in named.iter().flat_map(|(_, pdos)| pdos) {
+            rules.learn(store, pdo);
+        }
+        rules.learn_modules(store, device, modules);
         let plugged = DefaultPdos::new(device, modules);
         for (n, sm) in device.sync_managers.iter().enumerate().take(8) {
             let direction = match sm.usage {
@@ -133,39 +216,48 @@ impl PdoRules {
                 Direction::Rx => (&device.rx_pdos, &plugged.rx),
                 Direction::Tx => (&device.tx_pdos, &plugged.tx),
             };
-            let mut assigned = Vec::new();
+            let mut default: Vec<Pdo> = Vec::new();
             for pdo in own.iter().chain(plugged).filter(|pdo| pdo.sm == Some(n)) {
                 // A module may overwrite a PDO of the device.
-                if !assigned.contains(&pdo.index) {
-                    assigned.push(pdo.index);
+                if !default.iter().any(|other| other.index == pdo.index) {
+                    default.extend(sampled(pdo, default_factor(pdo)));
                 }
             }
-            let room = MAX_ASSIGNED.max(u8::try_from(assigned.len()).unwrap_or(u8::MAX));
+            for pdo in &default {
+                rules.learn(store, pdo);
+            }
+            let assigned: Vec<u16> = default.iter().map(|pdo| pdo.index).collect();
+            rules.named.push(NamedAssignment::new(n, &default));
+            let own_named = named.iter().filter(|(sm, _)| *sm == n);
+            let own_named = own_named.map(|(_, pdos)| NamedAssignment::new(n, pdos));
+            rules.named.extend(own_named);
+            let of_sm = rules.named.iter().filter(|named| named.sm == n);
+            let longest = of_sm.map(|named| named.contents.len()).max();
+            let longest = u8::try_from(longest.unwrap_or(0)).unwrap_or(u8::MAX);
+            let room = MAX_ASSIGNED.max(longest);
             let index = ASSIGNMENT + u16::from(n);
             let name = format!("SyncManager {n} PDO assignment");
             store.describe(index, ObjectCode::Array, &name);
-            rules.fill(store, index, 16, &assigned, room, assign);
+            rules.fill(store, index, 16, &assigned, room, rules.assign);
         }
-        let modes = device.dc_modes.iter().map(|mode| &mode.sync_managers);
-        let mappings = device.sm_mappings.iter().map(|m| &m.sync_managers);
-        let named = modes.chain(mappings).flatten();
-        rules.named = named.map(|(_, pdos)| pdos.clone()).collect();
         rules.plug_defaults(store, device);
         rules
     }
 
-    fn learn(&mut self, store: &mut ObjectStore, pdo: &Pdo, config: bool) {
+    fn learn(&mut self, store: &mut ObjectStore, pdo: &Pdo) {
         let index = pdo.index;
         if !self.pdos.iter().any(|known| known.index == index) {
             self.pdos.push(KnownPdo {
                 index,
                 direction: pdo.direction,
                 fixed: pdo.fixed,
+                oversampled: pdo.oversampling.is_some(),
                 exclude: pdo.exclude.iter().map(|other| other.index).collect(),
             });
             let entries: Vec<u32> = pdo.entries.iter().map(|entry| entry.mapping()).collect();
             store.describe(index, ObjectCode::Record, &pdo.name);
-            self.fill(store, index, 32, &entries, MAX_MAPPED, config && !pdo.fixed);
+            let writable = self.config && !pdo.fixed;
+            self.fill(store, index, 32, &entries, MAX_MAPPED, writable);
         }
         for entry in pdo.entries.iter().filter(|entry| !entry.is_gap()) {
             let access = Access {
@@ -181,6 +273,9 @@ impl PdoRules {
             let slot = store.ensure(entry.index, entry.sub, &entry.name, bits, access, &[]);
             if new {
                 store.set_type(slot, &entry.data_type);
+            } else if pdo.oversampling.is_some() {
+                // All samples of a cycle may be one object.
+                store.lengthen(slot, bits);
             }
             let key = (pdo.direction, entry.mapping() >> 8);
             if !self.known_entries.contains(&key) {
@@ -189,13 +284,7 @@ impl PdoRules {
         }
     }
 
-    fn learn_modules(
-        &mut self,
-        store: &mut ObjectStore,
-        device: &Device,
-        modules: &[Module],
-        config: bool,
-    ) {
+    fn learn_modules(&mut self, store: &mut ObjectStore, device: &Device, modules: &[Module]) {
         let Some(slots) = &device.slots else { return };
         for (position, slot) in expand(slots).enumerate() {
             self.slots
@@ -208,10 +297,10 @@ impl PdoRules {
                 {
                     continue;
                 }
-                let module = module.at(slots, slot, position);
+                let module = module.at(device, slots, slot, position);
                 let mut contents = Vec::new();
                 for pdo in module.rx_pdos.iter().chain(&module.tx_pdos) {
-                    self.learn(store, pdo, config);
+                    self.learn(store, pdo);
                     contents.push((
                         pdo.index,
                         pdo.entries.iter().map(|entry| entry.mapping()).collect(),
@@ -324,6 +413,54 @@ impl PdoRules {
             .find(|sm| ASSIGNMENT + u16::from(sm.sm) == index)
     }
 
+    /// Makes the present modules hardware.
+    pub(crate) fn fix_modules(&mut self) {
+        self.modules_are_hardware = true;
+    }
+
+    /// True if the configured modules (0xF030) differ from the detected ones (0xF050).
+    pub(crate) fn modules_differ(&self, store: &ObjectStore) -> bool {
+        let module = |list: u16, sub: u8| {
+            let listed = i64::from(sub) <= count(store, list);
+            let slot = store.slot(list, sub).filter(|_| listed);
+            slot.map_or(0, |slot| store.get(slot))
+        };
+        self.modules_are_hardware
+            && (1..=u8::MAX).any(|sub| module(MODULE_LIST, sub) != module(DETECTED_MODULES, sub))
+    }
+
+    /// Takes the assignment of the ESI whose length a SyncManager has. A device without PDO
+    /// assignment, or with all samples in one PDO, has no object for the OpMode of the MainDevice.
+    pub(crate) fn adopt(&self, store: &mut ObjectStore, sm: u8, len: usize) {
+        if self.layout(store, sm, &mut Vec::new()) == len {
+            return;
+        }
+        let index = ASSIGNMENT + u16::from(sm);
+        let assigned: Vec<u16> = elements(store, index, count(store, index))
+            .map(|pdo| pdo as u16)
+            .collect();
+        let mut of_sm = self.named.iter().filter(|named| named.sm == sm);
+        let Some(named) = of_sm.find(|named| {
+            let pdos = named.indices();
+            named.bytes() == len && (!self.assign || pdos == assigned)
+        }) else {
+            return;
+        };
+        self.fill(store, index, 16, &named.indices(), 0, self.assign);
+        for (pdo, entries) in &named.contents {
+            if self.pdo(*pdo).is_some_and(|pdo| pdo.oversampled) {
+                let writable = self.config && self.pdo(*pdo).is_some_and(|pdo| !pdo.fixed);
+                self.fill(store, *pdo, 32, entries, 0, writable);
+            }
+        }
+    }
+
+    /// Returns the bytes of the longest assignment that the ESI names for a SyncManager.
+    pub(crate) fn longest_named(&self, sm: u8) -> usize {
+        let of_sm = self.named.iter().filter(|named| named.sm == sm);
+        of_sm.map(NamedAssignment::bytes).max().unwrap_or(0)
+    }
+
     /// Rejects a write that makes assignment or mapping invalid.
     pub(crate) fn before_write(
         &self,
@@ -373,7 +510,9 @@ impl PdoRules {
         if index == MODULE_LIST && sub > 0 {
             let ident = u32::try_from(value).unwrap_or(0);
             self.plug(store, usize::from(sub) - 1, ident);
-            if let Some(slot) = store.slot(DETECTED_MODULES, sub) {
+            if !self.modules_are_hardware
+                && let Some(slot) = store.slot(DETECTED_MODULES, sub)
+            {
                 store.set(slot, value);
             }
         }
@@ -406,7 +545,7 @@ impl PdoRules {
     }
 
     fn check_entry(&self, store: &ObjectStore, pdo: u16, value: i64) -> Result<(), Abort> {
-        let Some(direction) = self.pdo(pdo).map(|pdo| pdo.direction) else {
+        let Some(pdo) = self.pdo(pdo) else {
             return Err(Abort::NOT_MAPPABLE);
         };
         let value = u32::try_from(value).map_err(|_| Abort::VALUE)?;
@@ -418,7 +557,10 @@ impl PdoRules {
         let Some(item) = store.slot(index, sub).and_then(|slot| store.item(slot)) else {
             return Err(Abort::NOT_MAPPABLE);
         };
-        if self.mappable(direction, item) && item.bit_len & 0xff == u32::from(bits) {
+        let bits = u32::from(bits);
+        // An object of samples has the length of the most samples.
+        let fits = item.bit_len & 0xff == bits || pdo.oversampled && bits <= item.bit_len;
+        if self.mappable(pdo.direction, item) && fits {
             Ok(())
         } else {
             Err(Abort::NOT_MAPPABLE)
@@ -455,7 +597,7 @@ impl PdoRules {
         count: i64,
     ) -> Result<(), Abort> {
         let assigned: Vec<u16> = elements(store, index, count).map(|v| v as u16).collect();
-        let in_one = |pdos: &Vec<u16>| assigned.iter().all(|pdo| pdos.contains(pdo));
+        let in_one = |named: &NamedAssignment| assigned.iter().all(|pdo| named.contains(*pdo));
         let mut pdos = assigned.iter().filter_map(|index| self.pdo(*index));
         let excluded = pdos.any(|pdo| pdo.exclude.iter().any(|other| assigned.contains(other)));
         if excluded && !self.named.iter().any(in_one) {

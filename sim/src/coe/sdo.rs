@@ -112,7 +112,15 @@ impl SdoServer {
         };
         match result {
             Ok(reply) => Answer::One(reply),
-            Err(Refusal::Abort(code)) => Answer::One(abort(code, address)),
+            Err(Refusal::Abort(code)) => {
+                let (index, sub) = address;
+                let kept = if services.abort_index_word {
+                    0xff00
+                } else {
+                    0xffff
+                };
+                Answer::One(abort(code, (index & kept, sub)))
+            }
             Err(Refusal::Mailbox(detail)) => Answer::Error(detail),
         }
     }

@@ -248,7 +248,11 @@ impl SimDevice {
         self.store = self.fresh.store.clone();
         self.sercos = self.fresh.sercos.clone();
         let Application::Gateway(gateway) = &mut self.application else {
-            self.application = self.fresh.application.clone();
+            let before = std::mem::replace(&mut self.application, self.fresh.application.clone());
+            let drives = self.application.drives_mut().iter_mut();
+            for (drive, before) in drives.zip(before.drives()) {
+                drive.keep_position(before, &mut self.store);
+            }
             return;
         };
         // The configuration of the other network and its nodes survives a power cycle.
@@ -257,6 +261,7 @@ impl SimDevice {
                 gateway.prepare(store);
             });
             gateway.bind(&objects.store);
+            self.startup.prepare(&mut objects.store, &objects.pdo);
             objects.store.keep_defaults();
             self.fresh.store = objects.store.clone();
             (self.store, self.pdo, self.process) = (objects.store, objects.pdo, objects.process);

@@ -8,11 +8,12 @@ use super::esm::Al;
 use super::mailbox::{Mailbox, MailboxOptions};
 use super::process::ProcessData;
 use super::supervision::Supervision;
-use super::{Delays, MailboxLimits, PowerOnState, SimDevice};
+use super::{Delays, InputFault, MailboxLimits, PowerOnState, SimDevice};
 use crate::Nanos;
 use crate::coe::history;
 use crate::coe::object_dictionary::ObjectStore;
 use crate::coe::pdo::{PdoRules, expand};
+use crate::coe::startup::{StartupWrite, StartupWrites};
 use crate::drive::PlantParams;
 use crate::eoe::EoeServer;
 use crate::esc::chip::ChipRequirements;
@@ -22,6 +23,7 @@ use crate::esc::{Esc, EscConfig, EscInfo};
 use crate::firmware::{BootLoader, FirmwareOptions};
 use crate::foe::FileStore;
 use crate::gateway::{Gateway, GatewayError, GatewayOptions};
+use crate::quirks::Quirks;
 use crate::soe::{self, Sercos};
 
 /// The CiA 402 profile number.
@@ -64,11 +66,19 @@ pub struct DeviceOptions {
     /// The chip. `None`: the smallest chip that fits the device. Process RAM grows if SyncManagers
     /// need more.
     pub esc: Option<EscInfo>,
+    /// How the device differs from the standard, except for its drives.
+    pub quirks: Quirks,
     /// Mailbox properties.
     pub mailbox: MailboxOptions,
     /// The boot loader for firmware in Bootstrap and, if the ESI contains 0x1F51, through that
     /// object.
     pub firmware: Option<FirmwareOptions>,
+    /// True if the default modules of the slots are hardware: the device refuses SafeOp with other
+    /// modules in 0xF030. Otherwise it becomes what 0xF030 says.
+    pub modules_are_hardware: bool,
+    /// Further downloads that the device accepts even if its dictionary contradicts them, as it
+    /// accepts the InitCmds of its ESI.
+    pub startup: Vec<StartupWrite>,
     /// The options of a CANopen gateway and its nodes. A gateway without options has no nodes.
     pub gateway: Option<GatewayOptions>,
 }
@@ -90,8 +100,11 @@ impl Default for DeviceOptions {
             state_change_ns: 200_000,
             state_notice_ns: None,
             esc: None,
+            quirks: Quirks::default(),
             mailbox: MailboxOptions::default(),
             firmware: None,
+            modules_are_hardware: false,
+            startup: Vec::new(),
             gateway: None,
         }
     }
@@ -159,6 +172,10 @@ impl Objects {
                 sm: usize::from(sm.sm),
                 direction: sm.direction,
                 mode: sm.mode,
+                control: device
+                    .sync_managers
+                    .get(usize::from(sm.sm))
+                    .map_or(0, |sm| sm.control_byte),
                 op_only: device
                     .sync_managers
                     .get(usize::from(sm.sm))
@@ -210,7 +227,7 @@ impl SimDevice {
         if is_sercos {
             soe::prepare(&mut objects.store, device);
         }
-        let is_drive = is_sercos || device.mailbox.is_some() && is_drive(device, &objects.store);
+        let is_drive = is_sercos || is_drive(device, &objects.store);
         let mut sercos = None;
         let application = match gateway.take() {
             Some(mut gateway) => {
@@ -234,9 +251,12 @@ impl SimDevice {
         };
         let Objects {
             mut store,
-            pdo,
+            mut pdo,
             process,
         } = objects;
+        if options.modules_are_hardware {
+            pdo.fix_modules();
+        }
         let ram_end = ram_end.max(mapped_end(device, &pdo, &store)).min(0x1_0000);
         let ram_kib = count((ram_end - PROCESS_RAM).div_ceil(1024));
         let needs = ChipRequirements {
@@ -271,6 +291,10 @@ impl SimDevice {
             },
             image,
         );
+        let plugged = modules_at_places(device, modules);
+        let plugged = plugged.iter().map(|(module, _)| module);
+        let mut startup = StartupWrites::new(device, plugged, options.startup);
+        startup.prepare(&mut store, &pdo);
         store.keep_defaults();
         let coe = device
             .mailbox
@@ -313,7 +337,9 @@ impl SimDevice {
             sdo_info: coe.is_some_and(|coe| coe.sdo_info),
             has_boot: device.eeprom.bootstrap.iter().any(|b| *b != 0) && device.mailbox.is_some(),
             complete_access: coe.is_some_and(|coe| coe.complete_access),
-            mailbox_options: options.mailbox,
+            mailbox_options: options.mailbox.with(&options.quirks),
+            quirks: options.quirks,
+            startup,
             files: FileStore::default(),
             al: Al::default(),
             serial: options.serial,
@@ -329,6 +355,7 @@ impl SimDevice {
             refusals: Vec::new(),
             forced_aborts: Vec::new(),
             ignored_writes: Vec::new(),
+            input_fault: InputFault::default(),
             mailbox_silent: false,
             sync0_before_safe_op: false,
             activations: device
@@ -355,10 +382,10 @@ fn factory_image(device: &Device, modules: &[Module], options: &SiiOptions) -> V
     sii.to_bytes()
 }
 
-/// True for a drive profile, or if a dictionary or PDO of device or modules has Controlword and
-/// Statusword.
+/// True for a drive profile with a mailbox, or if a dictionary or PDO of device or modules has
+/// Controlword and Statusword.
 fn is_drive(device: &Device, store: &ObjectStore) -> bool {
-    device.profile == Some(DRIVE_PROFILE)
+    device.profile == Some(DRIVE_PROFILE) && device.mailbox.is_some()
         || [CONTROLWORD, STATUSWORD].map(|index| store.has_object(index)) == [true, true]
 }
 
@@ -381,7 +408,7 @@ fn modules_at_places(device: &Device, modules: &[Module]) -> Vec<(Module, bool)>
     for (place, slot) in expand(slots).enumerate().take(MAX_PLACES) {
         for (ident, default) in &slot.module_idents {
             if let Some(module) = modules.iter().find(|module| module.ident == *ident) {
-                all.push((module.at(slots, slot, place), *default));
+                all.push((module.at(device, slots, slot, place), *default));
             }
         }
     }
@@ -495,7 +522,7 @@ fn ram_end(device: &Device) -> Result<usize, SimError> {
     Ok(end)
 }
 
-/// Returns the end of the process RAM for the PDOs assigned at power-on. A modular device gets 8
+/// Returns the end of the process RAM for the PDOs that the ESI assigns. A modular device gets 8
 /// KiB, because its modules are unknown.
 fn mapped_end(device: &Device, pdo: &PdoRules, store: &ObjectStore) -> usize {
     let mut map = Vec::new();
@@ -504,7 +531,10 @@ fn mapped_end(device: &Device, pdo: &PdoRules, store: &ObjectStore) -> usize {
         .sync_managers
         .iter()
         .zip(0..)
-        .map(|(sm, n)| usize::from(sm.start_address) + 3 * pdo.layout(store, n, &mut map))
+        .map(|(sm, n)| {
+            let len = pdo.layout(store, n, &mut map).max(pdo.longest_named(n));
+            usize::from(sm.start_address) + 3 * len
+        })
         .fold(modular, usize::max)
 }
 

@@ -10,6 +10,8 @@ use crate::esc::sm::{BufferOwner, Mode, SyncManager};
 
 /// The time a device waits for the first SYNC0 before Op.
 const FIRST_SYNC_NS: u64 = 5_000_000_000;
+/// The time a device waits for the first outputs before Op.
+const FIRST_OUTPUTS_NS: u64 = 1_000_000_000;
 
 #[derive(Debug, Clone)]
 pub(super) struct Al {
@@ -21,8 +23,8 @@ pub(super) struct Al {
     unread: Option<u16>,
     followed: Option<u16>,
     pub(super) due: u64,
-    /// True while Op is requested and SYNC0 is armed but has not fired yet.
-    pub(super) waits_for_sync: bool,
+    /// True while Op is requested and the first SYNC0 or the first outputs are missing.
+    pub(super) waits_for_op: bool,
 }
 
 impl Default for Al {
@@ -34,7 +36,7 @@ impl Default for Al {
             unread: None,
             followed: None,
             due: u64::MAX,
-            waits_for_sync: false,
+            waits_for_op: false,
         }
     }
 }
@@ -47,7 +49,7 @@ impl SimDevice {
         }
         self.al.unread = Some(control);
         if self.al.followed.is_none() {
-            self.al.waits_for_sync = false;
+            self.al.waits_for_op = false;
             self.al.due = local.saturating_add(self.state_notice_ns);
         }
     }
@@ -68,11 +70,11 @@ impl SimDevice {
         self.esc.put(reg::AL_STATUS_CODE, &[0, 0]);
     }
 
-    /// Handles a due event: a request to read, a request to complete, or the end of the wait for
-    /// SYNC0.
+    /// Handles a due event: a request to read, a request to complete, or the end of the wait before
+    /// Op.
     pub(super) fn al_step(&mut self, local: u64) {
         self.al.due = u64::MAX;
-        if std::mem::take(&mut self.al.waits_for_sync) {
+        if std::mem::take(&mut self.al.waits_for_op) {
             return self.finish_op();
         }
         match self.al.followed.take() {
@@ -80,7 +82,7 @@ impl SimDevice {
                 self.al.control = control;
                 self.follow(local);
                 if self.al.unread.is_some() {
-                    self.al.waits_for_sync = false;
+                    self.al.waits_for_op = false;
                     self.al.due = local.saturating_add(self.state_notice_ns);
                 }
             }
@@ -94,37 +96,62 @@ impl SimDevice {
     }
 
     fn follow(&mut self, local: u64) {
-        match judge(self.al.state, self.al.code != 0, self.al.control) {
+        let has_error = self.al.code != 0 && !self.quirks.error_bit_missing;
+        let request = judge(self.al.state, has_error, self.al.control);
+        if request == Request::Change(AlState::SafeOp) && self.al.state < AlState::SafeOp {
+            self.adopt_assignments();
+        }
+        match request {
             Request::Ignored => {}
             Request::Stay => self.settle(self.al.state, 0),
             Request::Refused(code) => self.settle(self.al.state, code),
             Request::Change(to) => match self.demand(to) {
                 Err(code) => self.settle(self.al.state, code),
-                Ok(()) if to == AlState::Op && self.sync0_decides() => {
-                    self.settle(self.al.state, 0);
-                    self.al.waits_for_sync = true;
-                    self.al.due = local + FIRST_SYNC_NS;
-                    self.first_sync_seen();
-                }
+                Ok(()) if to == AlState::Op => match self.missing_for_op() {
+                    None => self.enter(to),
+                    Some((_, wait)) => {
+                        self.settle(self.al.state, 0);
+                        self.al.waits_for_op = true;
+                        self.al.due = local + wait;
+                    }
+                },
                 Ok(()) => self.enter(to),
             },
         }
     }
 
-    /// Ends the wait for SYNC0 before Op if SYNC0 has fired.
-    pub(super) fn first_sync_seen(&mut self) {
-        if self.al.waits_for_sync && self.sync0_pulses() > 0 {
-            self.al.waits_for_sync = false;
+    fn adopt_assignments(&mut self) {
+        for data in &self.process {
+            if let Some(sm) = self.esc.sms.get(data.sm).filter(|sm| sm.enabled) {
+                let number = u8::try_from(data.sm).unwrap_or(u8::MAX);
+                self.pdo.adopt(&mut self.store, number, sm.len.into());
+            }
+        }
+    }
+
+    /// Returns what a device lacks before Op: the AL status code of a refusal and the time that it
+    /// waits. ETG.1020: outputs must be valid before they take effect.
+    fn missing_for_op(&self) -> Option<(u16, u64)> {
+        if self.sync0_decides() && self.sync0_pulses() == 0 {
+            return Some((code::NO_SYNC_ERROR, FIRST_SYNC_NS));
+        }
+        let misses_outputs = !self.outputs_are_none() && !self.supervision.has_outputs();
+        misses_outputs.then_some((code::NO_VALID_OUTPUTS, FIRST_OUTPUTS_NS))
+    }
+
+    /// Ends the wait for SYNC0 and outputs before Op if both have come.
+    pub(super) fn continue_to_op(&mut self) {
+        if self.al.waits_for_op && self.application_runs() && self.missing_for_op().is_none() {
+            self.al.waits_for_op = false;
             self.al.due = u64::MAX;
             self.finish_op();
         }
     }
 
     fn finish_op(&mut self) {
-        if self.sync0_pulses() > 0 {
-            self.enter(AlState::Op);
-        } else {
-            self.settle(self.al.state, code::NO_SYNC_ERROR);
+        match self.missing_for_op() {
+            None => self.enter(AlState::Op),
+            Some((code, _)) => self.settle(self.al.state, code),
         }
     }
 
@@ -132,6 +159,9 @@ impl SimDevice {
         self.al.state = state;
         self.al.code = code;
         self.esc.set_al(state, code);
+        if self.quirks.error_bit_missing {
+            self.esc.put_al_status(u16::from(state.code()));
+        }
         if code == 0 && self.al.control & al::DEVICE_ID != 0 {
             let id = self.esc.u16_at(reg::STATION_ALIAS);
             self.esc
@@ -151,6 +181,9 @@ impl SimDevice {
             AlState::Boot if !self.has_boot => Err(code::BOOT_NOT_SUPPORTED),
             AlState::Boot => self.check_mailbox(code::INVALID_MAILBOX_BOOT),
             AlState::SafeOp if self.is_stopped() => Err(code::NO_VALID_FIRMWARE),
+            AlState::SafeOp if rising && self.pdo.modules_differ(&self.store) => {
+                Err(code::MODULES_DIFFER)
+            }
             AlState::SafeOp if rising => {
                 self.check_process_data(to)?;
                 if self.sync0_before_safe_op && self.sync0_pulses() == 0 {
@@ -221,6 +254,7 @@ impl SimDevice {
                 && usize::from(sm.len) == len
                 && sm.mode == data.mode
                 && sm.filled == filled
+                && (!self.quirks.exact_control_byte || sm.control == data.control)
                 && self.is_free(data.sm, sm);
             if !good {
                 return Err(code);
@@ -289,8 +323,11 @@ impl SimDevice {
         let from = std::mem::replace(&mut self.al.state, to);
         if from == AlState::Op && to != from {
             self.drop_outputs();
+        } else if to == AlState::Op {
+            self.supervision.enter_op();
         }
         if from < AlState::SafeOp && to >= AlState::SafeOp {
+            self.supervision.end_outputs();
             self.lay_out();
             self.close_process_data(false);
         } else if to < AlState::SafeOp {
@@ -328,7 +365,7 @@ impl SimDevice {
             self.close_process_data(true);
         }
         // A pending request is still processed.
-        if std::mem::take(&mut self.al.waits_for_sync) {
+        if std::mem::take(&mut self.al.waits_for_op) {
             self.al.due = u64::MAX;
         }
         self.settle(state, code);
@@ -338,6 +375,7 @@ impl SimDevice {
 
     pub(super) fn watchdog_expired(&mut self) {
         self.esc.expire_watchdog();
+        self.supervision.end_outputs();
         self.drop_outputs();
         let minds = self.application_runs() && !self.esc.emulates_device();
         if self.al.state == AlState::Op && minds {

@@ -29,19 +29,22 @@ use ecaxis_esi::model::Access;
 use crate::Nanos;
 use crate::coe::object_dictionary::ObjectStore;
 use crate::coe::pdo::PdoRules;
-use crate::drive::{Emergency, State};
+use crate::coe::startup::StartupWrites;
+use crate::drive::{Drive, Emergency, State};
 use crate::esc::Esc;
 use crate::esc::al::AlState;
 use crate::esc::dc::sync::Edges;
 use crate::firmware::BootLoader;
 use crate::foe::FileStore;
 use crate::frame::Datagram;
+use crate::quirks::Quirks;
 use crate::soe::Sercos;
 use application::Application;
 pub use build::{DeviceOptions, SimError};
 use esm::Al;
 use mailbox::Mailbox;
 pub use mailbox::MailboxOptions;
+pub(crate) use process::InputFault;
 use process::ProcessData;
 use supervision::Supervision;
 pub(crate) use time::Rest;
@@ -151,6 +154,8 @@ pub struct SimDevice {
     sdo_info: bool,
     complete_access: bool,
     mailbox_options: MailboxOptions,
+    quirks: Quirks,
+    startup: StartupWrites,
     files: FileStore,
     al: Al,
     serial: u32,
@@ -175,6 +180,7 @@ pub struct SimDevice {
     pub(crate) refusals: Vec<(AlState, u16)>,
     pub(crate) forced_aborts: Vec<(u16, u8, u32)>,
     pub(crate) ignored_writes: Vec<(u16, u8)>,
+    input_fault: InputFault,
     mailbox_silent: bool,
     sync0_before_safe_op: bool,
     /// The values of 0x0981 that the OpModes of the ESI have.
@@ -347,9 +353,7 @@ impl SimDevice {
                 return false;
             }
         }
-        self.axes()
-            .iter()
-            .any(|drive| drive.velocity_rev_s() != 0.0)
+        self.axes().iter().any(Drive::turns_without_power)
     }
 
     /// Switches the power on. Volatile data are lost and objects return to their defaults.
@@ -388,7 +392,7 @@ impl SimDevice {
         }
         if edges.sync0 {
             self.esc.acknowledge_sync(0);
-            self.first_sync_seen();
+            self.continue_to_op();
             self.count_sync0();
             self.exchange();
         }

@@ -6,8 +6,9 @@ use ecaxis_esi::model::Direction;
 use super::SimDevice;
 use crate::Nanos;
 use crate::bits;
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 use crate::coe::pdo::Mapped;
-use crate::drive::CONTROL_PERIOD_NS;
+use crate::drive::{CONTROL_PERIOD_NS, Drive};
 use crate::esc::al::AlState;
 use crate::esc::registers::ADDRESS_SPACE;
 use crate::esc::sm::{Mode, SyncManager};
@@ -19,6 +20,8 @@ pub(super) struct ProcessData {
     pub(super) direction: Direction,
     /// The buffer mode in the ESI.
     pub(super) mode: Mode,
+    /// The ControlByte in the ESI.
+    pub(super) control: u8,
     /// True if the SyncManager may be disabled outside Op.
     pub(super) op_only: bool,
     pub(super) map: Vec<Mapped>,
@@ -26,7 +29,32 @@ pub(super) struct ProcessData {
     pub(super) len: usize,
 }
 
+/// Wrong inputs of a drive.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct InputFault {
+    /// All inputs are zero.
+    pub zero: bool,
+    /// The Statusword has these values in the bits of the mask.
+    pub statusword: u16,
+    pub mask: u16,
+    /// The number of inputs still to affect.
+    pub left: u32,
+}
+
+impl InputFault {
+    fn statusword(self, store: &ObjectStore, slot: EntryHandle) -> [u8; 2] {
+        let [low, high, ..] = store.get(slot).to_le_bytes();
+        let word = u16::from_le_bytes([low, high]);
+        (word & !self.mask | self.statusword & self.mask).to_le_bytes()
+    }
+}
+
 impl SimDevice {
+    /// Makes the next inputs of a drive wrong.
+    pub(crate) fn disturb_inputs(&mut self, fault: InputFault) {
+        self.input_fault = fault;
+    }
+
     /// Computes the layouts again from assignment and mapping.
     pub(super) fn lay_out(&mut self) {
         for data in &mut self.process {
@@ -86,6 +114,11 @@ impl SimDevice {
             return;
         }
         self.show();
+        let drives = self.application.drives();
+        let fault = Some(self.input_fault).filter(|fault| fault.left > 0);
+        let zero =
+            fault.is_some_and(|fault| fault.zero) || drives.iter().any(Drive::inputs_are_zero);
+        let is_statusword = |slot| drives.iter().any(|drive| drive.shows_statusword(slot));
         for data in self.process.iter().filter(|d| d.direction == Direction::Tx) {
             // A SyncManager over registers is not filled by the device.
             let ram = |sm: &&SyncManager| usize::from(sm.start) >= ADDRESS_SPACE;
@@ -95,8 +128,21 @@ impl SimDevice {
             let Some(buffer) = self.esc.fill_buffer(data.sm) else {
                 continue;
             };
-            for m in &data.map {
-                bits::copy(buffer, m.bit, self.store.bytes(m.slot), 0, m.bits);
+            if zero {
+                buffer.fill(0);
+            } else {
+                for m in &data.map {
+                    bits::copy(buffer, m.bit, self.store.bytes(m.slot), 0, m.bits);
+                    if let Some(fault) = fault
+                        && is_statusword(m.slot)
+                    {
+                        let word = fault.statusword(&self.store, m.slot);
+                        bits::copy(buffer, m.bit, &word, 0, m.bits);
+                    }
+                }
+            }
+            if fault.is_some() {
+                self.input_fault.left = self.input_fault.left.saturating_sub(1);
             }
             self.esc.filled_buffer(data.sm, self.local);
         }

@@ -21,6 +21,8 @@ pub(super) struct Supervision {
     /// The counters 0x1C32:0B and 0x1C32:20.
     missed: Option<EntryHandle>,
     sync_error: Option<EntryHandle>,
+    /// True if outputs arrived since entry to SafeOp and the watchdog has not expired after it.
+    received: bool,
     /// True if outputs arrived since the last SYNC0.
     fresh: bool,
     /// True if outputs arrived since entry to Op.
@@ -36,11 +38,27 @@ impl Supervision {
             limit: store.slot(0x10f1, 2),
             missed: store.slot(0x1c32, 0x0b),
             sync_error: store.slot(0x1c32, 0x20),
+            received: false,
             fresh: false,
             began: false,
             errors: 0,
             last_sync0: 0,
         }
+    }
+
+    /// True if valid outputs have come.
+    pub(super) fn has_outputs(&self) -> bool {
+        self.received
+    }
+
+    /// Ends the validity of the outputs that have come so far.
+    pub(super) fn end_outputs(&mut self) {
+        self.received = false;
+    }
+
+    /// Begins to supervise with the first outputs in Op.
+    pub(super) fn enter_op(&mut self) {
+        self.fresh = false;
     }
 
     fn restart(&mut self) {
@@ -53,7 +71,9 @@ impl SimDevice {
     pub(super) fn outputs_came(&mut self, written: u8) {
         if self.process.iter().any(|d| written >> d.sm & 1 != 0) {
             self.supervision.fresh = true;
+            self.supervision.received = true;
             self.arrivals.push(self.esc.clock.true_time(self.local));
+            self.continue_to_op();
         }
     }
 

@@ -8,6 +8,7 @@
 //! * `control`: position and velocity loops at 0.4 ms, current loop at 0.04 ms, gains
 //! * `plant`: motor, load, friction, encoder
 //! * `mechanics`: backlash and pitch error between motor and load
+//! * `quirks`: how drives of other vendors differ
 //!
 //! The device calls `Drive::sync` when process data takes effect and `Drive::control` every 0.4
 //! ms of its own time. Neither allocates. This crate defines its own state and mask values, so that
@@ -38,6 +39,7 @@ mod objects;
 mod plant;
 mod profile;
 mod publish;
+mod quirks;
 mod state;
 mod supervise;
 #[cfg(test)]
@@ -57,8 +59,9 @@ use fault::Faults;
 use io::Inputs as DigitalInputs;
 use mechanics::Mechanics;
 use modes::{Cycle, Mode, Motion, PositionFrame, SetPoints};
-use objects::{AXIS_STRIDE, HomingParameters, Objects, Parameters};
+use objects::{AXIS_STRIDE, GearSlots, HomingParameters, Objects, Parameters};
 use plant::Plant;
+use quirks::{ActiveQuirks, Gear, Seen};
 use state::{Inputs, Power, Request, Stop};
 use touch_probe::TouchProbes;
 
@@ -109,6 +112,10 @@ pub struct Drive {
     mode: Option<Mode>,
     frame: PositionFrame,
     set_points: SetPoints,
+    quirks: ActiveQuirks,
+    gear: Option<Gear>,
+    /// The Controlword of the process data.
+    received: u16,
     /// True after the first SYNC in Op: the Controlword is valid.
     commanded: bool,
     in_op: bool,
@@ -143,6 +150,8 @@ impl Drive {
     }
 
     fn of_axis(store: &mut ObjectStore, axis: u16, plant: PlantParams) -> Self {
+        let gear = Gear::new(GearSlots::bind(store, axis, &plant), &plant);
+        let plant = gear.as_ref().map_or(plant, |gear| gear.plant(store));
         let objects = Objects::bind(store, axis, &plant);
         let parameters = objects.parameters(store, &plant);
         let tuning = objects.tuning(store);
@@ -177,6 +186,9 @@ impl Drive {
             probes: TouchProbes::default(),
             mode: None,
             set_points: SetPoints::default(),
+            quirks: ActiveQuirks::new(plant.quirks),
+            gear,
+            received: 0,
             commanded: false,
             in_op: false,
             start: false,
@@ -188,6 +200,7 @@ impl Drive {
             warning: false,
             unseen: None,
         };
+        drive.plant.set_brake(drive.params.quirks.has_brake());
         drive.read_parameters(store);
         drive.show_inputs(store);
         drive.publish(store, &Demand::Off, false);
@@ -205,17 +218,22 @@ impl Drive {
     pub(crate) fn sync(&mut self, store: &ObjectStore) {
         let o = &self.objects;
         let word = store.get(o.controlword).to_le_bytes();
-        let controlword = u16::from_le_bytes([word[0], word[1]]);
+        self.received = u16::from_le_bytes([word[0], word[1]]);
+        let controlword = if self.quirks.any() {
+            self.quirks.controlword(self.received)
+        } else {
+            self.received
+        };
         let rose = controlword & !self.set_points.controlword;
         let polarity = self.frame.polarity;
         self.set_points = SetPoints {
             controlword,
             position: self.frame.turned(objects::int(store, o.target_position)),
             velocity: polarity.velocity(objects::int(store, o.target_velocity)),
-            torque: objects::int(store, o.target_torque),
+            torque: polarity.torque(objects::int(store, o.target_torque)),
             position_offset: polarity.way(objects::int(store, o.position_offset)),
             velocity_offset: polarity.velocity(objects::int(store, o.velocity_offset)),
-            torque_offset: objects::int(store, o.torque_offset),
+            torque_offset: polarity.torque(objects::int(store, o.torque_offset)),
         };
         if self.objects.limits_are_mapped() {
             self.parameters_age = PARAMETER_CYCLES;
@@ -289,6 +307,9 @@ impl Drive {
         self.step_power(store);
         let demand = self.demand();
         self.supervise(&demand);
+        if self.quirks.any() {
+            self.step_quirks(store);
+        }
         // A new fault starts its ramp in the next cycle, but cuts the power at once.
         let demand = if self.power.powered() {
             demand
@@ -304,6 +325,45 @@ impl Drive {
             self.objects.record(store, code);
         }
         self.unseen = Some((demand, limited));
+    }
+
+    /// Advances the quirks.
+    fn step_quirks(&mut self, store: &ObjectStore) {
+        if self.params.quirks.has_brake() {
+            let outputs = self.objects.io.outputs(store);
+            let closed = self.quirks.brake_is_closed(self.power.powered(), outputs);
+            self.plant.set_brake(closed);
+        }
+        let bits = self.mode.map_or(0, |mode| {
+            let velocity = self.controller.velocity();
+            self.motion
+                .status(mode, self.follows(), velocity, &self.parameters)
+        });
+        let shift = self.quirks.step(
+            self.received,
+            &Seen {
+                state: self.power.state(),
+                mode: self.mode,
+                in_op: self.in_op,
+                set_points: &self.set_points,
+                bits,
+            },
+        );
+        self.shift_positions(shift);
+    }
+
+    /// Shifts all positions by a number of counts; the shaft does not turn. The drive takes the
+    /// next set-point in the new frame.
+    pub fn shift_positions(&mut self, counts: i64) {
+        if counts != 0 {
+            self.frame.shift += counts;
+            self.motion.shift(counts, &self.frame);
+        }
+    }
+
+    /// True while all inputs are zero.
+    pub(crate) fn inputs_are_zero(&self) -> bool {
+        self.quirks.inputs_are_zero()
     }
 
     /// Writes the results of the last control cycle to the objects. Call it before anything reads
@@ -322,6 +382,9 @@ impl Drive {
 
     /// Runs one control period without power.
     pub(crate) fn coast(&mut self) {
+        if self.params.quirks.has_brake() {
+            self.plant.set_brake(true);
+        }
         self.controller.coast(&mut self.plant);
     }
 
@@ -353,6 +416,69 @@ impl Drive {
         self.power.hold_in(state);
     }
 
+    /// Requests safe torque off, or ends the request: no torque, in Switch on disabled.
+    pub fn set_sto(&mut self, on: bool) {
+        self.power.set_sto(on);
+    }
+
+    /// Switches the enable input. Without it the drive removes the torque and reaches Ready to
+    /// switch on.
+    pub fn set_enable_input(&mut self, on: bool) {
+        self.power.set_disabled(!on);
+    }
+
+    /// True if the entry is the Statusword of this axis.
+    pub(crate) fn shows_statusword(&self, slot: EntryHandle) -> bool {
+        self.objects.statusword == slot
+    }
+
+    /// True if the shaft turns or is about to turn without power.
+    pub(crate) fn turns_without_power(&self) -> bool {
+        self.plant.velocity() != 0.0 || self.plant.falls()
+    }
+
+    /// Takes over the position from before a loss of power, with an absolute encoder.
+    pub(crate) fn keep_position(&mut self, before: &Self, store: &mut ObjectStore) {
+        if !self.params.quirks.absolute_encoder {
+            return;
+        }
+        self.take_shaft(before);
+        self.publish(store, &Demand::Off, false);
+    }
+
+    /// Takes over the shaft and the position frame of a drive with another number of counts per
+    /// turn.
+    fn take_shaft(&mut self, before: &Self) {
+        self.plant.take_shaft(&before.plant);
+        let turn = |drive: &Self| i64::from(drive.params.counts_per_turn);
+        self.frame.shift = before.frame.shift * turn(self) / turn(before).max(1);
+        self.controller = Controller::new(&self.tuning, &self.params, &self.plant);
+        self.inputs = DigitalInputs::new(&self.params, &self.plant);
+        if let Some(mechanics) = &mut self.mechanics {
+            *mechanics = Mechanics::new(self.params.backlash, self.params.pitch_error, &self.plant);
+        }
+        let counts = self.plant.counts();
+        self.motion = before.motion.clone();
+        self.motion.forget_homing();
+        self.motion.restart(counts, 0.0, &self.frame);
+        self.parameters_edits = None;
+    }
+
+    /// Changes the unit of positions as 0x6091 demands.
+    fn change_gear(&mut self, store: &ObjectStore) {
+        let Some(gear) = self.gear.as_ref().filter(|_| !self.power.powered()) else {
+            return;
+        };
+        let params = gear.plant(store);
+        if params.counts_per_turn == self.params.counts_per_turn {
+            return;
+        }
+        let before = self.clone();
+        self.params = params;
+        self.plant = Plant::new(&params);
+        self.take_shaft(&before);
+    }
+
     /// Sets an external signal on an input of 0x60FD ([`input`]), in parallel to the track's
     /// switch. The input changes in the next control cycle. A touch probe latches the position at
     /// the fraction `after` (0 to 1) of the control period.
@@ -373,7 +499,8 @@ impl Drive {
 
     /// Sets the torque that pulls towards negative positions, in N·m.
     pub fn set_load_torque(&mut self, torque: f64) {
-        self.plant.set_load_torque(torque);
+        let own = self.params.quirks.load_torque;
+        self.plant.set_load_torque(own + torque);
     }
 
     /// Blocks or releases the shaft.
@@ -422,6 +549,7 @@ impl Drive {
         self.parameters_age = 0;
         let edits = Some(store.edits()).filter(|_| !self.objects.parameters_are_mapped());
         if edits.is_none() || self.parameters_edits != edits {
+            self.change_gear(store);
             self.parameters_edits = edits;
             self.parameters = self.objects.parameters(store, &self.params);
             self.homing = self.objects.homing(store, &self.params);
@@ -481,7 +609,10 @@ impl Drive {
     }
 
     fn select_mode(&mut self, store: &ObjectStore) {
-        let wanted = Mode::from_code(store.get_signed(self.objects.mode));
+        let powered = self.power.powered();
+        let wanted = self
+            .quirks
+            .next_mode(store.get_signed(self.objects.mode), powered);
         if wanted.is_some() && wanted != self.mode {
             self.mode = wanted;
             self.read_parameters(store);
@@ -502,8 +633,13 @@ impl Drive {
     }
 
     fn step_power(&mut self, store: &ObjectStore) {
-        let request =
+        let mut request =
             (self.in_op && self.commanded).then(|| Request::decode(self.set_points.controlword));
+        if self.quirks.any() {
+            let object = store.get(self.objects.controlword);
+            let by_sdo = self.quirks.sdo_controlword(object, self.in_op);
+            request = request.or(by_sdo.map(Request::decode));
+        }
         let reset = std::mem::take(&mut self.reset) && self.faults.cause().is_none();
         let stopped = self.stopping.is_some()
             && self.stopping == self.power.stop()

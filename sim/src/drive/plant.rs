@@ -5,9 +5,13 @@ use std::f64::consts::TAU;
 use super::mechanics::PitchError;
 use super::objects::float;
 use super::travel::Track;
+use crate::quirks::Quirks;
 
 /// One step of the current loop, in seconds.
 pub(super) const CURRENT_STEP: f64 = 40e-6;
+
+/// The torque of a holding brake, as a multiple of the rated torque.
+const BRAKE: f64 = 2.0;
 
 /// The largest position in counts. Beyond it, an f64 cannot represent every integer.
 const FARTHEST: f64 = 9_007_199_254_740_992.0;
@@ -78,6 +82,8 @@ pub struct PlantParams {
     pub enable_cycles: u32,
     /// Switches, index pulses and mechanical ends along the axis.
     pub track: Track,
+    /// How the drive differs from the standard.
+    pub quirks: Quirks,
 }
 
 impl Default for PlantParams {
@@ -102,6 +108,7 @@ impl Default for PlantParams {
             max_motor_speed: 6000,
             enable_cycles: 10,
             track: Track::default(),
+            quirks: Quirks::default(),
         }
     }
 }
@@ -165,6 +172,9 @@ pub(super) struct Plant {
     /// The mechanical ends, in counts.
     pub(super) ends: (f64, f64),
     pub(super) coulomb: f64,
+    /// Friction without the brake, and the torque of the brake.
+    open_coulomb: f64,
+    brake_torque: f64,
     pub(super) torque_constant: f64,
     counts_per_rad: f64,
     elastic: Option<Elastic>,
@@ -196,7 +206,7 @@ impl Plant {
             position: f64::from(p.initial_position) + 0.5,
             velocity: 0.0,
             current: 0.0,
-            load_torque: p.load_torque,
+            load_torque: p.load_torque + p.quirks.load_torque,
             blocked: false,
             ends: p
                 .track
@@ -206,6 +216,8 @@ impl Plant {
                     (f64::from(low) + 0.5, f64::from(high) + 0.5)
                 }),
             coulomb: p.coulomb_friction,
+            open_coulomb: p.coulomb_friction,
+            brake_torque: BRAKE * p.rated_torque(),
             torque_constant: p.torque_constant,
             counts_per_rad: p.counts_per_rad(),
             elastic: p.elastic.as_ref().map(Elastic::new),
@@ -262,6 +274,29 @@ impl Plant {
 
     pub(super) fn set_load_torque(&mut self, torque: f64) {
         self.load_torque = torque;
+    }
+
+    /// Closes or opens the brake: friction that holds the shaft.
+    pub(super) fn set_brake(&mut self, closed: bool) {
+        let brake = if closed { self.brake_torque } else { 0.0 };
+        self.coulomb = self.open_coulomb + brake;
+    }
+
+    /// True if the load turns a shaft that stands without current.
+    pub(super) fn falls(&self) -> bool {
+        !self.blocked && self.load_torque.abs() > self.coulomb
+    }
+
+    /// Converts positions to another number of counts per turn. The shaft keeps its angle and
+    /// speed.
+    pub(super) fn take_shaft(&mut self, before: &Self) {
+        let ratio = self.counts_per_rad / before.counts_per_rad;
+        self.position = (before.position * ratio).clamp(self.ends.0, self.ends.1);
+        self.velocity = before.velocity;
+        self.load_torque = before.load_torque;
+        self.blocked = before.blocked;
+        self.coulomb = before.coulomb;
+        self.elastic = before.elastic;
     }
 
     pub(super) fn set_blocked(&mut self, blocked: bool) {

@@ -29,6 +29,9 @@ impl Drive {
                 bit::MODE_13,
             );
         }
+        if self.quirks.any() {
+            word = self.quirks.statusword(word, self.mode);
+        }
         word
     }
 
@@ -49,13 +52,21 @@ impl Drive {
         };
         let register = others | i64::from(self.faults.register());
         store.show(o.error_register, register);
-        store.show(o.mode_display, self.mode.map_or(0, Mode::code));
+        let mode = if self.quirks.any() {
+            self.quirks.shown_mode()
+        } else {
+            self.mode
+        };
+        store.show(o.mode_display, mode.map_or(0, Mode::code));
         store.show(o.position, self.frame.turned(self.frame.show(counts)));
         store.show(
             o.velocity,
             polarity.velocity(whole(velocity / p.velocity_unit)),
         );
-        store.show(o.torque, whole(current * torque_per_ampere));
+        store.show(
+            o.torque,
+            polarity.torque(whole(current * torque_per_ampere)),
+        );
         let error = self.motion.following_error(demand, counts);
         store.show(o.following_error, polarity.way(whole(error)));
         let (position, speed) = match demand {
@@ -77,7 +88,7 @@ impl Drive {
         }
         if let Some(slot) = o.torque_averaged {
             let averaged = self.controller.averaged_current();
-            store.show(slot, whole(averaged * torque_per_ampere));
+            store.show(slot, polarity.torque(whole(averaged * torque_per_ampere)));
         }
         if let Some(slot) = o.current {
             store.show(slot, whole(current * 1e3));

@@ -165,6 +165,10 @@ pub(super) struct Power {
     state: State,
     stop: Option<Stop>,
     hold: Option<State>,
+    /// Safe torque off is requested.
+    sto: bool,
+    /// The enable input is off.
+    disabled: bool,
     /// Control cycles until the next automatic transition.
     wait: u32,
     enable_cycles: u32,
@@ -176,6 +180,8 @@ impl Power {
             state: State::NotReadyToSwitchOn,
             stop: None,
             hold: None,
+            sto: false,
+            disabled: false,
             wait: SELF_TEST,
             enable_cycles,
         }
@@ -191,6 +197,34 @@ impl Power {
 
     pub(super) fn hold_in(&mut self, state: Option<State>) {
         self.hold = state;
+    }
+
+    /// Requests safe torque off or ends the request. Meanwhile the drive is in Switch on disabled.
+    pub(super) fn set_sto(&mut self, on: bool) {
+        self.sto = on;
+    }
+
+    /// Switches the enable input off or on. Without it the drive reaches Ready to switch on.
+    pub(super) fn set_disabled(&mut self, disabled: bool) {
+        self.disabled = disabled;
+    }
+
+    /// Returns the transition that STO or the missing enable input causes.
+    fn inhibited(&mut self) -> Option<(u8, State)> {
+        use State as S;
+        if self.sto && self.state == S::FaultReactionActive {
+            // The fault reaction needs torque.
+            self.stop = None;
+        }
+        match self.state {
+            S::ReadyToSwitchOn if self.sto => Some((7, S::SwitchOnDisabled)),
+            S::SwitchedOn if self.sto => Some((10, S::SwitchOnDisabled)),
+            S::OperationEnabled if self.sto => Some((9, S::SwitchOnDisabled)),
+            S::QuickStopActive if self.sto || self.disabled => Some((12, S::SwitchOnDisabled)),
+            S::SwitchedOn if self.disabled => Some((6, S::ReadyToSwitchOn)),
+            S::OperationEnabled if self.disabled => Some((8, S::ReadyToSwitchOn)),
+            _ => None,
+        }
     }
 
     /// True while the output stage drives the winding.
@@ -219,6 +253,16 @@ impl Power {
     pub(super) fn step(&mut self, inputs: &Inputs) -> Option<u8> {
         use State as S;
         let request = inputs.request.unwrap_or(Request::None);
+        if self.sto || self.disabled {
+            if let Some((number, to)) = self.inhibited() {
+                return self.go(to, None).then_some(number);
+            }
+            match (self.state, request) {
+                (S::SwitchOnDisabled, _) if self.sto => return None,
+                (S::ReadyToSwitchOn, Request::SwitchOn | Request::EnableOperation) => return None,
+                _ => {}
+            }
+        }
         if let Some(Stop { then: Some(to), .. }) = self.stop
             && inputs.stopped
         {

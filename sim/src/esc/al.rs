@@ -60,6 +60,7 @@ pub mod code {
     pub const NO_VALID_FIRMWARE: u16 = 0x0014;
     pub const INVALID_MAILBOX_BOOT: u16 = 0x0015;
     pub const INVALID_MAILBOX_PREOP: u16 = 0x0016;
+    pub const NO_VALID_OUTPUTS: u16 = 0x0019;
     pub const SYNC_ERROR: u16 = 0x001a;
     pub const SM_WATCHDOG: u16 = 0x001b;
     pub const INVALID_OUTPUTS: u16 = 0x001d;
@@ -68,6 +69,7 @@ pub mod code {
     pub const NO_SYNC_ERROR: u16 = 0x002d;
     pub const INVALID_DC_SYNC: u16 = 0x0030;
     pub const INVALID_SYNC_CYCLE: u16 = 0x0035;
+    pub const MODULES_DIFFER: u16 = 0x0070;
 }
 
 /// Bit 4 of AL control (acknowledge) and AL status (error).

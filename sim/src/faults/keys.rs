@@ -2,6 +2,7 @@
 
 use super::script::{Fault, FaultKind, FrameSelection, NewIdentity, RawFault};
 use crate::Nanos;
+use crate::device::InputFault;
 use crate::drive::State;
 use crate::esc::al::AlState;
 use crate::esc::ports::PORTS;
@@ -28,6 +29,11 @@ const KINDS: &[(&str, &[&str])] = &[
     ("stuck", &["device", "state"]),
     ("load", &["device", "torque"]),
     ("blocked", &["device"]),
+    ("statusword", &["device", "value", "mask", "count"]),
+    ("zero-inputs", &["device", "count"]),
+    ("position-shift", &["device", "value"]),
+    ("sto", &["device"]),
+    ("enable-input", &["device"]),
     ("identity", &["device", "vendor", "product", "revision"]),
     (
         "swap",
@@ -71,7 +77,7 @@ pub(super) fn check(raw: &RawFault, line: u32) -> Result<Fault, String> {
     })
 }
 
-fn given(raw: &RawFault) -> [(&'static str, bool); 17] {
+fn given(raw: &RawFault) -> [(&'static str, bool); 18] {
     [
         ("device", raw.device.is_some()),
         ("port", raw.port.is_some()),
@@ -90,6 +96,7 @@ fn given(raw: &RawFault) -> [(&'static str, bool); 17] {
         ("alias", raw.alias.is_some()),
         ("torque", raw.torque.is_some()),
         ("value", raw.value.is_some()),
+        ("mask", raw.mask.is_some()),
     ]
 }
 
@@ -154,6 +161,28 @@ fn kind(name: &str, raw: &RawFault) -> Result<FaultKind, String> {
             FaultKind::Load { torque }
         }
         "blocked" => FaultKind::Blocked,
+        "statusword" => {
+            let value = raw.value.ok_or("`value` is missing")?;
+            FaultKind::Inputs(InputFault {
+                zero: false,
+                statusword: u16::try_from(value)
+                    .map_err(|_| format!("`value` {value} does not fit 16 bits"))?,
+                mask: raw.mask.unwrap_or(u16::MAX),
+                left: raw.count.unwrap_or(u32::MAX),
+            })
+        }
+        "zero-inputs" => FaultKind::Inputs(InputFault {
+            zero: true,
+            left: raw.count.unwrap_or(u32::MAX),
+            ..InputFault::default()
+        }),
+        "position-shift" => FaultKind::PositionShift {
+            counts: i32::try_from(raw.value.ok_or("`value` (counts) is missing")?)
+                .map_err(|_| "`value` does not fit 32 bits")?
+                .into(),
+        },
+        "sto" => FaultKind::Sto,
+        "enable-input" => FaultKind::EnableInput,
         "identity" => {
             if raw.vendor.or(raw.product).or(raw.revision).is_none() {
                 return Err("needs `vendor`, `product` or `revision`".into());

@@ -47,6 +47,12 @@
 //! * `stuck` (`device`, `state`): the drive does not leave this CiA 402 state
 //! * `load` (`device`, `torque`): a torque (N·m) pulls the shaft towards negative positions
 //! * `blocked` (`device`): the shaft does not turn
+//! * `statusword` (`device`, `value`; `mask`, `count`): the Statusword in the process data has this
+//!   value in the bits of the mask (default all), `count` times or while the fault lasts
+//! * `zero-inputs` (`device`; `count`): all inputs of the drive are zero
+//! * `position-shift` (`device`, `value`): all positions of the drive shift once by these counts
+//! * `sto` (`device`): safe torque off; the drive is in Switch on disabled
+//! * `enable-input` (`device`): the enable input is off; the drive reaches Ready to switch on
 //! * `node-silent` (`device`, `node`): a node behind a gateway has no power
 //! * `heartbeat-lost` (`device`, `node`): a node sends no heartbeat
 //! * `node-error` (`device`, `node`): the status word names the node as the node in error
@@ -78,7 +84,7 @@ mod script;
 mod tests;
 
 use crate::Nanos;
-use crate::device::{Identification, SimDevice};
+use crate::device::{Identification, InputFault, SimDevice};
 use crate::eoe::EoeFaults;
 use crate::gateway::GatewayFault;
 use crate::random::Random;
@@ -318,6 +324,14 @@ impl ActiveFault {
             FaultKind::Watchdog => device.expire_watchdog(),
             FaultKind::Load { torque } => load(device, torque),
             FaultKind::Blocked => block(device, true),
+            FaultKind::Inputs(fault) => device.disturb_inputs(fault),
+            FaultKind::PositionShift { counts } => {
+                if let Some(drive) = device.drive_mut() {
+                    drive.shift_positions(counts);
+                }
+            }
+            FaultKind::Sto => sto(device, true),
+            FaultKind::EnableInput => enable_input(device, false),
             FaultKind::Emergency { code } => device.inject_emergency(code),
             FaultKind::Gateway(fault) => disturb(device, fault, true),
             FaultKind::Input { index, sub, value } => {
@@ -339,6 +353,9 @@ impl ActiveFault {
             FaultKind::Identity(_) | FaultKind::Swap(_) => device.identify(&self.saved),
             FaultKind::Load { .. } => load(device, 0.0),
             FaultKind::Blocked => block(device, false),
+            FaultKind::Inputs(_) => device.disturb_inputs(InputFault::default()),
+            FaultKind::Sto => sto(device, false),
+            FaultKind::EnableInput => enable_input(device, true),
             FaultKind::Gateway(fault) => disturb(device, fault, false),
             FaultKind::Input { index, sub, .. } => {
                 device.set_input(index, sub, 0);
@@ -361,6 +378,18 @@ fn load(device: &mut SimDevice, torque: f64) {
 fn block(device: &mut SimDevice, blocked: bool) {
     if let Some(drive) = device.drive_mut() {
         drive.set_blocked(blocked);
+    }
+}
+
+fn sto(device: &mut SimDevice, on: bool) {
+    for drive in device.axes_mut() {
+        drive.set_sto(on);
+    }
+}
+
+fn enable_input(device: &mut SimDevice, on: bool) {
+    for drive in device.axes_mut() {
+        drive.set_enable_input(on);
     }
 }
 

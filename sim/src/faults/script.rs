@@ -5,6 +5,7 @@ use toml::Spanned;
 
 use super::keys;
 use crate::Nanos;
+use crate::device::InputFault;
 use crate::drive::State;
 use crate::esc::al::AlState;
 use crate::gateway::GatewayFault;
@@ -150,6 +151,16 @@ pub(crate) enum FaultKind {
     },
     /// The shaft does not turn, regardless of the motor torque.
     Blocked,
+    /// Inputs of the drive are wrong.
+    Inputs(InputFault),
+    /// All positions of the drive shift by a number of counts.
+    PositionShift {
+        counts: i64,
+    },
+    /// Safe torque off is requested.
+    Sto,
+    /// The enable input is off.
+    EnableInput,
     /// EEPROM and 0x1018 contain the identity of another device.
     Identity(NewIdentity),
     /// The device has no power. Its neighbours lose their link. Devices behind it, or powered by it
@@ -255,6 +266,7 @@ pub(super) struct RawFault {
     pub probability: Option<f64>,
     pub torque: Option<f64>,
     pub value: Option<i64>,
+    pub mask: Option<u16>,
     pub delay: Option<String>,
     pub code: Option<u32>,
     pub index: Option<u16>,

@@ -123,14 +123,9 @@ pub(super) fn prepare(store: &mut ObjectStore, (inputs, outputs): (u16, u16), na
         }
     }
     let bits = u32::try_from(name.len() * 8).unwrap_or(0);
-    store.ensure(
-        0x1008,
-        0,
-        "Manufacturer device name",
-        bits,
-        ro,
-        name.as_bytes(),
-    );
+    let title = "Manufacturer device name";
+    let slot = store.ensure(0x1008, 0, title, bits, ro, name.as_bytes());
+    store.set_type(slot, "STRING(1)");
     store.ensure(0x1c00, 0, "SubIndex 000", 8, ro, &[4]);
     for sub in 1..=4 {
         store.ensure(

@@ -115,6 +115,18 @@ impl Bus {
         n
     }
 
+    /// Writes zeros to the outputs, which a device needs before Op.
+    pub fn first_outputs(&mut self, station: u16) {
+        for n in 0..8 {
+            let (sm, _) = self.datagram(4, station, 0x800 + n * 8, &[0; 8]);
+            let word = |at: usize| u16::from_le_bytes([sm[at], sm[at + 1]]);
+            let mailbox = n < 2 && sm[4] & 3 == 2;
+            if sm[6] & 1 != 0 && sm[4] >> 2 & 3 == 1 && !mailbox && word(2) > 0 {
+                self.datagram(5, station, word(0), &vec![0; word(2).into()]);
+            }
+        }
+    }
+
     /// Requests a state. Returns (AL status, AL status code) afterwards.
     pub fn request(&mut self, station: u16, control: u16) -> (u16, u16) {
         self.write(station, 0x120, &control.to_le_bytes());
@@ -122,7 +134,11 @@ impl Bus {
         (self.read_u16(station, 0x130), self.read_u16(station, 0x134))
     }
 
+    /// Takes a device to a state, to Op with first outputs.
     pub fn to(&mut self, station: u16, state: u8) {
+        if state == OP {
+            self.first_outputs(station);
+        }
         let expected = (u16::from(state), 0);
         assert_eq!(
             self.request(station, u16::from(state)),

@@ -350,6 +350,7 @@ pub fn bring_up(bus: &mut Bus, station: u16) -> Result<(Learned, Mapped), String
     if mapped.len() > 0 {
         expect("SafeOp", counter(bus), mapped.working_counter())?;
     }
+    bus.first_outputs(station);
     step(bus, station, OP)?;
     for _ in 0..20 {
         if mapped.len() > 0 {

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::Command;
 
 use ecaxis_test_support::program::{self, Ran};
-use ecaxis_test_support::root;
+use ecaxis_test_support::{fixture, root};
 
 /// Returns exit code, standard output and standard error.
 fn ran(folder: &Path, arguments: &[&str]) -> (i32, String, String) {
@@ -144,6 +144,99 @@ fn sdo_saves_and_restores_a_parameter_file() {
     let (code, _, err) = run(&["sdo", "restore", &demo, "y", "x.toml", "--sim"]);
     assert_eq!(code, 1);
     assert!(err.contains("--other-device"), "{err}");
+}
+
+/// Saves the parameters of an EPOS4, and again as those of another unit.
+#[test]
+fn restore_names_each_write_and_keeps_unit_data() {
+    let Some(esi) = fixture("esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml") else {
+        return;
+    };
+    let esi = esi.canonicalize().expect("a path").display().to_string();
+    let folder = tempfile::tempdir().expect("a folder");
+    let text = format!(
+        "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[[device]]\nname = \"x\"\nesi = \"{esi}\"\nposition = 0\n\
+         mode = \"csp\"\n[device.axis]\nencoder = 2000\nlimits = {{ velocity = 50.0, acceleration = 500.0 }}\n"
+    );
+    let at = |name: &str| folder.path().join(name);
+    std::fs::write(at("m.toml"), text).expect("written");
+    let run = |words: &[&str]| ran(folder.path(), words);
+    let (code, _, err) = run(&["sdo", "dump", "m.toml", "x", "x.toml"]);
+    assert_eq!(code, 0, "{err}");
+    let mut dump = std::fs::read_to_string(at("x.toml")).expect("the file");
+    for (object, value) in [
+        ("0x3001:01", 3300),
+        ("0x30a1:01", 77),
+        ("0x3241:06", 60),
+        ("0x30b5:02", 1),
+    ] {
+        let (before, after) = dump
+            .split_once(&format!("\"{object}\""))
+            .expect("an object");
+        let (head, tail) = after.split_once("value = ").expect("a value");
+        let tail = tail.split_once(" }").expect("an end").1;
+        dump = format!("{before}\"{object}\"{head}value = {value} }}{tail}");
+    }
+    std::fs::write(at("own.toml"), &dump).expect("written");
+    let serial = dump.lines().find(|line| line.starts_with("serial = "));
+    let other = dump.replace(serial.expect("a number"), "serial = 4711");
+    std::fs::write(at("other.toml"), other).expect("written");
+
+    let (code, out, err) = run(&["sdo", "restore", "m.toml", "x", "other.toml"]);
+    assert_eq!(code, 0, "{err}");
+    for part in ["0x3001:01", "machine", "0x30a1:01", "tuned"] {
+        assert!(out.contains(part), "`{part}` is not in:\n{out}");
+    }
+    assert!(!out.contains("0x3241") && !out.contains("0x30b5"), "{out}");
+    for part in [
+        "2 settings written",
+        "not written (unit): ",
+        "0x3241:06 (rotor angle): 0 kept, 60 in the file",
+        "0x30b5:02 (home reference and its state): 0 kept, 1 in the file",
+        "not written (command): ",
+    ] {
+        assert!(err.contains(part), "`{part}` is not in:\n{err}");
+    }
+    let restored = |words: &[&str]| {
+        let (code, out, err) =
+            run(&[&["sdo", "restore", "m.toml", "x"], words, &["--json"]].concat());
+        assert_eq!(code, 0, "{err}");
+        let json: serde_json::Value = serde_json::from_str(&out).expect("JSON");
+        let objects = |key: &str| -> Vec<String> {
+            let all = json[key].as_array().expect("a list").iter();
+            all.map(|one| format!("{} {}", one["object"].as_str().expect("text"), one["class"]))
+                .collect()
+        };
+        (objects("writes"), objects("skipped"))
+    };
+    let (writes, skipped) = restored(&["other.toml"]);
+    assert_eq!(writes, ["0x3001:01 \"machine\"", "0x30a1:01 \"tuned\""]);
+    assert!(
+        skipped.contains(&"0x3241:06 \"unit\"".to_owned()),
+        "{skipped:?}"
+    );
+    let (writes, _) = restored(&["own.toml"]);
+    assert_eq!(writes.len(), 4, "{writes:?}");
+    let (writes, _) = restored(&["own.toml", "--class", "machine,tuned"]);
+    assert_eq!(writes.len(), 2, "{writes:?}");
+    let (code, _, err) = run(&[
+        "sdo",
+        "restore",
+        "m.toml",
+        "x",
+        "other.toml",
+        "--class",
+        "unit",
+    ]);
+    assert!(code == 2 && err.contains("serial number 4711"), "{err}");
+    // Data of different units is not a difference of settings.
+    let (_, out, _) = run(&["sdo", "compare", "m.toml", "x", "other.toml"]);
+    assert!(
+        out.contains("0x30a1:01") && !out.contains("0x3241"),
+        "{out}"
+    );
+    let (_, out, _) = run(&["sdo", "compare", "m.toml", "x", "own.toml"]);
+    assert!(out.contains("0x3241:06"), "{out}");
 }
 
 #[test]

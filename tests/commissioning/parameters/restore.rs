@@ -14,6 +14,7 @@ use ecaxis_master::acyclic::parameters::restore::{RestoreError, Restored, restor
 use ecaxis_master::acyclic::parameters::restore_order::{Write, order};
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::mailbox::{CoeClient, DatagramError, MailboxTransport, NamedObject};
+use ecaxis_master::parameters::class::{Class, CopyRule};
 use ecaxis_master::parameters::dump::{Dump, DumpError, Origin};
 use ecaxis_master::parameters::lookup::{FindError, ObjectQuery, find};
 use ecaxis_master::parameters::{DataType, Kind, Parameter};
@@ -249,17 +250,18 @@ fn compare_returns_differing_settings() {
         parameter(0x6065, 0, "UDINT", &[7, 0, 0, 0]),
     ];
     left[4].writable = false;
-    assert_eq!(compare(&left, &left, true), []);
+    let rule = CopyRule::to_other_unit(0xfb);
+    assert_eq!(compare(&left, &left, rule, true), []);
     let mut right = left.clone();
     // A count, a command, an actual value.
     for n in [2, 3, 4] {
         right[n].value[0] = 99;
     }
-    assert_eq!(compare(&left, &right, false), []);
-    assert_eq!(compare(&left, &right, true).len(), 2);
+    assert_eq!(compare(&left, &right, rule, false), []);
+    assert_eq!(compare(&left, &right, rule, true).len(), 2);
     right[5].value[0] = 8;
     right.push(parameter(0x6067, 0, "UDINT", &[1, 0, 0, 0]));
-    let reported: Vec<_> = compare(&left, &right, false)
+    let reported: Vec<_> = compare(&left, &right, rule, false)
         .into_iter()
         .map(|d| (d.at.index, d.left, d.right))
         .collect();
@@ -306,6 +308,66 @@ fn order_writes_lists_first() {
             "1c12:0", "6065:0"
         ]
     );
+}
+
+/// Restores values of an EPOS4 with the given rule to a device whose values are all 0.
+fn restore_epos4(rule: CopyRule) -> (Restored, Vec<u32>) {
+    let places: [(u16, u8); 9] = [
+        (0x1010, 1),
+        (0x1023, 1),
+        (0x2ec0, 1),
+        (0x3001, 1),
+        (0x30a1, 1),
+        (0x30b5, 2),
+        (0x3241, 1),
+        (0x3241, 6),
+        (0x324b, 1),
+    ];
+    let objects = places.map(|(index, sub)| (index, sub, &[0; 4][..]));
+    let server = Server::new(48, &objects, &[]);
+    let wanted = places.map(|(index, sub)| parameter(index, sub, "UDINT", &[7, 0, 0, 0]));
+    let (at, mut coe) = (device(), client());
+    let mut silent = |_, _| {};
+    let done = restore(&mut coe, &server, &at, None, (&wanted, rule), &mut silent);
+    let done = block_on(done).expect("restored");
+    let values = places.iter().map(|&(index, sub)| {
+        let value = server.object(index, sub).expect("an object");
+        u32::from_le_bytes(value.try_into().expect("four bytes"))
+    });
+    (done, values.collect())
+}
+
+#[test]
+fn unit_data_and_commands_are_not_copied_to_another_unit() {
+    let (done, values) = restore_epos4(CopyRule::to_other_unit(0xfb));
+    assert_eq!(values, [0, 0, 0, 7, 7, 0, 0, 0, 0]);
+    let lines: Vec<_> = done
+        .lines_of_written()
+        .chain(done.lines_of_skipped())
+        .collect();
+    assert_eq!(
+        lines,
+        [
+            "written (machine): 0x3001:01 0 → 7",
+            "written (tuned): 0x30a1:01 0 → 7",
+            "not written (unit): 0x30b5:02 (home reference and its state): 0 kept, 7 in the file, \
+             0x3241:01 (offset of the current sensors): 0 kept, 7 in the file, \
+             0x3241:06 (rotor angle): 0 kept, 7 in the file",
+            "not written (command): 0x1010:01 (store and restore), 0x1023:01 (OS command), \
+             0x2ec0:01 (internal control)",
+            "not written (log): 0x324b:01 (state of the auto tuning)",
+        ]
+    );
+}
+
+#[test]
+fn unit_data_goes_back_to_its_own_unit_unless_left_out() {
+    let rule = CopyRule::to_same_unit(0xfb);
+    let (done, values) = restore_epos4(rule);
+    assert_eq!(values, [0, 0, 0, 7, 7, 7, 7, 7, 0]);
+    assert_eq!(done.written.len(), 5);
+    let (_, values) = restore_epos4(rule.only(&[Class::Tuned]));
+    assert_eq!(values, [0, 0, 0, 0, 7, 0, 0, 0, 0]);
 }
 
 /// A device that loses its frames from a given download on, before the download or with its answer.
@@ -364,7 +426,7 @@ impl Failing {
             self,
             &device,
             Some(&dictionary),
-            &wanted,
+            (&wanted, CopyRule::to_other_unit(0)),
             progress,
         ))
     }
@@ -425,7 +487,7 @@ fn failed_restore_reports_the_remaining_state() {
     let whole = Failing::new(0, false);
     let done = whole.restore(&mut |_, _| {}).expect("restored");
     assert!(done.complete(), "{done:?}");
-    assert_eq!((done.written, whole.downloads.get()), (4, WRITES));
+    assert_eq!((done.written.len(), whole.downloads.get()), (4, WRITES));
 
     let mut empty = 0;
     for arrives in [false, true] {

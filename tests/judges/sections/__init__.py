@@ -24,6 +24,7 @@ from .oddities import oddities
 from .operation import operation
 from .page import page
 from .parameters import parameters
+from .quirks import quirks
 from .recordings import judge, recordings
 from .reports import reports
 from .rights import rights
@@ -31,7 +32,7 @@ from .ring import ring
 from .service import service
 from .viewers import viewers
 
-__all__ = ["Bench", "bringup", "chain", "eeproms", "ethercrab", "faults", "gateway", "kickcat", "mailbox", "monitoring", "oddities", "operation", "overlap", "page", "parameters", "recordings", "reports", "rights", "ring", "service", "viewers"]
+__all__ = ["Bench", "bringup", "chain", "eeproms", "ethercrab", "faults", "gateway", "kickcat", "mailbox", "monitoring", "oddities", "operation", "overlap", "page", "parameters", "quirks", "recordings", "reports", "rights", "ring", "service", "viewers"]
 
 MAXON = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml"
 OWN = rig.ROOT / "configs/esi"

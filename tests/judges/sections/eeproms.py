@@ -265,6 +265,9 @@ def by_ethercrab(d, machine, found, images):
         d.compare("mailboxes", device, got.sms[0], mailboxes)
         if not machine.kind.ethercrab_maps or esi.of_modules or esi.in_dictionary:
             continue
+        if any(pdo.samples > 1 for pdo in esi.rx + esi.tx):
+            # The device maps one sample or several, by the OpMode.
+            continue
         # As long as what is mapped, whatever length the EEPROM gives.
         process = {n: (sm[0], -(-esi.sm_bits(n) // 8), sm[2]) for n, sm in enumerate(esi.sms) if esi.sm_bits(n)}
         written = {n: sm for n, sm in (mailboxes | process).items() if n in enabled}

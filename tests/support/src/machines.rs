@@ -147,3 +147,23 @@ limits = {{ position = [-100.0, 100.0], velocity = 50.0, acceleration = 500.0, t
     }
     text
 }
+
+/// Returns the ESI of the EPOS4 with a position of the load (0x60E4:01).
+pub fn with_load_encoder(epos4: &str) -> String {
+    let item = |sub, name, kind, bits, at| {
+        format!(
+            "<SubItem><SubIdx>{sub}</SubIdx><Name>{name}</Name><Type>{kind}</Type><BitSize>{bits}</BitSize>\
+             <BitOffs>{at}</BitOffs><Flags><Access>ro</Access><PdoMapping>T</PdoMapping></Flags></SubItem>"
+        )
+    };
+    let kind = format!(
+        "<DataType><Name>DT60E4</Name><BitSize>48</BitSize>{}{}</DataType><DataType><Name>BOOL</Name>",
+        item(0, "Highest subindex", "USINT", 8, 0),
+        item(1, "Position of the load", "DINT", 32, 16)
+    );
+    let object = "<Object><Index>#x60E4</Index><Name>Additional position actual value</Name><Type>DT60E4</Type>\
+        <BitSize>48</BitSize><Info><SubItem><Name>Highest subindex</Name><Info><DefaultValue>1</DefaultValue></Info></SubItem>\
+        </Info><Flags><Access>ro</Access><PdoMapping>T</PdoMapping></Flags></Object>\n              <Object>\n                <Index>#x6065</Index>";
+    let text = epos4.replacen("<DataType><Name>BOOL</Name>", &kind, 1);
+    text.replacen("<Object>\n                <Index>#x6065</Index>", object, 1)
+}

@@ -95,15 +95,26 @@ impl Registers {
             let at = ecaxis_ecat::registers::SYNC_MANAGER
                 + ecaxis_ecat::registers::SYNC_MANAGER_LEN * u16::from(number);
             let control = self.u8(at + 4)?;
-            let len = self.u16(at + 2)?;
+            let (start, len) = (self.u16(at)?, self.u16(at + 2)?);
+            // Process data may have one buffer, too, but only they have an FMMU.
+            let one_buffer = control & 0x03 == MODE_MAILBOX;
             (len > 0).then_some(SyncManager {
                 number,
-                start: self.u16(at)?,
+                start,
                 len,
-                mailbox: control & 0x03 == MODE_MAILBOX,
+                mailbox: one_buffer && !self.is_mapped(start, len),
                 output: control >> 2 & 0x03 == 1,
                 enabled: self.u8(at + 6).is_some_and(|activate| activate & 1 != 0),
             })
+        })
+    }
+
+    /// True if an active FMMU maps a part of the memory.
+    fn is_mapped(&self, start: u16, len: u16) -> bool {
+        let end = |start: u16, len: u16| u32::from(start) + u32::from(len);
+        self.fmmus().any(|fmmu| {
+            u32::from(fmmu.physical) < end(start, len)
+                && u32::from(start) < end(fmmu.physical, fmmu.len)
         })
     }
 
@@ -136,4 +147,28 @@ pub fn part(register: u16, data: &[u8], wanted: u16, len: usize) -> Option<&[u8]
 pub fn part_u16(register: u16, data: &[u8], wanted: u16) -> Option<u16> {
     let bytes = part(register, data, wanted, 2)?.first_chunk()?;
     Some(u16::from_le_bytes(*bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// ETG.1000.4: the same mode serves mailboxes and process data of one buffer. An FMMU maps the
+    /// latter only.
+    #[test]
+    fn a_sync_manager_with_one_buffer_is_a_mailbox_unless_it_is_mapped() {
+        let mut registers = Registers::default();
+        // Start, length, control, status, activation.
+        registers.set(0x0800, &[0x00, 0x10, 128, 0, 0x26, 0, 1]);
+        registers.set(0x0808, &[0x80, 0x10, 1, 0, 0x46, 0, 1]);
+        let mailboxes = |registers: &Registers| -> Vec<bool> {
+            registers.sync_managers().map(|sm| sm.mailbox).collect()
+        };
+        assert_eq!(mailboxes(&registers), [true, true]);
+        registers.set(0x0600, &[0, 0, 1, 0, 1, 0, 0, 7, 0x80, 0x10, 0, 2, 1]);
+        assert_eq!(mailboxes(&registers), [true, false]);
+        // Mailbox status: a register of the SyncManager, not its memory.
+        registers.set(0x0610, &[0, 0, 1, 0, 1, 0, 0, 0, 0x0d, 0x08, 0, 1, 1]);
+        assert_eq!(mailboxes(&registers), [true, false]);
+    }
 }

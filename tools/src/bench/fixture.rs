@@ -200,6 +200,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEnd
             cams: Vec::new(),
             line_shafts: Vec::new(),
             copies: Vec::new(),
+            output_locks: Vec::new(),
             repeats: Vec::new(),
         },
         link,

@@ -11,8 +11,9 @@ use ecaxis_esi::Mode;
 
 use crate::scan::{Device, Scan};
 use ecaxis_master::acyclic::topology;
-use ecaxis_master::bringup::align;
+use ecaxis_master::bringup::{align, module_difference};
 use ecaxis_master::config::{DeviceConfig, Locator, Machine};
+use ecaxis_master::report::ModuleDifference;
 
 pub mod apply;
 mod parameters;
@@ -391,8 +392,8 @@ fn modules(
     asked: bool,
     comparison: &mut Comparison,
 ) {
-    let selection = &config.selection;
-    if config.device.slots.is_none() || selection.mode.is_some_and(Mode::is_cyclic) {
+    let by_mode = config.selection.mode.is_some_and(Mode::is_cyclic);
+    if config.device.slots.is_none() || by_mode {
         return;
     }
     let detected = match &device.answers {
@@ -406,38 +407,13 @@ fn modules(
         }
         return;
     };
-    let mut expected: Vec<u32> = Vec::new();
-    for module in &selection.modules {
-        let Some(new) = module.place.checked_add(1).filter(|n| *n <= 255) else {
-            continue;
-        };
-        expected.resize(expected.len().max(new), 0);
-        if let Some(ident) = expected.get_mut(module.place) {
-            *ident = module.ident;
-        }
-    }
-    let trimmed = |idents: &[u32]| {
-        let end = idents.iter().rposition(|ident| *ident != 0);
-        idents
-            .get(..end.map_or(0, |end| end + 1))
-            .unwrap_or_default()
-            .to_vec()
-    };
-    let (expected, found) = (trimmed(&expected), trimmed(detected));
-    if expected == found {
+    let Some(ModuleDifference { expected, found }) = module_difference(config, detected) else {
         return;
-    }
-    let name = |ident: &u32| match ident {
-        0 => "-".to_owned(),
-        ident => {
-            let known = config.esi.modules.iter().find(|m| m.ident == *ident);
-            known.map_or_else(|| format!("0x{ident:08x}"), |m| m.type_name.clone())
-        }
     };
     comparison.differences.push(Difference::Modules {
         device: index,
         position: device.position(),
-        expected: expected.iter().map(name).collect(),
-        found: found.iter().map(name).collect(),
+        expected,
+        found,
     });
 }

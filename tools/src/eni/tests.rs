@@ -393,3 +393,48 @@ fn idns_and_settings_of_eoe_are_init_commands() {
     let back = import_with(twice.as_bytes(), &bench.path().join("esi"));
     assert_eq!(ethernet(&back.machine.expect("a machine")), ethernet(&web));
 }
+
+/// ETG.2100: `CycleTime` is optional. Then the cycle is that of most SYNC0 signals, from the element
+/// `DC` or from the command for 0x09A0.
+#[test]
+fn eni_without_cycle_time_takes_the_cycle_of_sync0() {
+    let slave = |n: u16, clock: &str| {
+        format!(
+            "<Slave><Info><Name>D{n}</Name><PhysAddr>{}</PhysAddr><AutoIncAddr>{}</AutoIncAddr>\
+             <VendorId>1</VendorId><ProductCode>1</ProductCode><RevisionNo>1</RevisionNo>\
+             <SerialNo>0</SerialNo></Info>{clock}</Slave>",
+            1001 + n,
+            0_u16.wrapping_sub(n)
+        )
+    };
+    let element = |ns: u32| {
+        format!(
+            "<DC><CycleTime0>{ns}</CycleTime0><CycleTime1>0</CycleTime1><ShiftTime>0</ShiftTime></DC>"
+        )
+    };
+    let command = "<InitCmds><InitCmd><Transition>PS</Transition><Cmd>5</Cmd><Adp>1002</Adp>\
+        <Ado>2464</Ado><Data>00093d0000000000</Data></InitCmd></InitCmds>";
+    for (slaves, time, cycle) in [
+        (vec![element(4_000_000)], "", "\"4ms\""),
+        (vec![String::new(), command.to_owned()], "", "\"4ms\""),
+        // The second one takes several samples in a cycle.
+        (vec![element(2_000_000), element(500_000)], "", "\"2ms\""),
+        (
+            vec![element(4_000_000)],
+            "<CycleTime>2000</CycleTime>",
+            "\"2ms\"",
+        ),
+        (vec![element(0)], "", "\"1ms\""),
+    ] {
+        let slaves = (0..).zip(&slaves).map(|(n, clock)| slave(n, clock));
+        let slaves: String = slaves.collect();
+        let eni = format!(
+            "<EtherCATConfig><Config><Master/>{slaves}<Cyclic>{time}</Cyclic></Config></EtherCATConfig>"
+        );
+        let back = import(eni.as_bytes(), None, Path::new("machine.toml"), "sim").expect("an ENI");
+        let line = back.text.lines().find(|line| line.starts_with("cycle"));
+        let line = line.expect("a cycle");
+        assert!(line.contains(cycle), "{line}");
+        assert_eq!(line.contains("CHECK"), time.is_empty(), "{line}");
+    }
+}

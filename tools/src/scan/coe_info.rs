@@ -3,11 +3,10 @@
 use ecaxis_axis::scale::DriveUnits;
 
 use super::Device;
-use ecaxis_master::bringup::drive_units;
+use ecaxis_master::bringup::{DETECTED_MODULES, drive_units};
 use ecaxis_master::mailbox::{CoeClient, MailboxTransport, SdoError};
 
 const CONFIGURED: u16 = 0xf030;
-const DETECTED: u16 = 0xf050;
 
 const MAXON: u32 = 0xfb;
 
@@ -84,7 +83,7 @@ pub(super) async fn ask(
         hardware: coe.upload_text(wire, 0x1009).await?,
         software: coe.upload_text(wire, 0x100a).await?,
         configured: coe.upload_list(wire, CONFIGURED).await?,
-        detected: coe.upload_list(wire, DETECTED).await?,
+        detected: coe.upload_list(wire, DETECTED_MODULES).await?,
         drive: None,
         gateway: None,
     };

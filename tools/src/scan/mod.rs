@@ -255,7 +255,7 @@ async fn look_at(
         );
     let at = found.named(format!("position {position}"));
     let image = if readable {
-        let image = read_image(wire, &at, EepromAccess::IfFree).await;
+        let image = read_image(wire, &at, EepromAccess::of(found.state)).await;
         image.map_err(|error| error.to_string())
     } else {
         Err(format!(

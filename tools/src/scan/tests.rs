@@ -11,9 +11,9 @@ use std::time::Duration;
 use ecaxis_sim::FaultScript;
 
 use super::{MainDeviceEvidence, Options, Scan, scan};
-use ecaxis_master::acyclic::AlState;
 use ecaxis_master::acyclic::DatagramClient;
 use ecaxis_master::acyclic::enumerate::{address, enumerate};
+use ecaxis_master::acyclic::{AlState, al};
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::{Clock, Nanos};
 use ecaxis_master::config::{self, Machine};
@@ -325,23 +325,33 @@ fn scan_reports_foreign_frames() {
     assert!(!scan.asked);
 }
 
-/// An EEPROM owned by the device's processor is not taken away.
+/// In Init an EEPROM is taken from the device's processor, to which other MainDevices leave it, and
+/// given back. In other states the processor may need it.
 #[test]
-fn scan_skips_an_eeprom_in_use() {
-    let ((scan, access), _) = on("demo.toml", async |wire| {
-        let mut found = enumerate(&wire).await.expect("two");
-        address(&wire, &mut found).await.expect("addresses");
-        let station = found[0].station;
-        wire.write(station, 0x0500, &[1]).await.expect("written");
-        let scan = scanned(&wire, Options::default()).await;
-        let mut access = [0; 1];
-        wire.read(station, 0x0500, &mut access).await.expect("read");
-        (scan, access)
-    });
-    assert_eq!(access, [1], "as it was");
-    let first = &scan.devices[0];
-    let problem = first.sii.as_ref().expect_err("lent");
-    assert!(problem.contains("processor"), "{problem}");
-    assert!(scan.devices[1].sii.is_ok());
-    assert_eq!(first.found.state, AlState::Init);
+fn scan_takes_an_eeprom_from_the_processor_in_init_only() {
+    for state in [AlState::Init, AlState::PreOp] {
+        let ((scan, access), _) = on("terminals.toml", async move |wire| {
+            let mut found = enumerate(&wire).await.expect("all");
+            address(&wire, &mut found).await.expect("addresses");
+            let coupler = [found[0].named("coupler".to_owned())];
+            let change = al::change_state(&wire, &coupler, state, Duration::from_secs(3));
+            change.await.expect("changed");
+            let station = found[0].station;
+            wire.write(station, 0x0500, &[1]).await.expect("written");
+            let scan = scanned(&wire, Options::default()).await;
+            let mut access = [0; 1];
+            wire.read(station, 0x0500, &mut access).await.expect("read");
+            (scan, access)
+        });
+        assert_eq!(access, [1], "as it was");
+        let first = &scan.devices[0];
+        match &first.sii {
+            Ok(_) => assert_eq!(state, AlState::Init),
+            Err(problem) => assert!(
+                state == AlState::PreOp && problem.contains("processor"),
+                "{problem}"
+            ),
+        }
+        assert!(scan.devices[1].sii.is_ok());
+    }
 }

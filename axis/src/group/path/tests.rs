@@ -1,7 +1,7 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::setpoint::{Motion, Playback, TableRate};
+use crate::setpoint::{Motion, Playback, Rate, Setpoint, TableRate};
 
 const DT: f64 = 0.001;
 
@@ -19,7 +19,7 @@ fn played(plan: &PathPlan) -> Vec<Vec<f64>> {
         let mut playback = Playback::new(table, motion, limits, 0.0).unwrap();
         let mut column = vec![motion.position];
         while !playback.finished(motion) {
-            motion = playback.advance(table, motion, DT, 1.0);
+            motion = playback.with_table(table).advance(motion, Rate::WHOLE, DT);
             column.push(motion.position);
         }
         columns.push(column);
@@ -141,13 +141,13 @@ proptest! {
         for (wanted, seconds) in rates.into_iter().chain([(0.0, 20.0), (1.0, 1e4)]) {
             let mut cycles = 0;
             while f64::from(cycles) * dt < seconds && !ended {
-                let value = rate.advance(wanted, dt, |course| {
+                let value = rate.advance(Rate::new(wanted), dt, |course| {
                     players.iter().zip(tables).zip(&axes).all(|((play, table), limits)| play.keeps(table, limits, course, dt))
                 });
                 ended = true;
                 for ((play, table), limits) in players.iter_mut().zip(tables).zip(&axes) {
                     let before = play.motion();
-                    let next = play.advance(table, before, dt, value);
+                    let next = play.with_table(table).advance(before, value, dt);
                     let jerk = (next.acceleration - before.acceleration) / dt;
                     prop_assert!(next.velocity.abs() <= limits.velocity * 1.000_001);
                     prop_assert!(next.acceleration.abs() <= limits.acceleration * 1.000_001, "{} of {}", next.acceleration, limits.acceleration);
@@ -155,13 +155,13 @@ proptest! {
                     ended &= play.finished(next);
                 }
                 cycles += 1;
-                if wanted == 0.0 && value == 0.0 {
+                if wanted == 0.0 && value.is_held() {
                     break;
                 }
                 slowest = slowest.max(if wanted == 0.0 { cycles } else { 0 });
             }
             // A hold ends, unless the path does.
-            prop_assert!(wanted > 0.0 || ended || rate.value() == 0.0 || seconds < 20.0);
+            prop_assert!(wanted > 0.0 || ended || rate.value().is_held() || seconds < 20.0);
         }
         prop_assert!(ended);
         prop_assert!(f64::from(slowest) * dt < 3.0, "a hold took {} s", f64::from(slowest) * dt);

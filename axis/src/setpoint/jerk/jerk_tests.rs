@@ -15,6 +15,7 @@ struct Watch {
     limits: MotionLimits,
     dt: f64,
     motion: Motion,
+    rate: Rate,
     /// Derived from positions.
     velocity: f64,
     acceleration: f64,
@@ -28,6 +29,7 @@ impl Watch {
             limits,
             dt,
             motion,
+            rate: Rate::WHOLE,
             velocity: motion.velocity,
             acceleration: motion.acceleration,
             check_jerk: true,
@@ -35,7 +37,7 @@ impl Watch {
     }
 
     fn cycle(&mut self, source: &mut JerkLimited) -> Result<(), TestCaseError> {
-        let next = source.advance(self.motion, self.dt);
+        let next = source.advance(self.motion, self.rate, self.dt);
         // Rounding for a position of at most 1400.
         let rounding = 1400.0 * 4.0 * f64::EPSILON;
         let velocity = (next.position - self.motion.position) / self.dt;
@@ -376,7 +378,7 @@ proptest! {
         if let Ok(mut source) = JerkLimited::new(MoveRequest::within(goal, limits), motion, i) {
             let mut motion = motion;
             for dt in dts {
-                motion = source.advance(motion, dt.abs().min(0.1));
+                motion = source.advance(motion, Rate::WHOLE, dt.abs().min(0.1));
                 prop_assert!(motion.position.is_finite() && motion.velocity.is_finite(), "{motion:?} {source:?}");
             }
         }
@@ -399,12 +401,12 @@ proptest! {
         let mut motion = motion;
         let dt = source.duration_s() / f64::from(cycles);
         for _ in 0..cycles {
-            motion = source.advance(motion, dt);
+            motion = source.advance(motion, Rate::WHOLE, dt);
             prop_assert!(motion.velocity.abs() <= v * (1.0 + 1e-6), "{motion:?}");
             prop_assert!(motion.position >= source.span()[0] - slack && motion.position <= source.span()[1] + slack);
         }
         prop_assert!((motion.position - target).abs() <= slack, "{motion:?} {source:?}");
-        motion = source.advance(motion, dt);
+        motion = source.advance(motion, Rate::WHOLE, dt);
         prop_assert_eq!(motion.position, target);
     }
 }
@@ -427,7 +429,7 @@ proptest! {
         let mut watch = Watch::at(Motion::at(0.0), LIMITS, DT);
         for (rate, cycles) in rates {
             for _ in 0..cycles {
-                source.set_rate(rate, watch.motion, DT);
+                watch.rate = Rate::new(rate);
                 watch.cycle(&mut source)?;
             }
             let most = order.at_rate(rate).limits.velocity;
@@ -439,7 +441,8 @@ proptest! {
             prop_assert!(rate > 0.0 || watch.motion.velocity == 0.0);
             prop_assert!(most <= LIMITS.velocity);
         }
-        source.set_rate(1.0, watch.motion, DT);
+        watch.rate = Rate::WHOLE;
+        watch.cycle(&mut source)?;
         watch.finish(&mut source)?;
         match goal {
             Goal::Position(target) => prop_assert!(watch.motion.stands_at(target)),

@@ -11,7 +11,7 @@
 mod plan;
 mod profile;
 
-use super::{Motion, MotionLimits, Setpoint, SetpointError};
+use super::{HoldResponse, Motion, MotionLimits, Rate, Setpoint, SetpointError};
 use profile::{Profile, State, coasting, velocity_change};
 
 /// Fraction of every limit used for planning. The rest covers the rounding of positions in their
@@ -135,6 +135,18 @@ impl JerkLimited {
         Self::plan(order, self.now, motion, Some(self.used))
     }
 
+    /// Returns true if the present deceleration can end, with bounded jerk, before the velocity
+    /// changes its sign.
+    pub(crate) fn can_rest_before_turning(&self) -> bool {
+        let State {
+            velocity,
+            acceleration,
+            ..
+        } = self.now;
+        let most = 2.0 * self.used.scaled(PLANNED).jerk * velocity.abs();
+        velocity * acceleration < 0.0 && acceleration * acceleration <= most
+    }
+
     /// Returns the request of this move.
     #[must_use]
     pub const fn request(&self) -> &MoveRequest {
@@ -142,13 +154,12 @@ impl JerkLimited {
     }
 
     /// Multiplies the velocity of the request by `rate` ([`MoveRequest::at_rate`]). 0 stops on the
-    /// way, and a later rate continues from there. `motion` is the result of the last cycle. RT:
-    /// O(1), plans only if the rate changes.
+    /// way, and a later rate continues from there. Plans only if the rate changes.
     ///
     /// If no plan is possible, the present one continues and the next call tries again.
-    pub fn set_rate(&mut self, rate: f64, motion: Motion, dt_s: f64) {
+    fn set_rate(&mut self, rate: f64, motion: Motion, dt_s: f64) {
         let stops = self.nominal.goal == Goal::Velocity(0.0);
-        if rate == self.rate || stops || !rate.is_finite() {
+        if rate == self.rate || stops {
             return;
         }
         let nominal = self.nominal;
@@ -405,10 +416,11 @@ impl JerkLimited {
 
 impl Setpoint for JerkLimited {
     /// RT: O(1). Plans again if `motion` is not the last result of this source.
-    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
+    fn advance(&mut self, motion: Motion, rate: Rate, dt_s: f64) -> Motion {
         if dt_s.is_nan() || dt_s <= 0.0 {
             return motion;
         }
+        self.set_rate(rate.value(), motion, dt_s);
         if !self.continues(motion) {
             self.resume(motion, dt_s);
         }
@@ -442,6 +454,10 @@ impl Setpoint for JerkLimited {
             Goal::Velocity(_) => motion.then(motion.position + step, step / dt_s, dt_s),
         };
         self.last
+    }
+
+    fn at_hold(&self) -> HoldResponse {
+        HoldResponse::Waits
     }
 
     /// A velocity goal is finished when it is reached. A goal that is held by rate 0 is not

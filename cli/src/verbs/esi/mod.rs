@@ -149,12 +149,11 @@ impl DeviceArgs {
         }
     }
 
-    /// Returns the device with this number in the file, from 1 as in element paths. Device names
-    /// take precedence.
+    /// Returns the device with this number in the file, from 1. Device names take precedence.
     fn number_of<'e>(&self, file: &'e EsiFile, text: &str) -> Option<&'e Device> {
-        let place = format!("/Device[{}]", text.parse::<usize>().ok()?);
+        let number: u32 = text.parse().ok()?;
         let mut devices = file.devices.iter();
-        let device = devices.find(|device| device.path.ends_with(&place))?;
+        let device = devices.find(|device| device.number == number)?;
         let called = |device: &Device| device.type_name == text || device.name == text;
         let fits = self
             .product
@@ -211,6 +210,7 @@ fn load(path: &Path, wanted: &dyn Fn(&DeviceHeader) -> bool) -> Result<EsiFile, 
         match error {
             LoadError::Esi { source, .. } => failure.hint(match source.problem() {
                 esi::EsiProblem::NotEsi(_) => "this is some other XML file",
+                esi::EsiProblem::NotXml => "an ESI file is an XML file of the vendor of the device",
                 esi::EsiProblem::Truncated(_) | esi::EsiProblem::TruncatedTag => {
                     "the file is not complete; fetch it again"
                 }

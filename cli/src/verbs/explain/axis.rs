@@ -2,10 +2,11 @@
 
 use ecaxis_axis::Mode;
 use ecaxis_axis::StopMethod;
-use ecaxis_axis::homing;
 use ecaxis_axis::scale::ModuloDirection;
 use ecaxis_axis::supervision::FaultReset;
-use ecaxis_master::config::{AxisSetup, HomingSetup, TorqueUnit, UnitSource, duration};
+use ecaxis_master::config::{
+    AxisSetup, HomingSetup, TorqueLimit, TorqueUnit, UnitSource, duration,
+};
 use ecaxis_tools::cells;
 use ecaxis_tools::document::Table;
 
@@ -142,7 +143,16 @@ fn limits(axis: &AxisSetup, table: &mut Table) {
         _ => format!(" ({} % of rated)", rounded(limits.torque)),
     };
     let torque = format!("{torque} {}{percent}", axis.torque.unit);
-    table.row(cells!["", torque, "`limits.torque`, or rated torque"]);
+    let origin = match &axis.torque_limit {
+        TorqueLimit::NotNeeded => "`limits.torque`, or rated torque".to_owned(),
+        TorqueLimit::Written(startup) => {
+            let objects = startup.iter().map(|sdo| format!("0x{:04X}", sdo.index));
+            let objects: Vec<_> = objects.collect();
+            format!("`limits.torque`, written to {}", objects.join(" and "))
+        }
+        TorqueLimit::NotEffective { .. } => "`limits.torque`, in CST only".to_owned(),
+    };
+    table.row(cells!["", torque, origin]);
     let following = match limits.following_error {
         Some(error) => format!("following error {error} {unit}"),
         None => "following error not supervised".to_owned(),
@@ -265,6 +275,20 @@ fn guards(axis: &AxisSetup, table: &mut Table) {
     if !config.follows_bit {
         table.row(cells!["Statusword bit 12", "ignored", "`follows_bit`"]);
     }
+    if config.mode_display_enabled {
+        let shown = format!(
+            "{} after Operation enabled, else a trip",
+            time(config.mode_time_s)
+        );
+        table.row(cells!["0x6061 shown", shown, "`mode_display`"]);
+    }
+    if config.mode_change_unpowered {
+        table.row(cells![
+            "mode switch",
+            "at standstill: no power, 0x6060, power",
+            "`mode_change`"
+        ]);
+    }
     if let Some(option) = config.quick_stop {
         let option = format!("option {}", option.0);
         table.row(cells!["quick stop", option, "0x605A from `sdo` or the ESI"]);
@@ -291,7 +315,9 @@ fn guards(axis: &AxisSetup, table: &mut Table) {
 
 fn homing(setup: &HomingSetup, unit: &str, table: &mut Table) {
     let home = &setup.homing;
-    let text = homing::method(home.method).map_or("", |method| method.text);
+    let text = home
+        .known_method()
+        .map_or("method of the vendor", |method| method.text);
     let method = format!("{}: {text}", home.method);
     table.row(cells!["homing", method, "`homing.method`, 0x6098"]);
     let threshold = home.threshold_ma.map(f64::from);

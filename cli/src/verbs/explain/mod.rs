@@ -477,7 +477,7 @@ fn has_watchdog(device: &DeviceConfig, outputs: &BitRange) -> bool {
         let start = first;
         first += u32::from(sm.len) * 8;
         let apart = outputs.bits.end <= start || first <= outputs.bits.start;
-        apart || sm.control_byte & 0x40 != 0
+        apart || sm.has_trigger()
     })
 }
 

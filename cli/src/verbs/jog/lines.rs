@@ -271,8 +271,8 @@ impl Operator for Script {
         let replaced = |event: &&RequestEvent| matches!(event, RequestEvent::Replaced { .. });
         for news in view.news.iter().filter(|event| !replaced(event)) {
             let (axis, text) = match news {
-                RequestEvent::Input { result: Ok(()), .. } => continue,
-                RequestEvent::Input { .. } => ("input", news.to_string()),
+                RequestEvent::Signal { result: Ok(()), .. } => continue,
+                RequestEvent::Signal { .. } => ("signal", news.to_string()),
                 _ => (view.name(news.axis().unwrap_or_default()), news.to_string()),
             };
             self.answers.news(axis, &text, news.is_failure());

@@ -406,10 +406,13 @@ impl Observer for Listener {
                 after_ns,
                 home,
                 first: false,
+                has_axes,
                 ..
-            } => (device_returned(device, *after_ns, *home), false),
+            } => (device_returned(device, *after_ns, *home, *has_axes), false),
             Progress::Ring { text, broken } => (text.clone(), *broken),
-            Progress::DeviceReturned { device, .. } => (device_appeared(device), false),
+            Progress::DeviceReturned {
+                device, has_axes, ..
+            } => (device_appeared(device, *has_axes), false),
             Progress::UnknownDevice(device) => (device.to_string(), true),
             Progress::GroupReleased { group } => {
                 let text = format!("the group `{group}` has been reset: e enables");

@@ -115,7 +115,7 @@ impl AxisPanel {
             },
             doing,
             enabled: status.enabled,
-            homed: status.homed || status.homing == HomingStatus::Attained,
+            homed: status.homed() || status.homing == HomingStatus::Attained,
             held_by_range: status.held_by_range,
             trouble,
         }

@@ -100,8 +100,11 @@ fn identity(device: &Device, esi: Option<&EsiMatch>) -> [String; 7] {
 
 /// Returns the name of a vendor: from its ESI file, else from the table.
 pub(super) fn vendor(esi: Option<&EsiMatch>, id: u32) -> Option<&str> {
-    let from_file = esi.filter(|esi| esi.path.is_some() && !esi.file.vendor.name.is_empty());
-    from_file.map_or_else(|| vendor_name(id), |esi| Some(&*esi.file.vendor.name))
+    let from_file = esi.filter(|esi| esi.path.is_some());
+    let from_file = from_file.map(|esi| esi.file.vendor_name(id));
+    from_file
+        .filter(|name| !name.is_empty())
+        .or_else(|| vendor_name(id))
 }
 
 fn place(device: &Device) -> [String; 9] {
@@ -168,20 +171,8 @@ fn modules(answers: &CoeInfo, described: Option<&EsiMatch>) -> Option<String> {
     let lists = [&answers.detected, &answers.configured];
     let plugged = |idents: &&Vec<u32>| idents.iter().any(|ident| *ident != 0);
     let idents = lists.into_iter().flatten().find(plugged)?;
-    let end = idents.iter().rposition(|ident| *ident != 0)?;
-    let known = |ident: u32| {
-        let mut modules = described.into_iter().flat_map(|d| &d.file.modules);
-        modules.find(|module| module.ident == ident)
-    };
-    let names = idents
-        .iter()
-        .take(end + 1)
-        .map(|ident| match known(*ident) {
-            _ if *ident == 0 => "-".to_owned(),
-            Some(module) => module.type_name.to_string(),
-            None => format!("0x{ident:08x}"),
-        });
-    Some(names.collect::<Vec<_>>().join(" "))
+    let modules = described.map_or(&[][..], |described| &described.file.modules);
+    Some(esi::module_names(modules, idents).join(" "))
 }
 
 /// Formats 0x6502 (CiA 402-2, supported drive modes).

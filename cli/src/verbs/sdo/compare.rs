@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use ecaxis_master::parameters::class::CopyRule;
+
 use super::dump::taken;
 use super::{Common, as_json, load, print_differences};
 use crate::access::device::Open;
@@ -16,8 +18,8 @@ Examples:
 
 /// Compare a parameter file with a device or with another file
 ///
-/// Only settings are compared: writable objects that are not commands. Prints nothing and exits
-/// with 0 if all are equal, else with 1.
+/// Only settings are compared: writable objects of the classes `machine` and `tuned`; of one device
+/// also those of the class `unit`. Prints nothing and exits with 0 if all are equal, else with 1.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, override_usage = "ecaxis sdo compare FILE DEVICE DUMP.toml\n       \
     ecaxis sdo compare --nic IF --position N DUMP.toml\n       \
@@ -61,6 +63,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
     let found = ecaxis_master::acyclic::parameters::compare::compare(
         &left.parameters,
         &right.parameters,
+        CopyRule::between(&left.device, &right.device),
         args.all,
     );
     let [first, second] = &names;

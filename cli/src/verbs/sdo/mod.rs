@@ -208,7 +208,7 @@ fn print_differences(sides: [&str; 2], all: &[Difference]) -> Result<(), Failure
     // A file name may contain the separator of headings.
     let mut table = Table::default();
     let [left, right] = sides;
-    table.row(cells!["object", left, right, "name"]);
+    table.row(cells!["object", left, right, "class", "name"]);
     for d in all {
         let side = |value: &Option<String>, meaning: &Option<String>| match (value, meaning) {
             (Some(value), Some(meaning)) => format!("{value}: {meaning}"),
@@ -216,7 +216,7 @@ fn print_differences(sides: [&str; 2], all: &[Difference]) -> Result<(), Failure
         };
         let [of_left, of_right] = &d.meanings;
         let (left, right) = (side(&d.left, of_left), side(&d.right, of_right));
-        table.row(cells![address(d.at), left, right, d.name]);
+        table.row(cells![address(d.at), left, right, d.class, d.name]);
     }
     print_table(&table)
 }
@@ -225,6 +225,7 @@ fn as_json(all: &[Difference]) -> Value {
     let each = all.iter().map(|difference| {
         json!({
             "index": difference.at.index, "sub": difference.at.sub, "name": difference.name,
+            "class": difference.class.name(),
             "left": difference.left, "right": difference.right,
             "left_text": difference.meanings[0], "right_text": difference.meanings[1],
         })

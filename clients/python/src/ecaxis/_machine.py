@@ -335,6 +335,10 @@ class Machine(AxesByName["Axis"]):
     def set_output(self, device: str, name: str, value: float) -> None:
         self._await("output", device=device, output=name, value=value)
 
+    def command_node(self, device: str, node: int, action: str) -> None:
+        """NMT command to a node behind a gateway: "start", "stop", "pre_operational" or "reset"."""
+        self._await("node", device=device, node=node, action=action)
+
     def set_input(self, name: str, value: float = True) -> None:
         """Switches an input of the simulated bus: a name of `[signals]`, or `io.Input 1`. Needs no lease."""
         self.connection.request("sim_input", input=name, value=float(value), wait=True)

@@ -262,6 +262,10 @@ class Machine(AxesByName["Axis"]):
     async def set_output(self, device: str, name: str, value: float) -> None:
         await self.connection.request("output", device=device, output=name, value=value, wait=True)
 
+    async def command_node(self, device: str, node: int, action: str) -> None:
+        """NMT command to a node behind a gateway: "start", "stop", "pre_operational" or "reset"."""
+        await self.connection.request("node", device=device, node=node, action=action, wait=True)
+
     async def set_input(self, name: str, value: float = True) -> None:
         """Switches an input of the simulated bus: a name of `[signals]`, or `io.Input 1`. Needs no lease."""
         await self.connection.request("sim_input", input=name, value=float(value), wait=True)

@@ -29,6 +29,8 @@ pub(super) struct Cursor<'a> {
     /// True if the element on top of the stack has the form `<…/>`.
     ends_at_once: bool,
     spent: usize,
+    /// The number of `Device` elements so far, over all lists of the file.
+    pub devices: u32,
     pub warnings: Vec<Warning>,
     /// The PDOs with a `RefName`.
     pub pdo_definitions: PdoDefinitions,
@@ -68,11 +70,6 @@ impl Element<'_> {
     pub fn offset(&self) -> usize {
         self.offset
     }
-
-    /// Returns the number among the siblings of the same name, from 1, for numbered names.
-    pub fn number(&self) -> u32 {
-        self.number
-    }
 }
 
 enum Token<'a> {
@@ -94,6 +91,7 @@ impl<'a> Cursor<'a> {
             top: Level::default(),
             ends_at_once: false,
             spent: 0,
+            devices: 0,
             warnings: Vec::new(),
             pdo_definitions: PdoDefinitions::default(),
             first_left_out: None,
@@ -113,6 +111,10 @@ impl<'a> Cursor<'a> {
 
     /// Returns the first element of the document.
     pub fn root(&mut self) -> Result<Element<'a>, EsiError> {
+        let text = self.scanner.rest(0).trim_ascii_start();
+        if !text.is_empty() && !text.starts_with(b"<") {
+            return Err(self.error(EsiProblem::NotXml));
+        }
         loop {
             match self.tag()? {
                 Token::Start(element) => return Ok(element),

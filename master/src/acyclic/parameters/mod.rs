@@ -3,7 +3,7 @@
 //! - [`dictionary`]: the dictionary from the device (SDO Information), in the form of ESI
 //!   dictionaries;
 //! - [`upload`]: reads every readable object;
-//! - [`restore_order`]: selects and orders the writes of a restore;
+//! - [`restore_order`]: orders the writes of a restore;
 //! - [`compare`], [`restore`]: compares two sets of values, writes one to a device;
 //! - [`command`]: "save" and "load" (0x1010, 0x1011).
 

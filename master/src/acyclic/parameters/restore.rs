@@ -1,12 +1,15 @@
 //! Writes values to a device.
 
+use std::fmt;
+
 use crate::acyclic::DeviceRef;
 use crate::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, abort_text};
 use crate::report::{Cause, Error};
 use ecaxis_esi::Dictionary;
 
 use super::compare::Difference;
-use super::restore_order::{Write, is_list, is_setting, order, settings_only};
+use super::restore_order::{Write, is_list, order, settings_only};
+use crate::parameters::class::{Class, CopyRule};
 use crate::parameters::{Parameter, writable_in_pre_op};
 
 /// The maximum number of passes. Settings limit each other, so refused writes are retried after the
@@ -16,10 +19,12 @@ const PASSES: usize = 8;
 /// The result of a restore.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Restored {
-    /// The number of subindices that differed and were written.
-    pub written: usize,
+    /// The subindices that differed and were written.
+    pub written: Vec<Change>,
     /// The number of subindices that had the value already.
     pub same: usize,
+    /// Writable parameters of the file that are not copied.
+    pub skipped: Vec<Skipped>,
     /// Settings that the device does not have or does not allow to write.
     pub missing: Vec<NamedObject>,
     /// Settings that were refused in every pass, with the abort code.
@@ -28,7 +33,74 @@ pub struct Restored {
     pub differing: Vec<Difference>,
 }
 
+/// A value that was written.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Change {
+    pub at: NamedObject,
+    pub name: String,
+    pub class: Class,
+    /// The value before; `None` if it is not readable.
+    pub before: Option<String>,
+    pub after: String,
+}
+
+impl fmt::Display for Change {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let before = self.before.as_deref().unwrap_or("?");
+        write!(f, "{} {before} → {}", self.at.number(), self.after)
+    }
+}
+
+/// A parameter that is not copied.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Skipped {
+    pub at: NamedObject,
+    pub name: String,
+    pub class: Class,
+    /// What the object is, where that decides its class.
+    pub what: &'static str,
+    /// The value of the file.
+    pub value: String,
+    /// The value of the device, if it is data of a unit and differs.
+    pub kept: Option<String>,
+}
+
+impl fmt::Display for Skipped {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.at.number())?;
+        if !self.what.is_empty() {
+            write!(f, " ({})", self.what)?;
+        }
+        match &self.kept {
+            Some(kept) => write!(f, ": {kept} kept, {} in the file", self.value),
+            None => Ok(()),
+        }
+    }
+}
+
+fn lines<T: fmt::Display>(
+    verb: &str,
+    all: &[T],
+    class_of: impl Fn(&T) -> Class,
+) -> impl Iterator<Item = String> {
+    Class::ALL.iter().filter_map(move |&class| {
+        let each = all.iter().filter(|one| class_of(one) == class);
+        let each: Vec<_> = each.map(ToString::to_string).collect();
+        (!each.is_empty()).then(|| format!("{verb} ({class}): {}", each.join(", ")))
+    })
+}
+
 impl Restored {
+    /// Returns a line for each class with what was written.
+    pub fn lines_of_written(&self) -> impl Iterator<Item = String> {
+        lines("written", &self.written, |change| change.class)
+    }
+
+    /// Returns a line for each class with what was not copied.
+    pub fn lines_of_skipped(&self) -> impl Iterator<Item = String> {
+        lines("not written", &self.skipped, |skipped| skipped.class)
+    }
+
     #[must_use]
     pub fn complete(&self) -> bool {
         self.missing.is_empty() && self.refused.is_empty() && self.differing.is_empty()
@@ -153,9 +225,10 @@ impl<W: MailboxTransport> Device<'_, W> {
     }
 }
 
-/// Writes the settings of `parameters` that exist and differ, in a safe order, and reads them back.
-/// Without a dictionary all exist. The device must be in PreOp. `progress` receives the completed and planned writes. A
-/// cancellation takes effect when no list is empty.
+/// Writes the settings of `parameters` that `rule` copies, that exist and that differ, in a safe
+/// order, and reads them back. Without a dictionary all exist. The device must be in PreOp.
+/// `progress` receives the completed and planned writes. A cancellation takes effect when no list
+/// is empty.
 ///
 /// # Errors
 /// [`Cause::Sdo`] with the remaining state if the device stops answering. Refused objects
@@ -165,12 +238,12 @@ pub async fn restore(
     wire: &impl MailboxTransport,
     device: &DeviceRef,
     dictionary: Option<&Dictionary>,
-    parameters: &[Parameter],
+    (parameters, rule): (&[Parameter], CopyRule),
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Restored, RestoreError> {
     let mut course = RestoreProgress::default();
     let mut device = Device { coe, wire, device };
-    let whole = device.restore(dictionary, parameters, progress, &mut course);
+    let whole = device.restore(dictionary, (parameters, rule), progress, &mut course);
     let done = wire.stop().shield(whole).await;
     done.map_err(|source| course.aborted(source))
 }
@@ -186,21 +259,44 @@ impl<W: MailboxTransport> Device<'_, W> {
             .with_action("restoring its settings"))
     }
 
+    /// Returns the report on a parameter that is not copied.
+    async fn skip(&mut self, parameter: &Parameter, rule: CopyRule) -> Result<Skipped, Error> {
+        let (class, what) = rule.class(parameter);
+        // Other classes are not read: the value of a command says nothing.
+        let kept = match class {
+            Class::Unit => self.read(parameter.at).await?.ok(),
+            _ => None,
+        };
+        let kept = kept.filter(|value| *value != parameter.value);
+        Ok(Skipped {
+            at: parameter.at,
+            name: parameter.name.clone(),
+            class,
+            what,
+            value: parameter.shown(),
+            kept: kept.map(|value| parameter.data_type.show(&value)),
+        })
+    }
+
     async fn restore(
         &mut self,
         dictionary: Option<&Dictionary>,
-        parameters: &[Parameter],
+        (parameters, rule): (&[Parameter], CopyRule),
         progress: &mut dyn FnMut(usize, usize),
         course: &mut RestoreProgress,
     ) -> Result<Restored, Error> {
         let mut restored = Restored::default();
         let mut wanted = Vec::new();
-        let mut differing: Vec<NamedObject> = Vec::new();
-        for parameter in settings_only(parameters)
-            .into_iter()
-            .filter(|p| is_setting(p))
-        {
+        let mut differing: Vec<(NamedObject, Option<String>)> = Vec::new();
+        for parameter in settings_only(parameters) {
             self.go_on(course)?;
+            if !parameter.writable {
+                continue;
+            }
+            if !rule.copies(parameter) {
+                restored.skipped.push(self.skip(parameter, rule).await?);
+                continue;
+            }
             let exists = dictionary.is_none_or(|dictionary| {
                 let item = dictionary.item(parameter.at.index, parameter.at.sub);
                 item.is_some_and(writable_in_pre_op)
@@ -211,12 +307,17 @@ impl<W: MailboxTransport> Device<'_, W> {
             }
             match self.read(parameter.at).await? {
                 Ok(value) if value == parameter.value => restored.same += 1,
+                Ok(value) => {
+                    let before = parameter.data_type.show(&value);
+                    differing.push((parameter.at, Some(before)));
+                }
                 // Unreadable objects may be writable.
-                Ok(_) | Err(_) => differing.push(parameter.at),
+                Err(_) => differing.push((parameter.at, None)),
             }
             wanted.push(parameter);
         }
-        let writes = order(&wanted, |p| differing.contains(&p.at));
+        let differs = |p: &Parameter| differing.iter().find(|(at, _)| *at == p.at);
+        let writes = order(&wanted, |p| differs(p).is_some());
         course.of = writes.len();
         let mut left = Vec::new();
         for (n, write) in writes.iter().enumerate() {
@@ -256,7 +357,14 @@ impl<W: MailboxTransport> Device<'_, W> {
             }
             let right = match self.read(parameter.at).await? {
                 Ok(value) if value == parameter.value => {
-                    restored.written += usize::from(differing.contains(&parameter.at));
+                    let changed = differs(parameter).map(|(at, before)| Change {
+                        at: *at,
+                        name: parameter.name.clone(),
+                        class: rule.class(parameter).0,
+                        before: before.clone(),
+                        after: parameter.shown(),
+                    });
+                    restored.written.extend(changed);
                     continue;
                 }
                 Ok(value) => Some(parameter.data_type.show(&value)),
@@ -265,6 +373,7 @@ impl<W: MailboxTransport> Device<'_, W> {
             restored.differing.push(Difference {
                 at: parameter.at,
                 name: parameter.name.clone(),
+                class: rule.class(parameter).0,
                 left: Some(parameter.shown()),
                 right,
                 meanings: [parameter.meaning(), None],

@@ -1,37 +1,9 @@
-//! Selects and orders the writes of a restore.
+//! Orders the writes of a restore.
 //!
 //! Lists, whose subindex 0 is the count, are emptied, filled and counted. PDO lists follow the
 //! order of ETG.1020: no PDO is assigned while its mapping changes.
 
 use crate::parameters::Parameter;
-
-/// The index offset between the axes of a drive (CiA 402).
-const AXIS: u16 = 0x0800;
-const PROFILE: std::ops::Range<u16> = 0x6000..0xa000;
-
-/// True if the value is a setting that can be copied to another device: it is writable, and writing
-/// it neither commands nor clears anything.
-#[must_use]
-pub fn is_setting(parameter: &Parameter) -> bool {
-    parameter.writable && !is_command(parameter.at.index)
-}
-
-/// True for objects that act when written, or that hold the present command.
-fn is_command(index: u16) -> bool {
-    let index = match index {
-        profile if PROFILE.contains(&profile) => PROFILE.start + (profile - PROFILE.start) % AXIS,
-        other => other,
-    };
-    matches!(
-        index,
-        // Clears error and diagnosis histories, stores and restores parameters, sets the time.
-        0x1003 | 0x1010 | 0x1011 | 0x10f3 | 0x10f8
-        // Program control (CiA 302-3).
-        | 0x1f50..=0x1f57
-        // Controlword, mode, targets, offsets, outputs (CiA 402).
-        | 0x6040 | 0x6042 | 0x6060 | 0x6071 | 0x607a | 0x60b0..=0x60b2 | 0x60b8 | 0x60fe | 0x60ff
-    )
-}
 
 /// True for lists with a writable count.
 #[must_use]

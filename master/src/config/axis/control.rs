@@ -3,13 +3,14 @@
 use ecaxis_axis::homing::{self, Homing, ParameterError};
 use ecaxis_axis::supervision::{Brake, FaultReset, Supervision, TorqueWatch};
 use ecaxis_axis::{AxisConfig, FeedForward, Loops, PositionPid, VelocityLoop};
+use ecaxis_ecat::object::NamedObject;
 use ecaxis_esi as esi;
 use toml::Spanned;
 
 use super::super::fields::{Key, KeyExt, Ns};
 use super::super::problem::Problems;
 use super::super::raw::{RawAxis, RawHoming};
-use super::super::{HomingSetup, TorqueSetup};
+use super::super::{HomingSetup, TorqueSetup, sdo};
 use super::{is_maxon, positive};
 
 /// The default time in s for which torque may exceed its supervised limit.
@@ -144,6 +145,8 @@ pub(super) fn homing(
     selection: Option<&esi::Selection>,
     p: &mut Problems<'_>,
 ) -> Option<HomingSetup> {
+    let dictionary = &selection?.dictionary;
+    let has_threshold = may_have(dictionary, THRESHOLD, 0);
     let homing = Homing {
         method: raw.method.value()?,
         search_velocity: raw.search.value(),
@@ -152,6 +155,7 @@ pub(super) fn homing(
         distance: raw.distance.value(),
         position: raw.position.value(),
         threshold_ma: raw.threshold.value(),
+        maxon_methods: selection.is_some_and(is_maxon) || has_threshold,
     };
     if let Err(error) = homing.check(&config.scale, &config.limits) {
         let hint = match &error {
@@ -187,29 +191,115 @@ pub(super) fn homing(
         );
         return None;
     }
-    let startup = homing
-        .objects(&config.scale, is_maxon(selection))
-        .map(|object| {
-            let bytes = object.value.to_le_bytes();
-            let name = selection
-                .dictionary
-                .item(object.index, object.subindex)
-                .map_or(String::new(), |item| item.name.to_string());
-            esi::StartupSdo {
-                transition: "PS",
-                index: object.index,
-                sub: object.subindex,
-                complete_access: false,
-                data: bytes[..usize::from(object.bytes)].to_vec(),
-                name,
-                origin: "`homing` of the machine file".to_owned(),
-                optional: false,
-            }
-        })
-        .collect();
+    let objects = homing.objects(&config.scale, is_maxon(selection));
+    let startup = objects.map(|object| {
+        let data = object.value.to_le_bytes()[..usize::from(object.bytes)].to_vec();
+        let address = (object.index, object.subindex);
+        startup_sdo(selection, address, data, "`homing` of the machine file")
+    });
+    let startup: Vec<_> = startup.collect();
+    let is_possible = |sdo: &esi::StartupSdo| is_possible(sdo, raw, &homing, dictionary, p);
+    let possible: Vec<bool> = startup.iter().map(is_possible).collect();
+    if possible.contains(&false) {
+        return None;
+    }
     Some(HomingSetup {
         homing,
         startup,
         timeout_ns: raw.timeout.value().unwrap_or(HOMING_TIMEOUT_NS),
     })
+}
+
+/// maxon's current threshold that detects a mechanical end.
+const THRESHOLD: u16 = 0x30b2;
+const HOMING_METHOD: u16 = 0x6098;
+
+/// True if a drive may have an object: an object of the profile, or a vendor's object that its ESI
+/// lists. Some files list no object of the vendor at all.
+fn may_have(dictionary: &esi::Dictionary, index: u16, sub: u8) -> bool {
+    /// Vendor-specific objects of CiA 301.
+    const OF_VENDOR: std::ops::Range<u16> = 0x2000..0x6000;
+    let mut objects = dictionary.objects.iter();
+    let lists_vendor = objects.any(|object| OF_VENDOR.contains(&object.index));
+    !(lists_vendor && OF_VENDOR.contains(&index)) || dictionary.item(index, sub).is_some()
+}
+
+/// Returns a start-up SDO with the name that the ESI gives the object.
+pub(super) fn startup_sdo(
+    selection: &esi::Selection,
+    (index, sub): (u16, u8),
+    data: Vec<u8>,
+    origin: &str,
+) -> esi::StartupSdo {
+    let item = selection.dictionary.item(index, sub);
+    esi::StartupSdo {
+        transition: "PS",
+        index,
+        sub,
+        complete_access: false,
+        data,
+        name: item.map_or(String::new(), |item| item.name.to_string()),
+        origin: origin.to_owned(),
+        optional: false,
+    }
+}
+
+/// Reports a homing object that the ESI lacks, or whose range excludes the value. The vendor's own
+/// methods may be beyond the range: files do not list all of them.
+fn is_possible(
+    sdo: &esi::StartupSdo,
+    raw: &RawHoming,
+    homing: &Homing,
+    dictionary: &esi::Dictionary,
+    p: &mut Problems<'_>,
+) -> bool {
+    let place = match (sdo.index, sdo.sub) {
+        (HOMING_METHOD, _) => raw.method.place(),
+        (0x6099, 1) => raw.search.place(),
+        (0x6099, _) => raw.zero.place(),
+        (0x609a, _) => raw.acceleration.place(),
+        (0x30b1, _) => raw.distance.place(),
+        (THRESHOLD, _) => raw.threshold.place(),
+        _ => raw.position.place(),
+    };
+    let place = place.unwrap_or(raw.span.clone());
+    let object = NamedObject {
+        index: sdo.index,
+        sub: sdo.sub,
+    };
+    let Some(item) = dictionary.item(sdo.index, sdo.sub) else {
+        let may_have = may_have(dictionary, sdo.index, sdo.sub);
+        if !may_have {
+            let message = format!("the drive has no {object}: its ESI does not list it");
+            p.add_hint(place, message, "remove the key from `homing`");
+        }
+        return may_have;
+    };
+    let is_vendor_method = sdo.index == HOMING_METHOD && homing.known_method().is_none();
+    let Some(problem) = sdo::outside_esi_range(item, &sdo.data).filter(|_| !is_vendor_method)
+    else {
+        return true;
+    };
+    let hint = match (sdo.index, homing.method) {
+        // Method 37 replaces 35 (CiA 402-2).
+        (HOMING_METHOD, 37) => "older drives have method 35 for the same",
+        (HOMING_METHOD, _) => "write a method that the drive has",
+        _ => "write a value that the drive accepts",
+    };
+    p.add_hint(place, format!("{object}: {problem}"), hint);
+    false
+}
+
+/// Returns a note about a vendor's homing method that the ESI's range does not include.
+pub(in super::super) fn vendor_method_note(
+    homing: &HomingSetup,
+    selection: &esi::Selection,
+) -> Option<String> {
+    let method = homing.homing.method;
+    if homing.homing.known_method().is_some() {
+        return None;
+    }
+    let item = selection.dictionary.item(HOMING_METHOD, 0)?;
+    let range = sdo::outside_esi_range(item, &method.to_le_bytes());
+    range.map(|range| format!("homing method of the vendor: {range} for 0x6098"))
 }

@@ -2,8 +2,8 @@
 //! and torque.
 
 use ecaxis_axis::scale::TorqueScale;
-use ecaxis_axis::units::{Amperes, NewtonMetres};
-use ecaxis_axis::{AccelerationUnit, Scale, ScaleError, VelocityUnit};
+use ecaxis_axis::units::{Amperes, NewtonMetres, UserUnits};
+use ecaxis_axis::{AccelerationUnit, AxisConfig, Scale, ScaleError, VelocityUnit};
 use ecaxis_esi as esi;
 use toml::Spanned;
 
@@ -13,6 +13,7 @@ use super::super::raw::{RawAxis, RawSdo, SdoValue};
 use super::super::units::is_turn;
 use super::super::{TorqueSetup, TorqueUnit, UnitSource};
 use super::positive;
+use crate::text::rounded;
 
 /// The maximum number of counts per motor turn.
 const MOST_COUNTS: f64 = 2_147_483_648.0;
@@ -132,6 +133,67 @@ fn modulo(raw: &RawAxis, scale: Scale, unit: &str, p: &mut Problems<'_>) -> Opti
             None
         }
     }
+}
+
+/// The counts after which the drive's position repeats.
+const WRAP: f64 = 4_294_967_296.0;
+
+/// Returns why a start cannot determine the position of an absolute encoder: the drive counts 32 bits.
+/// `None` if it can.
+pub(crate) fn ambiguous_start(config: &AxisConfig, unit: &str) -> Option<String> {
+    let scale = &config.scale;
+    if !config.absolute || config.limits.position.is_some() {
+        return None;
+    }
+    let length = scale.modulo();
+    if let Some(length) = length {
+        let counts = length * scale.counts_per_unit();
+        let turns = (WRAP / counts).round();
+        // Each wrap of the drive moves the angle by the rest.
+        if turns >= 1.0 && (WRAP - turns * counts).abs() < 0.5 {
+            return None;
+        }
+    }
+    let half = rounded(scale.units_of_counts(WRAP / 2.0));
+    let repeats = match length {
+        Some(length) => {
+            let turns = rounded(WRAP / (length * scale.counts_per_unit()));
+            format!("its 2^32 counts are {turns} times {length} {unit}, no whole number")
+        }
+        None => "the axis is endless".to_owned(),
+    };
+    Some(format!(
+        "`absolute`: {repeats}: beyond 2^31 counts, {half} {unit}, a start finds a wrong position, \
+         so no start takes it as home"
+    ))
+}
+
+/// Reports a range of an absolute encoder in which the drive's position repeats.
+pub(super) fn absolute_range(
+    raw: &RawAxis,
+    config: &AxisConfig,
+    unit: &str,
+    p: &mut Problems<'_>,
+) -> Option<()> {
+    let is_counted = |end: f64| {
+        let counts = config.scale.position_to_counts(UserUnits(end));
+        i32::try_from(counts.0).is_ok()
+    };
+    let mut ends = config.limits.position.into_iter().flatten();
+    if !config.absolute || ends.all(is_counted) {
+        return Some(());
+    }
+    let half = rounded(config.scale.units_of_counts(WRAP / 2.0));
+    let place = raw.limits.position.place();
+    p.add_hint(
+        place.unwrap_or(raw.span.clone()),
+        format!(
+            "`limits.position` goes beyond the drive's 2^31 counts, {half} {unit}: with `absolute`, \
+             a start there finds a wrong position"
+        ),
+        "narrow `limits.position`, or correct `offset`",
+    );
+    None
 }
 
 const SI_UNIT_VELOCITY: u16 = 0x60a9;

@@ -3,10 +3,12 @@
 use ecaxis_esi as esi;
 use toml::Spanned;
 
+use super::super::axis::control::vendor_method_note;
+use super::super::axis_setup::add_startup;
 use super::super::fields::KeyExt;
 use super::super::problem::Problems;
 use super::super::raw::{RawAxis, RawCompensation, RawDevice, RawSdo, RawSecondEncoder};
-use super::super::{AxisSetup, axis, drive_limits};
+use super::super::{AxisSetup, axis, drive_limits, drive_units};
 
 /// An axis; its setup is missing if it is invalid and has been reported.
 pub(crate) struct CheckedAxis {
@@ -84,7 +86,7 @@ fn setup(
     number: u16,
     device: &RawDevice,
     mode: esi::Mode,
-    mut selection: Option<&mut esi::Selection>,
+    selection: Option<&mut esi::Selection>,
     p: &mut Problems<'_>,
 ) -> Option<AxisSetup> {
     let sdos: Vec<RawSdo> = device
@@ -104,11 +106,20 @@ fn setup(
             sdo.index = esi::axis::object(sdo.index, number);
         }
     }
-    if let (Some(selection), Some(homing)) = (selection.as_deref_mut(), &setup.homing) {
-        homing.add_to(&mut selection.startup);
-    }
     if let Some(selection) = selection {
-        let notes = drive_limits::check(&setup, &sdos, &selection.of_axis(number), p);
+        let seen = selection.of_axis(number);
+        setup.torque_limit = axis::torque_limit(raw, &setup, &sdos, &seen, p);
+        if let Some(homing) = &setup.homing {
+            add_startup(&mut selection.startup, &homing.startup);
+        }
+        add_startup(&mut selection.startup, setup.torque_limit.startup());
+        let seen = selection.of_axis(number);
+        let mut notes = drive_limits::check(&setup, &sdos, &seen, p);
+        notes.extend(drive_units::check(&setup, &sdos, &seen, p));
+        notes.extend(setup.torque_limit.note());
+        notes.extend(axis::ambiguous_start(&setup.config, &setup.unit));
+        let homing = setup.homing.as_ref();
+        notes.extend(homing.and_then(|homing| vendor_method_note(homing, &seen)));
         let warnings = notes.iter().map(|note| format!("warning: {note}"));
         selection.notes.extend(warnings);
     }

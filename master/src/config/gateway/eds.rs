@@ -1,7 +1,7 @@
 //! The EDS of a node (CiA 306-1): the objects that a PDO can carry, and the contents of its PDOs at
 //! delivery.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use configparser::ini::{Ini, IniDefault};
@@ -19,7 +19,7 @@ const MAX_MAPPED: u32 = 64;
 #[derive(Debug)]
 pub(super) struct Eds {
     /// The sections by their names in lower case: `1a00sub1`.
-    sections: HashMap<String, HashMap<String, Option<String>>>,
+    sections: BTreeMap<String, BTreeMap<String, Option<String>>>,
 }
 
 impl Eds {
@@ -47,8 +47,11 @@ impl Eds {
         defaults.comment_symbols = vec![';'];
         defaults.inline_comment_symbols = Some(Vec::new());
         let mut ini = Ini::new_from_defaults(defaults);
-        let sections = ini.read(text.to_owned())?;
-        let eds = Self { sections };
+        let sections = ini.read(text.to_owned())?.into_iter();
+        let sections = sections.map(|(name, keys)| (name, keys.into_iter().collect()));
+        let eds = Self {
+            sections: sections.collect(),
+        };
         match eds.number("deviceinfo", "vendornumber") {
             Some(_) => Ok(eds),
             None => Err("[DeviceInfo] has no VendorNumber: the file is not an EDS".to_owned()),

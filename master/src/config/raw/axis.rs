@@ -17,18 +17,17 @@ const WAYS: [(&str, ModuloDirection); 3] = [
     ("negative", ModuloDirection::Negative),
 ];
 
-const VELOCITY_UNITS: [(&str, VelocityUnit); 4] = [
-    ("rpm", VelocityUnit::RPM),
-    ("mrpm", VelocityUnit::MILLI_RPM),
-    ("counts/s", VelocityUnit::COUNTS_PER_SECOND),
-    ("turns/s", VelocityUnit::TURNS_PER_SECOND),
-];
-
 const TORQUE_UNITS: [(&str, TorqueUnit); 3] = [
     ("percent", TorqueUnit::Percent),
     ("Nm", TorqueUnit::NewtonMetres),
     ("A", TorqueUnit::Amperes),
 ];
+
+/// True: in Operation enabled only.
+const MODE_DISPLAYS: [(&str, bool); 2] = [("always", false), ("enabled", true)];
+
+/// True: without power only.
+const MODE_CHANGES: [(&str, bool); 2] = [("always", false), ("no-power", true)];
 
 table! { "[device.axis]",
     table RawAxis {
@@ -60,9 +59,9 @@ table! { "[device.axis]",
         /// Distance within which a move is in target (unit; default a tenth of the following error,
         /// or ten counts)
         target_window: Key<f64>,
-        /// Unit of the drive's velocities (`"rpm"`, `"mrpm"`, `"counts/s"`, `"turns/s"`; default
-        /// what 0x60A9 says)
-        velocity_unit: Key<VelocityUnit> [VELOCITY_UNITS],
+        /// Unit of the drive's velocities, with a power of ten if needed (`"rpm"`, `"0.1rpm"`,
+        /// `"mrpm"`, `"counts/s"`, `"turns/s"`, …; default what 0x60A9 says)
+        velocity_unit: Key<VelocityUnit>,
         /// Unit of torques in limits, supervision and steps (`"percent"`, `"Nm"`, `"A"`; default
         /// `"percent"`)
         torque_unit: Key<TorqueUnit> [TORQUE_UNITS],
@@ -71,6 +70,9 @@ table! { "[device.axis]",
         torque_constant: Key<f64>,
         /// Rated torque of the motor (above 0, Nm; default what 0x6076 says)
         rated_torque: Key<f64>,
+        /// Writes `limits.torque` to the drive (0x6072, or 0x60E0 and 0x60E1), for all modes (`true`,
+        /// `false`; default `false`)
+        torque_limit_in_drive: Key<bool>,
         /// Commanded values never exceed these limits
         limits: RawLimits = "{ velocity = 200.0, acceleration = 2000.0 }",
         /// From a set-point to the first report that can show it (time, up to 100 ms; default 0)
@@ -79,6 +81,12 @@ table! { "[device.axis]",
         stop_timeout: Key<Ns>,
         /// The drive serves Statusword bit 12 in CSP, CSV and CST (`true`, `false`; default `true`)
         follows_bit: Key<bool>,
+        /// When 0x6061 shows the commanded mode (`"always"`, `"enabled"`; default `"always"`)
+        mode_display: Key<bool> [MODE_DISPLAYS],
+        /// When the drive changes its mode (`"always"`, `"no-power"`; default `"always"`)
+        mode_change: Key<bool> [MODE_CHANGES],
+        /// Time within which 0x6061 must show the commanded mode (time above 0; default `"1s"`)
+        mode_time: Key<Ns>,
         /// What accompanies the target in CSP
         csp: RawOffsets,
         /// Position loop over the drive's velocity
@@ -148,6 +156,28 @@ impl Read for [u32; 2] {
         };
         let [motor, shaft] = [motor, shaft].map(|v| Domain::read(&(1..=u32::MAX), v, key, p));
         Some([motor?, shaft?])
+    }
+}
+
+impl Read for VelocityUnit {
+    fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
+        let text = String::read(value, key, p)?;
+        let unit = text.parse();
+        if unit.is_err() {
+            let message = format!("`{key}` cannot be \"{text}\"");
+            let hint = "there are `rpm`, `mrpm`, `counts/s`, `turns/s`, and powers of ten of them, \
+                        such as `0.1rpm` or `10^-5 turns/s`";
+            p.add_hint(value.span(), message, hint);
+        }
+        unit.ok()
+    }
+}
+
+impl Schema for VelocityUnit {
+    fn schema() -> serde_json::Value {
+        let factor = r"(10\^-?[0-9]|1(0{1,9})?|0\.0{0,8}1)?";
+        let pattern = format!("^(mrpm|{factor} *(rpm|counts/s|turns/s))$");
+        serde_json::json!({ "type": "string", "pattern": pattern })
     }
 }
 
@@ -280,7 +310,7 @@ table! { "`supervise`",
 
 table! { "`homing`",
     table RawHoming {
-        /// 0x6098: CiA 402 methods or maxon's negative ones; the error for a wrong one lists all
+        /// 0x6098: CiA 402 methods or the vendor's negative ones; the error for a wrong one lists all
         /// (number)
         method: Key<i8> = "37",
         /// Velocity to the switch or mechanical end (0x6099:01) (above 0, unit/s; default the

@@ -13,10 +13,12 @@ use super::gateway::{RawCan, RawNode};
 use super::problem::{Problems, Span};
 use super::schema::{self, Schema, any_of};
 use super::sim_motor::RawMotor;
+use super::sim_quirks::RawQuirks;
 use super::subprograms::RawSub;
 use super::travel::RawTrack;
 use super::{
-    CommonTimeUse, ExchangeMode, GroupStopScope, MailboxSource, SocketKind, Spin, UnknownDeviceRule,
+    CommonTimeUse, ExchangeMode, GroupStopScope, MailboxSource, SocketKind, Spin,
+    UnknownDeviceRule, WatchdogTrigger,
 };
 
 mod axis;
@@ -147,6 +149,11 @@ const UNKNOWN_DEVICES: [(&str, UnknownDeviceRule); 2] = [
     ("report", UnknownDeviceRule::Report),
 ];
 
+const TRIGGERS: [(&str, WatchdogTrigger); 2] = [
+    ("required", WatchdogTrigger::Required),
+    ("esi", WatchdogTrigger::Esi),
+];
+
 const MAILBOXES: [(&str, MailboxSource); 2] = [
     ("esi", MailboxSource::Esi),
     ("eeprom", MailboxSource::Eeprom),
@@ -238,6 +245,9 @@ table! { "[[device]]",
         sii: Key<String>,
         /// Source of the mailboxes if both differ (`"esi"`, `"eeprom"`; default `"esi"`)
         mailbox: Key<MailboxSource> [MAILBOXES],
+        /// Whether outputs trigger the SyncManager watchdog (`"required"`, `"esi"`; default those of
+        /// an axis do if the device accepts it)
+        watchdog_trigger: Key<WatchdogTrigger> [TRIGGERS],
         /// Position on the bus, from 0 (0 to 65535; default one of these four)
         position: Key<u16>,
         /// Configured station alias (0x0012) (1 to 65535)
@@ -271,7 +281,8 @@ table! { "[[device]]",
         mode: Key<String> [MODES],
         /// OpMode by name; `"off"`: no distributed clock (text; default the ESI's first OpMode)
         dc: Key<String>,
-        /// Module names, slot by slot (list of text; default by `mode`)
+        /// Module names, slot by slot; `"-"` for an empty slot. Slots after the end of the list are
+        /// empty (list of text; default by `mode`, else the ESI's)
         modules: Key<Vec<String>>,
         /// `AlternativeSmMapping` by name (text; default the ESI's default)
         assignment: Key<String>,
@@ -405,6 +416,23 @@ pub(crate) enum SdoValue {
     Bytes(Vec<u8>),
 }
 
+impl SdoValue {
+    /// Returns the value of an object of up to 8 bytes; `None` if it is not an integer.
+    pub fn integer(&self) -> Option<i64> {
+        match self {
+            Self::Integer(n) => Some(*n),
+            Self::Boolean(b) => Some(i64::from(*b)),
+            Self::Text(text) => unquoted(text),
+            Self::Bytes(bytes) if bytes.len() <= 8 => {
+                let mut all = [0; 8];
+                all[..bytes.len()].copy_from_slice(bytes);
+                Some(i64::from_le_bytes(all))
+            }
+            Self::Float(_) | Self::Bytes(_) => None,
+        }
+    }
+}
+
 impl Read for SdoValue {
     fn read(value: Value<'_>, key: &str, p: &mut Problems<'_>) -> Option<Self> {
         Some(match value.get_ref() {
@@ -445,10 +473,16 @@ table! { "[device.sim]",
         /// From a request in AL control to the answer in AL status (time, up to 60 s; default 200
         /// µs)
         state_change: Key<Ns> [0..=60 * S],
+        /// Modules in the slots, slot by slot, if they differ from those of the device (list of
+        /// text; default those of the device)
+        modules: Key<Vec<String>>,
         /// Switches and ends along a simulated axis (table; default no switches or ends)
         track: Option<RawTrack>,
         /// Motor and load of a simulated axis (table; default a motor of 70 W)
         motor: Option<RawMotor>,
+        /// How a simulated drive differs from the standard, see [drive.md](drive.md#quirks) (table;
+        /// default none)
+        quirks: Option<RawQuirks>,
     }
 }
 
@@ -505,6 +539,9 @@ table! { "[[copy]]",
         from: Key<String> = "\"io1.Input 1\"",
         /// Outputs of the same length (text)
         to: Key<String> = "\"io2.Output 1\"",
+        /// Frames of a safety connection, which also pass to a device that has returned (`true`,
+        /// `false`; default whether the ESI names an entry of either end after FSoE)
+        fsoe: Key<bool>,
     }
 }
 
@@ -536,7 +573,7 @@ table! { "[stop]",
         bus_lost: Key<StopMethod> [STOPS_BY_DRIVE],
         /// Each condition alone causes an emergency stop (conditions as in `wait`; default none)
         emergency: Option<Conditions>,
-        /// Axes that stop together (tables, `[[stop.group]]`; default none)
+        /// Axes and devices that stop together (tables, `[[stop.group]]`; default none)
         groups: Vec<RawGroup> as "group",
     }
 }
@@ -560,8 +597,9 @@ table! { "[[stop.group]]",
     table RawGroup {
         /// (text)
         name: Key<String> = "\"gantry\"",
-        /// An axis is in one group at most, with all axes of its drive (names)
-        axes: Option<Names> = "[\"x\", \"y\"]",
+        /// An axis is in one group at most, with all axes of its drive (names; default none, if
+        /// there are `devices`)
+        axes: Option<Names>,
         /// SubDevices without an axis, lost and stopped with the group (names; default none)
         devices: Option<Names>,
         /// How the other axes of the group stop when one faults or trips (as above; default that of

@@ -10,6 +10,7 @@ use crate::config::raw::{
     Conditions, NamedValues, RawCondition, RawInput, RawNumber, RawSignal, RawSimulation,
     RawVariable, RawWhen,
 };
+use crate::config::roles::UsedInput;
 use crate::config::signal::{self, SignalDirection};
 use crate::config::{
     AxisValue, Bound, Bounds, Condition, InputRef, NamedSignal, NumberPlace, OutputRef, Signal,
@@ -147,6 +148,15 @@ impl ProgramChecker<'_> {
         Some(Condition { input, bounds })
     }
 
+    /// Notes an input of the condition or setting that is being checked.
+    pub(super) fn use_input(&mut self, signal: Signal, place: Span) {
+        self.used.push(UsedInput {
+            usage: self.usage,
+            signal,
+            place,
+        });
+    }
+
     /// Returns the input that a condition tests.
     fn input(&mut self, raw: &RawCondition, p: &mut Problems<'_>) -> Option<InputRef> {
         let signal = self.signal(&raw.signal, p)?;
@@ -156,6 +166,13 @@ impl ProgramChecker<'_> {
         {
             possible(&input, *n, equal.span(), p)?;
         }
+        let place = raw
+            .signal
+            .device
+            .as_ref()
+            .unwrap_or(&raw.signal.name)
+            .span();
+        self.use_input(input.clone(), place);
         Some(InputRef(signal::known(&mut self.inputs, input)))
     }
 

@@ -8,6 +8,7 @@ use super::ProgramChecker;
 use crate::config::fields::KeyExt;
 use crate::config::problem::{Problems, suggestion};
 use crate::config::raw::{Named, RawOverride};
+use crate::config::roles::InputUse;
 use crate::config::signal::{self, SignalDirection};
 use crate::config::{Action, InputRef, Machine, OverrideConfig, OverrideInput};
 use crate::text::percent;
@@ -18,6 +19,7 @@ const MACHINE: &str = "machine";
 impl ProgramChecker<'_> {
     /// Returns the settings of the override. Mistakes are reported and replaced by defaults.
     pub(super) fn overrides(&mut self, raw: &RawOverride, p: &mut Problems<'_>) -> OverrideConfig {
+        self.usage = InputUse::Hold;
         let conditions = raw.hold.iter().flat_map(|conditions| &conditions.0);
         let hold = conditions.filter_map(|raw| self.condition(raw, p));
         let hold = hold.collect();
@@ -61,6 +63,8 @@ impl ProgramChecker<'_> {
             p.add(full.span(), "`zero` and `full` are the same value");
             return None;
         }
+        self.usage = InputUse::Override;
+        self.use_input(input.clone(), text.span());
         Some(OverrideInput {
             input: InputRef(signal::known(&mut self.inputs, input)),
             zero,

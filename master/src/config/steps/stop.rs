@@ -7,7 +7,8 @@ use super::ProgramChecker;
 use crate::config::fields::KeyExt;
 use crate::config::problem::{Problems, suggestion};
 use crate::config::raw::{RawGroup, RawStop};
-use crate::config::{GroupStopScope, StopGroup, StopSetup};
+use crate::config::roles::InputUse;
+use crate::config::{StopGroup, StopSetup};
 use ecaxis_axis::StopMethod;
 
 impl ProgramChecker<'_> {
@@ -20,21 +21,11 @@ impl ProgramChecker<'_> {
             groups.push(group);
         }
         let mut emergency = Vec::new();
+        self.usage = InputUse::Emergency;
         for raw in raw.emergency.iter().flat_map(|conditions| &conditions.0) {
             let Some(condition) = self.condition(raw, p) else {
                 continue;
             };
-            let device = self.inputs[condition.input.0].device;
-            let group = groups.iter().find(|g| g.devices.contains(&device));
-            if let Some(group) = group.filter(|g| g.outside == GroupStopScope::Continue) {
-                let message = format!(
-                    "`{}` is in the group `{}`, without which the machine goes on: an emergency would go unseen",
-                    self.devices[device].name, group.name,
-                );
-                let hint = "leave its device out of the group, or write `outside = \"stop\"`";
-                let at = raw.signal.device.as_ref().unwrap_or(&raw.signal.name);
-                p.add_hint(at.span(), message, hint);
-            }
             emergency.push(condition);
         }
         StopSetup {
@@ -75,6 +66,10 @@ impl ProgramChecker<'_> {
             others: raw.others.value().unwrap_or(others),
             outside: raw.outside.value().unwrap_or_default(),
         };
+        if raw.axes.is_none() && raw.devices.is_none() && !raw.written.has("axes") {
+            let hint = "add `axes = [\"x\", \"y\"]`, or `devices` for SubDevices without an axis";
+            p.add_hint(raw.span.clone(), "nothing is in this [[stop.group]]", hint);
+        }
         let mut axes = Vec::new();
         for name in raw.axes.iter().flat_map(|names| &names.0) {
             let Some((axis, _)) = self.axis(name, p) else {

@@ -35,13 +35,30 @@ fn stop_groups_are_parsed_with_their_defaults() {
 }
 
 #[test]
+fn a_group_may_consist_of_devices_alone() {
+    let text = "\n[[device]]\nname = \"io\"\nesi = \"D1.xml\"\nposition = 2\n\
+        [[stop.group]]\nname = \"g\"\ndevices = [\"io\"]\noutside = \"continue\"\n";
+    let machine = with_esi(&format!("{GOOD}{text}")).unwrap();
+    assert_eq!(machine.stop.groups[0].devices, [DeviceIndex(2)]);
+}
+
+/// The loss of a device without process data stops the machine.
+#[test]
+fn a_group_that_the_machine_goes_on_without_has_process_data() {
+    let text = "\n[[device]]\nname = \"io\"\nesi = \"D1.xml\"\nposition = 2\npdo.rx = []\npdo.tx = []\n\
+        [[stop.group]]\nname = \"g\"\ndevices = [\"io\"]\noutside = \"continue\"\n";
+    let error = with_esi(&format!("{GOOD}{text}")).unwrap_err().to_string();
+    assert!(error.contains("group `g` has no process data"), "{error}");
+}
+
+#[test]
 #[rustfmt::skip] // one row per mistake
 fn stop_rejects_invalid_groups() {
     let io = "\n[[device]]\nname = \"io\"\nesi = \"D1.xml\"\nposition = 2\n";
     let group = "[[stop.group]]\nname = \"g\"\naxes = [\"x\"]\n";
     for (text, message, hint, marked) in [
         ("[[stop.group]]\naxes = [\"x\"]\n", "`name` is missing in [[stop.group]]", "name = \"gantry\"", ""),
-        ("[[stop.group]]\nname = \"g\"\n", "`axes` is missing in [[stop.group]]", "axes = [\"x\", \"y\"]", ""),
+        ("[[stop.group]]\nname = \"g\"\n", "nothing is in this [[stop.group]]", "axes = [\"x\", \"y\"]", ""),
         ("[[stop.group]]\nname = \"g\"\naxes = []\n", "nothing is named here", "a list such as", "[]"),
         ("[[stop.group]]\nname = \" \"\naxes = [\"x\"]\n", "a group needs a name", "", "\" \""),
         ("[[stop.group]]\nname = \"g\"\naxes = [\"q\"]\n", "no device is named `q`", "axes: `x`, `v`", "\"q\""),

@@ -124,7 +124,7 @@ fn config_reports_each_mistake_with_its_place() {
         ("dwell = \"500ms\"", "wait = { z.In = true }", "no device is named `z`", "devices: `x`, `v`", "z"),
         ("dwell = \"500ms\"", "wait = { x.Nothing = true }", "no input \"Nothing\"", "its inputs: ", "Nothing"),
         ("dwell = \"500ms\"", "wait = { x.\"0x6041\" = 65536 }", "is not a value of `x.", "16 bits: 0 to 65535", "65536"),
-        ("dwell = \"500ms\"", "set = { x.\"0x607A\" = 5 }", "written by the axis itself", "a command", "\"0x607A\""),
+        ("dwell = \"500ms\"", "set = { x.\"0x607A\" = 5 }", "written by the axis `x` in line", "a command", "\"0x607A\""),
         ("dwell = \"500ms\"", "", "does nothing", "dwell", "[[step]]"),
         ("dwell = \"500ms\"", "dwel = \"500ms\"", "unknown key `dwel`", "`dwell`", "dwel"),
         ("dwell = \"500ms\"", "dwell = \"500 parsec\"", "unknown unit of time `parsec`", "units:", "parsec"),
@@ -224,16 +224,16 @@ fn brake_output_is_exclusive() {
         (
             "output = \"io.a.Output 1\"",
             "",
-            "opens the brake of `x` already",
+            "opens the brake of `x` in line 12; the brake of `y` in line 21 may not",
         ),
         ("output = \"io.a.Output 9\"", "", "no output \"Output 9\""),
         ("output = \"o.Output 1\"", "", "no device is named `o`"),
         ("output = \"Output 1\"", "", "names no output"),
-        ("output = \"x.0x60B1\"", "", "written by the axis itself"),
+        ("output = \"x.0x60B1\"", "", "has 32 bits"),
         (
             "",
             "[[step]]\nset = { \"io.a\".\"Output 1\" = true }\n",
-            "and a step sets it",
+            "is set by the step in line",
         ),
         (
             "",

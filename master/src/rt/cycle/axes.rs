@@ -1,7 +1,7 @@
 //! Steps every axis once per cycle, from its inputs to its outputs.
 
-use ecaxis_axis::setpoint::Motion;
-use ecaxis_axis::{Mode, StopPhase};
+use ecaxis_axis::setpoint::{Master, Motion};
+use ecaxis_axis::{Mode, PowerLossCause, State, StopPhase};
 use ecaxis_ecat::index::AxisIndex;
 
 use super::{Engine, Nanos};
@@ -83,9 +83,9 @@ impl Engine {
     /// same cycle.
     pub(super) fn act(&mut self) {
         self.stop_missing_axes();
+        self.set_rates();
         self.update_gantries();
         self.update_line_shafts();
-        self.set_rates();
         // Gears form no loops, so every pass steps at least one axis.
         for _ in 0..self.axes.len() {
             let mut waiting = false;
@@ -109,14 +109,19 @@ impl Engine {
                 break;
             }
         }
-        self.set_position_outputs();
         for group in self.groups.indices() {
             if let Some(cause) = self.groups.get_mut(group).and_then(|g| g.found.take()) {
-                // If an axis cannot be stopped, the machine must not continue without its group.
-                let own = !matches!(cause, StopCause::Powered { .. });
+                // If an axis cannot be stopped, or stops without a cause, the machine must not
+                // continue without its group.
+                let own = !matches!(
+                    cause,
+                    StopCause::Powered { .. } | StopCause::PowerLost { .. }
+                );
                 self.stop(own.then_some(group), cause);
             }
         }
+        // After the stops: an output is off in the cycle in which its axis gets the stop.
+        self.set_position_outputs();
     }
 
     /// Writes the outputs that follow positions. They are off while the group of the axis stops.
@@ -147,6 +152,18 @@ impl Engine {
                 let motion = known.shaft.motion();
                 motion.map_err(|end| GeneratorError::LineShaft { shaft, end })
             }
+        }
+    }
+
+    /// Returns true if a hold of an axis brings its master to rest as well: the master is held too,
+    /// and the followed motion is a set-point, or its set-point still moves.
+    fn comes_to_rest(&self, master: GearMaster) -> bool {
+        match master {
+            GearMaster::Axis { axis, actual } => self.axes.get(axis).is_some_and(|slot| {
+                let moves = slot.axis.status().target_velocity != 0.0;
+                slot.rates.own.is_held() && (moves || !actual)
+            }),
+            GearMaster::LineShaft(_) => false,
         }
     }
 
@@ -194,10 +211,16 @@ impl Engine {
             .axes
             .get(index)
             .and_then(|slot| slot.generator.master());
-        let master = master.map_or(Ok(Motion::default()), |(master, cam)| {
-            let motion = self.master_motion(master)?;
-            Ok(CamRef::through(cam, &self.config.cams, motion))
-        });
+        let master = match master {
+            Some((master, cam)) => self.master_motion(master).map(|motion| Master {
+                motion: CamRef::through(cam, &self.config.cams, motion),
+                comes_to_rest: self.comes_to_rest(master),
+            }),
+            None => Ok(Master {
+                motion: Motion::default(),
+                comes_to_rest: false,
+            }),
+        };
         let leader = self.axes.get(index).and_then(|slot| {
             let leader = slot.leader?;
             let first = self.axes.get(leader.axis)?.axis.status();
@@ -235,6 +258,21 @@ impl Engine {
             if status.resetting {
                 group.acknowledge();
             }
+        }
+        // A stop from outside the axis is one of its group or of its gantry, which record it.
+        let cause = status.power_loss_cause;
+        let recorded = cause.is_some_and(|cause| cause != PowerLossCause::Outside);
+        if group.stop().is_some() || recorded {
+            slot.power.end();
+        }
+        if status.switching.is_some() {
+            slot.power.switch_mode();
+        }
+        let operates = status.state == State::OperationEnabled;
+        let heard = status.stale_cycles == 0;
+        if heard && slot.power.is_lost(status.enabled, operates) {
+            let state = status.state;
+            group.found = Some(StopCause::PowerLost { axis: index, state });
         }
         let cause = match (status.fault, status.trip) {
             (Some(_), _) if slot.armed => Some(StopCause::DriveFault { axis: index }),

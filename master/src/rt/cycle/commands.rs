@@ -11,7 +11,8 @@ use crate::rt::channel::{COMMANDS_PER_CYCLE, Event, RtCommand};
 use crate::rt::exchange::SubDeviceDiagnostics;
 use crate::rt::flight_recorder::Trigger;
 use crate::rt::gantry;
-use crate::rt::gateway::Gateway;
+use crate::rt::gateway::{Gateway, NodeCommand, NodePlace};
+use crate::rt::overrides::check_hold;
 use crate::rt::reaction_group::{ActiveStop, ReactionGroup, check_permitted};
 use crate::rt::setpoint_generator::{CamRef, GearMaster, GeneratorError, GeneratorRequest};
 
@@ -39,7 +40,9 @@ impl Engine {
                 let Some(slot) = self.axes.get(axis) else {
                     return;
                 };
-                let admitted = check_permitted(&mut self.groups, slot.group, command);
+                let rate = self.overrides.rate(slot.group);
+                let admitted = check_permitted(&mut self.groups, slot.group, command)
+                    .and_then(|()| check_hold(rate, command));
                 let taken = admitted.and_then(|()| {
                     gantry::command(&mut self.axes, &mut self.gantries, axis, command)
                 });
@@ -77,12 +80,22 @@ impl Engine {
                 self.guarding = true;
                 self.exchange.expect_op(true);
             }
-            RtCommand::Absent { group } => self.stop(Some(group), StopCause::Absent),
+            RtCommand::Absent { group } => {
+                for device in self.guard.devices_of(group) {
+                    self.exchange.lock_outputs(device);
+                }
+                self.stop(Some(group), StopCause::Absent);
+            }
             RtCommand::StopBusMonitor => {
                 self.guarding = false;
                 self.exchange.expect_op(false);
                 self.axes.iter_mut().for_each(RtAxis::disarm);
             }
+            RtCommand::Node {
+                gateway,
+                node,
+                command,
+            } => self.command_node(gateway, node, command),
             RtCommand::EndGateways => self.gateways.iter_mut().for_each(Gateway::end),
             RtCommand::Stop => self.stop(None, StopCause::Requested),
             RtCommand::ErrorCode { axis, code } => {
@@ -116,6 +129,38 @@ impl Engine {
                 axis,
                 reason,
             });
+        }
+    }
+
+    /// Commands the NMT state of a node whose axis has no power.
+    fn command_node(&mut self, device: DeviceIndex, node: usize, command: NodeCommand) {
+        let mut gateways = self.gateways.iter_mut().enumerate();
+        let Some((number, gateway)) = gateways.find(|(_, g)| g.device() == device) else {
+            return;
+        };
+        let place = NodePlace {
+            gateway: number,
+            node,
+        };
+        let powered = |slot: &RtAxis| {
+            let status = slot.axis.status();
+            status.enabled || status.state.has_power()
+        };
+        let mut slots = self.axes.enumerate_mut();
+        let own = slots.find(|(_, slot)| slot.node == Some(place));
+        if let Some((axis, _)) = own.as_ref().filter(|(_, slot)| powered(slot)) {
+            let (cycle, axis) = (self.stats.counters.cycles, *axis);
+            drop(slots);
+            let reason = CommandError::HasPower;
+            return self.report(Event::Refused {
+                cycle,
+                axis,
+                reason,
+            });
+        }
+        gateway.command(node, command);
+        if let Some((_, slot)) = own.filter(|_| command == NodeCommand::Reset) {
+            slot.axis.restarted(false);
         }
     }
 
@@ -274,8 +319,9 @@ impl Engine {
         self.axes.iter().all(|slot| slot.axis.stop_ended())
     }
 
-    /// Releases groups that were reset. Their axes must be at rest without power, without a fault
-    /// or trip, their process data must be fresh, and their devices in Op.
+    /// Releases groups that were reset; a group without axes needs no reset. Their axes must be at
+    /// rest without power, without a fault or trip, their process data must be fresh, and their
+    /// devices in Op.
     pub(super) fn release(&mut self) {
         if self.stopping().is_some() {
             return;
@@ -298,16 +344,24 @@ impl Engine {
                 sound && !status.state.has_power()
             };
             let mut own = self.axes.iter().filter(|slot| slot.group == index);
+            let has_axes = own.clone().next().is_some();
             let Some(group) = self.groups.get_mut(index) else {
                 continue;
             };
-            if group.stop().is_none() || !there || !own.all(idle) || !group.release() {
+            if group.stop().is_none() || !there || !own.all(idle) {
+                continue;
+            }
+            if !has_axes {
+                group.acknowledge();
+            }
+            if !group.release() {
                 continue;
             }
             for slot in self.axes.iter_mut().filter(|slot| slot.group == index) {
                 slot.disarm();
             }
             self.exchange.release_windows(index);
+            self.exchange.unlock_outputs(index);
             let cycle = self.stats.counters.cycles;
             let group = index;
             self.report(Event::GroupReleased { cycle, group });

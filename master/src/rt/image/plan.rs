@@ -123,6 +123,9 @@ pub struct ImagePlan {
     pub mailboxes: Option<MailboxPlan>,
     /// Inputs that are copied to outputs in every cycle, each with the device of the inputs.
     pub copies: Vec<(DeviceIndex, BitCopy)>,
+    /// Outputs that have their initial value from the loss of their device to the reset of its
+    /// group.
+    pub output_locks: Vec<(DeviceIndex, BitCopy)>,
     /// Outputs that are copied to other outputs, after everything that writes outputs.
     pub repeats: Vec<BitCopy>,
     pub len: usize,
@@ -206,9 +209,13 @@ pub fn of(config: &RtConfig) -> Result<ImagePlan, TooLarge> {
     if wire_ns(&image.separate, config.align) + through > config.cycle_ns / 2 {
         image.separate.clear();
     }
-    let copies = config.copies.iter();
-    let copies = copies.filter_map(|copy| Some((copy.from.0, image.bit_copy(copy)?)));
-    image.copies = copies.collect();
+    let placed = |copies: &[ProcessDataCopy]| {
+        let copies = copies.iter();
+        let copies = copies.filter_map(|copy| Some((copy.from.0, image.bit_copy(copy)?)));
+        copies.collect::<Vec<_>>()
+    };
+    let (copies, locks) = (placed(&config.copies), placed(&config.output_locks));
+    (image.copies, image.output_locks) = (copies, locks);
     let repeats = config.repeats.iter();
     image.repeats = repeats.filter_map(|copy| image.bit_copy(copy)).collect();
     Ok(image)

@@ -20,6 +20,7 @@ use crate::clock::Nanos;
 use crate::config::{GroupStopScope, Machine, OutputRef, StopGroup};
 use crate::link::sim::SimInput;
 use crate::rt::channel::Snapshot;
+pub use crate::rt::gateway::NodeCommand;
 
 mod activity;
 mod requests;
@@ -198,6 +199,13 @@ pub enum Request {
         output: OutputRef,
         value: f64,
     },
+    /// Commands the NMT state of a node behind a gateway, whose axis has no power.
+    Node {
+        gateway: DeviceIndex,
+        /// The index in [`GatewaySetup::nodes`](crate::config::GatewaySetup::nodes).
+        node: usize,
+        command: NodeCommand,
+    },
     /// Switches an input of the simulated bus.
     SimInput(SimInput),
     /// Scales the speed of all motions of the machine (the first group) or of a group.
@@ -236,6 +244,7 @@ impl Request {
             Self::StopAll
             | Self::EmergencyStop
             | Self::SetOutput { .. }
+            | Self::Node { .. }
             | Self::SimInput(_)
             | Self::Override { .. }
             | Self::Hold { .. }
@@ -305,8 +314,8 @@ pub enum RequestEvent {
     },
     /// Another request has replaced this one.
     Replaced { request: u64, axis: AxisIndex },
-    /// An input of the simulated bus is switched, or the request was refused.
-    Input {
+    /// An output, a node or an input of the simulated bus is commanded, or the request was refused.
+    Signal {
         request: u64,
         result: Result<(), String>,
     },
@@ -327,7 +336,7 @@ impl RequestEvent {
             | Self::LetGo { axis, .. }
             | Self::Failed { axis, .. }
             | Self::Replaced { axis, .. } => Some(*axis),
-            Self::Program { .. } | Self::Input { .. } => None,
+            Self::Program { .. } | Self::Signal { .. } => None,
         }
     }
 
@@ -340,7 +349,7 @@ impl RequestEvent {
             | Self::LetGo { request, .. }
             | Self::Failed { request, .. }
             | Self::Replaced { request, .. }
-            | Self::Input { request, .. }
+            | Self::Signal { request, .. }
             | Self::Program { request, .. } => *request,
         }
     }
@@ -352,7 +361,7 @@ impl RequestEvent {
             self,
             Self::Refused { .. }
                 | Self::Failed { .. }
-                | Self::Input { result: Err(_), .. }
+                | Self::Signal { result: Err(_), .. }
                 | Self::Program { result: Err(_), .. }
         )
     }
@@ -378,8 +387,8 @@ impl fmt::Display for RequestEvent {
             Self::LetGo { .. } => f.write_str("let go, brakes"),
             Self::Failed { what, why, .. } => write!(f, "{what}: {why}"),
             Self::Replaced { .. } => f.write_str("replaced by another request"),
-            Self::Input { result: Ok(()), .. } => f.write_str("input: switched"),
-            Self::Input {
+            Self::Signal { result: Ok(()), .. } => f.write_str("signal: commanded"),
+            Self::Signal {
                 result: Err(why), ..
             } => write!(f, "refused: {why}"),
             Self::Program { result: Ok(()), .. } => f.write_str("program: done"),
@@ -391,16 +400,11 @@ impl fmt::Display for RequestEvent {
 }
 
 /// Returns the machine for manual mode. Axes without a group form one that stops alone, because a
-/// group can be reset and a stopped machine cannot. Causes of stops are unchanged. Devices with
-/// emergency inputs stay in the group whose stop stops everything.
+/// group can be reset and a stopped machine cannot. Causes of stops are unchanged. Devices with inputs
+/// whose loss must stop the machine stay in the group whose stop stops everything.
 #[must_use]
 pub fn for_manual_mode(mut machine: Machine) -> Machine {
-    let watched: Vec<_> = machine
-        .stop
-        .emergency
-        .iter()
-        .filter_map(|condition| Some(machine.inputs.get(condition.input.0)?.device))
-        .collect();
+    let watched: Vec<_> = machine.roles.watched_devices().collect();
     let free = |&device: &DeviceIndex| {
         machine.devices[device].selection.mode.is_some()
             && machine.group_of(device) == GroupIndex::MACHINE

@@ -1,7 +1,7 @@
 //! Turns requests, time and the axes' status into commands. No I/O, no clock.
 
 use ecaxis_axis::units::UserUnits;
-use ecaxis_axis::{AxisStatus, Command, CommandError, HomingStatus};
+use ecaxis_axis::{AxisStatus, Command, CommandError, EnableBlocker, HomingStatus, Mode};
 use ecaxis_ecat::index::{AxisIndex, GroupIndex, IndexVec};
 
 use super::activity::Activity;
@@ -12,15 +12,21 @@ use super::{
 use crate::clock::Nanos;
 use crate::config::{AxisSetup, Machine};
 use crate::rt::channel::Snapshot;
+use crate::rt::gateway::NodeState;
 
 /// The timeout in ns for an axis to follow after its set-point has arrived.
 const SETTLE: Nanos = 5_000_000_000;
+const MANUAL_PROFILE: &str = "by hand an axis moves with a part of its limits, and in PP this drive \
+    moves with its own speed and ramp: move it by a program, or use it in CSP";
+const READS_MODE: &str = "the axis is being enabled: its mode is read over CoE (0x6061)";
 const STOPPED: &str = "its group has been stopped";
 
 /// The state of one axis in manual mode.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct AxisActivity {
     pub doing: Activity,
+    /// The reading of the mode since the axis was enabled, if it is not in the process data.
+    mode: Option<ModeReading>,
     /// The time of the request. For a jog, the last request; for a move, the last time its
     /// set-point moved.
     pub since: Nanos,
@@ -28,11 +34,24 @@ pub struct AxisActivity {
     pub(super) request: u64,
 }
 
+/// The reading of a mode over CoE.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum ModeReading {
+    /// It starts when the axis has power.
+    Needed,
+    Pending,
+    Confirmed,
+}
+
 /// The state of all axes in manual mode.
 #[derive(Debug)]
 pub(super) struct RequestController {
     pub hands: IndexVec<AxisIndex, AxisActivity>,
     pub news: Pending,
+    /// Axes with power whose mode must be read over CoE before they are enabled.
+    pub unread: Vec<AxisIndex>,
+    /// Axes whose process data does not show their mode.
+    hidden: IndexVec<AxisIndex, bool>,
     /// The maximum time in ns to wait for a drive.
     timeout: Nanos,
     shares: LimitShares,
@@ -57,6 +76,10 @@ impl RequestContext<'_> {
         self.machine.group_of_axis(axis)
     }
 
+    fn mode(&self, axis: AxisIndex) -> Option<Mode> {
+        Some(self.snapshot.axes.get(axis)?.mode)
+    }
+
     fn enabled(&self, axis: AxisIndex) -> bool {
         let status = self.snapshot.axes.get(axis);
         status.is_some_and(|status| status.enabled)
@@ -79,10 +102,13 @@ impl RequestContext<'_> {
 pub(super) type Commands = Vec<(AxisIndex, Command)>;
 
 impl RequestController {
-    pub fn new(axes: usize, timeout: Nanos, shares: LimitShares) -> Self {
+    /// `hidden`: for each axis, true if its process data does not show its mode.
+    pub fn new(hidden: Vec<bool>, timeout: Nanos, shares: LimitShares) -> Self {
         Self {
-            hands: vec![AxisActivity::default(); axes].into(),
+            hands: vec![AxisActivity::default(); hidden.len()].into(),
             news: Pending::new(),
+            unread: Vec::new(),
+            hidden: hidden.into(),
             timeout,
             shares,
             number: 0,
@@ -128,10 +154,17 @@ impl RequestController {
             let Some(status) = scene.snapshot.axes.get(axis) else {
                 continue;
             };
+            if status.ready && hand.mode == Some(ModeReading::Needed) {
+                hand.mode = Some(ModeReading::Pending);
+                self.unread.push(axis);
+            }
             let what = hand.doing;
-            let Some(end) = hand.end(status, scene.stopped(axis), scene.now, self.timeout) else {
+            let Some(end) = hand.end(status, scene, axis, self.timeout) else {
                 continue;
             };
+            if what == Activity::Enabling && end.is_ok() && hand.reads_mode() {
+                continue;
+            }
             let request = std::mem::take(&mut hand.request);
             // Such a motion goes on, and its end by a stop or a fault is still watched.
             let goes_on = matches!(what, Activity::Turning { .. } | Activity::Pressing { .. });
@@ -167,6 +200,27 @@ impl RequestController {
         }
     }
 
+    /// Permits the motion of an axis whose mode was read, or fails its enabling. Returns true if the
+    /// axis must be disabled.
+    pub fn mode_was_read(&mut self, axis: AxisIndex, checked: Result<(), String>) -> bool {
+        let waits = |hand: &&mut AxisActivity| hand.mode == Some(ModeReading::Pending);
+        let Some(hand) = self.hands.get_mut(axis).filter(waits) else {
+            return false;
+        };
+        let Err(why) = checked else {
+            hand.mode = Some(ModeReading::Confirmed);
+            return false;
+        };
+        (hand.doing, hand.mode) = (Activity::Nothing, Some(ModeReading::Needed));
+        self.news.push_back(RequestEvent::Failed {
+            request: std::mem::take(&mut hand.request),
+            axis,
+            what: Activity::Enabling,
+            why,
+        });
+        true
+    }
+
     /// Stops motion without an operator or a repeated jog request. Must be called before `take`.
     pub fn watch(&mut self, scene: &RequestContext<'_>, presence: Presence, out: &mut Commands) {
         for (axis, hand) in self.hands.enumerate_mut() {
@@ -198,15 +252,6 @@ impl RequestController {
         self.hands.iter().any(|hand| hand.doing.moves())
     }
 
-    /// Stops everything that moves.
-    pub fn brake(&mut self, scene: &RequestContext<'_>, out: &mut Commands) {
-        for (axis, hand) in self.hands.enumerate_mut() {
-            if hand.doing.moves() {
-                hand.stop(axis, scene.now, out);
-            }
-        }
-    }
-
     /// Executes one request of a present operator, or reports why it is refused.
     pub fn take(
         &mut self,
@@ -216,6 +261,21 @@ impl RequestController {
         out: &mut Commands,
     ) {
         self.number = number;
+        let moves = matches!(
+            request,
+            Request::Jog { .. }
+                | Request::MoveBy { .. }
+                | Request::MoveTo { .. }
+                | Request::Home { .. }
+                | Request::Velocity { .. }
+                | Request::Torque { .. }
+        );
+        if let Some(axis) = request.axis().filter(|_| moves)
+            && self.hands.get(axis).is_some_and(AxisActivity::reads_mode)
+        {
+            self.refuse(axis, READS_MODE.to_owned());
+            return;
+        }
         match request {
             Request::StopAll => {
                 for (axis, hand) in self.hands.enumerate_mut() {
@@ -258,6 +318,7 @@ impl RequestController {
             },
             // The loop that serves the operator takes these.
             Request::SetOutput { .. }
+            | Request::Node { .. }
             | Request::SimInput(_)
             | Request::Override { .. }
             | Request::Hold { .. }
@@ -277,6 +338,9 @@ impl RequestController {
             hand.preempt(doing, axis, out);
             hand.begin(doing, scene.now);
             hand.replace(axis, self.number, &mut self.news);
+            if doing == Activity::Enabling && self.hidden.get(axis) == Some(&true) {
+                hand.mode = Some(ModeReading::Needed);
+            }
             out.push((axis, command));
         }
     }
@@ -297,6 +361,12 @@ impl RequestController {
             let unit = &setup.unit;
             let why = format!("{velocity} {unit}/s is more than the {most} {unit}/s of a jog");
             self.refuse(axis, why);
+            return;
+        }
+        if velocity != 0.0 && scene.mode(axis) == Some(Mode::Pp) {
+            let why =
+                "a jog needs CSP, CSV or PV; the axis is in PP, where the drive takes positions";
+            self.refuse(axis, why.to_owned());
             return;
         }
         let Some(hand) = self.hands.get_mut(axis) else {
@@ -328,6 +398,10 @@ impl RequestController {
     ) -> Result<Motion, (AxisIndex, String)> {
         let LimitShares { speed: most, ramp } = self.shares;
         let check = |axis: AxisIndex, speed: f64| {
+            let fixed = scene.setup(axis).is_some_and(|s| s.config.profile_fixed);
+            if fixed && ramp < 1.0 && scene.mode(axis) == Some(Mode::Pp) {
+                return Err((axis, MANUAL_PROFILE.to_owned()));
+            }
             if speed > 0.0 && speed <= most {
                 return Ok(());
             }
@@ -445,6 +519,11 @@ impl RequestController {
 }
 
 impl AxisActivity {
+    /// Returns true until the mode is confirmed: the axis must not move before.
+    const fn reads_mode(&self) -> bool {
+        matches!(self.mode, Some(ModeReading::Needed | ModeReading::Pending))
+    }
+
     /// Takes the number of the next request. The present one has no other outcome.
     fn replace(&mut self, axis: AxisIndex, number: u64, news: &mut Pending) {
         let request = std::mem::replace(&mut self.request, number);
@@ -477,12 +556,15 @@ impl AxisActivity {
     fn end(
         &mut self,
         status: &AxisStatus,
-        stopped: bool,
-        now: Nanos,
+        scene: &RequestContext<'_>,
+        axis: AxisIndex,
         timeout: Nanos,
     ) -> Option<Result<(), String>> {
+        let (now, stopped) = (scene.now, scene.stopped(axis));
         let waited = now.saturating_sub(self.since);
-        if self.doing.moves() && (stopped || !status.enabled) {
+        // A mode switch may need a time without power.
+        let powerless = !status.enabled && status.switching.is_none();
+        if self.doing.moves() && (stopped || powerless) {
             let why = if stopped {
                 STOPPED
             } else {
@@ -494,21 +576,32 @@ impl AxisActivity {
             // A jog ends when its requests end.
             Activity::Nothing | Activity::Jogging { .. } => return None,
             Activity::Enabling if stopped => return Some(Err(STOPPED.to_owned())),
-            Activity::Enabling => status.ready,
+            Activity::Enabling => {
+                if status.waiting == Some(EnableBlocker::Held) {
+                    self.since = now;
+                }
+                status.ready
+            }
             Activity::Disabling => !status.state.has_power(),
-            Activity::Stopping => !(status.enabled && status.moving),
+            // Zero torque does not stop an axis.
+            Activity::Stopping => {
+                let coasts = status.mode == Mode::Cst && !status.at_rest;
+                !(status.enabled && (status.moving || coasts))
+            }
             Activity::Turning { .. } => return status.in_target.then_some(Ok(())),
             Activity::Pressing { .. } => return (!status.moving).then_some(Ok(())),
             Activity::Moving { .. } => {
+                // A move that something has replaced ends elsewhere.
+                let there = status.in_target && status.commanded_target.is_some();
                 if status.moving && !status.held_by_range {
                     self.since = now;
-                } else if !status.in_target && waited > SETTLE {
+                } else if !there && waited > SETTLE {
                     return Some(Err(format!(
                         "not reached, stands at {:.4}",
                         status.position
                     )));
                 }
-                return status.in_target.then_some(Ok(()));
+                return there.then_some(Ok(()));
             }
             Activity::Homing => {
                 return match status.homing {
@@ -540,8 +633,11 @@ impl AxisActivity {
             return Some(Ok(()));
         }
         (waited > timeout).then(|| {
-            Err(match status.waiting {
-                Some(waiting) if self.doing == Activity::Enabling => waiting.to_string(),
+            let node = scene.snapshot.nodes.get(axis).copied().flatten();
+            let lost = node.filter(|state| *state != NodeState::Operational);
+            Err(match (lost, status.waiting) {
+                (Some(state), _) => format!("its node on the CAN network is {state}"),
+                (None, Some(waiting)) if self.doing == Activity::Enabling => waiting.to_string(),
                 _ => format!("not done in time; the drive is in {}", status.state),
             })
         })

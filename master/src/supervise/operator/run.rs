@@ -2,19 +2,19 @@
 
 use std::sync::Arc;
 
-use ecaxis_axis::Command;
-use ecaxis_ecat::index::{AxisIndex, GroupIndex};
+use ecaxis_axis::{Command, CommandError};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex};
 
-use super::activity::Activity;
 use super::requests::{Commands, RequestContext, RequestController};
 use super::{Operator, Presence, ProgramRequest, ProgramStatus, Request, RequestEvent, View};
 use crate::clock;
+use crate::concurrent::Background;
 use crate::config::steps::enables;
 use crate::link::sim::SimInput;
 use crate::report::{Cause, Error};
 use crate::rt::channel::{RtCommand, Snapshot};
-use crate::rt::reaction_group::GroupStatus;
-use crate::supervise::explain::MODES_OF_OPERATION_DISPLAY;
+use crate::rt::controller::OutputRef;
+use crate::supervise::explain::hidden_mode;
 use crate::supervise::{CommonStart, ProgramOutcome, Supervisor};
 
 /// The maximum number of requests per call, not counting stops.
@@ -37,8 +37,6 @@ pub(crate) struct Attendance {
     /// The number of requests so far.
     requests: u64,
     gone: bool,
-    /// Enabled axes whose mode must be read over CoE because it is not in their process data.
-    to_confirm: Vec<AxisIndex>,
 }
 
 impl Supervisor {
@@ -52,9 +50,13 @@ impl Supervisor {
         let all: Vec<_> = self.machine.axes.indices().collect();
         let timeout = timeout + self.longest_release(&all);
         let shares = operator.shares();
+        let hidden = all
+            .iter()
+            .map(|&axis| hidden_mode(&self.machine, axis).is_some());
+        let hidden = hidden.collect();
         self.attendance = Some(Box::new(Attendance {
             operator,
-            controller: RequestController::new(all.len(), timeout, shares),
+            controller: RequestController::new(hidden, timeout, shares),
             program: ProgramStatus::default(),
             program_request: 0,
             start_at: None,
@@ -63,10 +65,14 @@ impl Supervisor {
             step: false,
             requests: 0,
             gone: false,
-            to_confirm: Vec::new(),
         }));
+        let mut readings = Background::new();
         loop {
-            let snapshot = self.poll_snapshot().await?;
+            let (snapshot, modes) = readings.run_during(self.poll_snapshot()).await;
+            let snapshot = snapshot?;
+            for (axis, display) in modes {
+                self.mode_was_read(axis, display, &snapshot).await;
+            }
             let Some(attendance) = &mut self.attendance else {
                 return Ok(());
             };
@@ -79,32 +85,38 @@ impl Supervisor {
                 self.seen = all.iter().copied().filter(ill).collect();
                 return Ok(());
             }
+            for axis in std::mem::take(&mut attendance.controller.unread) {
+                match self.mode_reading(axis) {
+                    Some(reading) => readings.add(reading),
+                    None => self.mode_was_read(axis, None, &snapshot).await,
+                }
+            }
+            let Some(attendance) = &mut self.attendance else {
+                return Ok(());
+            };
             if std::mem::take(&mut attendance.start) {
                 self.run_attended_program(&all, ended).await?;
                 continue;
             }
-            if attendance.controller.moves() {
-                continue;
-            }
-            // Mailbox reads may take long, and the jog timeout is not checked meanwhile.
-            let confirm = std::mem::take(&mut attendance.to_confirm);
             self.report_stopped_groups(&snapshot).await;
-            for axis in confirm {
-                let own = self.setup(axis).map(|setup| setup.config.mode);
-                let other = own != snapshot.axes.get(axis).map(|status| status.mode);
-                if !other && let Err(error) = self.confirm_modes(&[axis]).await {
-                    if let Some(attendance) = &mut self.attendance {
-                        attendance.report(RequestEvent::Failed {
-                            request: 0,
-                            axis,
-                            what: Activity::Enabling,
-                            why: error.to_string(),
-                        });
-                    }
-                    let command = Command::Disable;
-                    self.send(RtCommand::Axis { axis, command }).await;
-                }
-            }
+        }
+    }
+
+    /// Ends enabling an axis whose mode was read over CoE.
+    async fn mode_was_read(&mut self, axis: AxisIndex, display: Option<i8>, snapshot: &Snapshot) {
+        let own = self.setup(axis).map(|setup| setup.config.mode);
+        let other = own != snapshot.axes.get(axis).map(|status| status.mode);
+        let checked = match other {
+            true => Ok(()),
+            false => self.check_mode(axis, display),
+        };
+        let checked = checked.map_err(|error| error.to_string());
+        let Some(attendance) = &mut self.attendance else {
+            return;
+        };
+        if attendance.controller.mode_was_read(axis, checked) {
+            let command = Command::Disable;
+            self.send(RtCommand::Axis { axis, command }).await;
         }
     }
 
@@ -227,40 +239,49 @@ impl Supervisor {
             if let Request::SimInput(input) = request {
                 let result = self.switch_input(input);
                 let request = attendance.requests;
-                attendance.report(RequestEvent::Input { request, result });
+                attendance.report(RequestEvent::Signal { request, result });
             } else if stops || (there && index < MOST_REQUESTS) {
                 attendance.take(request, &scene, &mut commands, out);
             } else {
                 attendance.refuse(request, "too many requests at once");
             }
         }
-        let stopped = |group: (GroupIndex, &GroupStatus)| {
-            group.1.stopped.is_some() && !self.is_stopped(group.0)
-        };
-        let just_stopped = snapshot.groups.enumerate().any(stopped);
-        let hidden = |axis: AxisIndex| {
-            let setup = &machine.axes[axis];
-            let display = ecaxis_esi::axis::object(MODES_OF_OPERATION_DISPLAY, setup.number);
-            let layout = &machine.devices[setup.device].selection.layout;
-            layout.tx_field(display, 0).is_none()
-        };
-        let just_enabled = |news: &RequestEvent| match *news {
-            RequestEvent::Done {
-                axis,
-                what: Activity::Enabling,
-                ..
-            } if hidden(axis) => Some(axis),
-            _ => None,
-        };
-        let enabled = news.iter().filter_map(just_enabled);
-        attendance.to_confirm.extend(enabled);
-        let waits = just_stopped || !attendance.to_confirm.is_empty();
-        if waits && !attendance.program.running {
-            attendance.controller.brake(&scene, &mut commands);
-        }
         attendance.gone |= turn.presence == Presence::Gone;
         let commands = commands.into_iter();
         out.extend(commands.map(|(axis, command)| RtCommand::Axis { axis, command }));
+    }
+}
+
+/// Fails if the outputs of a device are off until the reset of its group.
+fn check_unlocked(scene: &RequestContext<'_>, output: OutputRef) -> Result<(), String> {
+    let machine = scene.machine;
+    let Some(signal) = machine.outputs.get(output.0) else {
+        return Ok(());
+    };
+    if scene.snapshot.locked_outputs.get(signal.device) != Some(&true) {
+        return Ok(());
+    }
+    let (name, group) = (&signal.name, machine.group_of(signal.device));
+    let group = machine.group_name(group);
+    Err(format!(
+        "`{name}` is off: its device was lost, and its group `{group}` is not reset yet"
+    ))
+}
+
+/// Fails if the axis of a node has power.
+fn check_unpowered(
+    scene: &RequestContext<'_>,
+    gateway: DeviceIndex,
+    node: usize,
+) -> Result<(), String> {
+    let mut axes = scene.machine.axes_of(gateway);
+    let Some((axis, setup)) = axes.find(|(_, setup)| setup.node == Some(node)) else {
+        return Ok(());
+    };
+    let status = scene.snapshot.axes.get(axis);
+    match status.is_some_and(|status| status.enabled || status.state.has_power()) {
+        true => Err(format!("`{}`: {}", setup.name, CommandError::HasPower)),
+        false => Ok(()),
     }
 }
 
@@ -320,7 +341,30 @@ impl Attendance {
             Request::Program(request) => self.take_program(request, scene),
             // `take_requests` has carried it out.
             Request::SimInput(_) => {}
-            Request::SetOutput { output, value } => out.push(RtCommand::Output { output, value }),
+            Request::SetOutput { output, value } => {
+                let result = check_unlocked(scene, output);
+                if result.is_ok() {
+                    out.push(RtCommand::Output { output, value });
+                }
+                let request = self.requests;
+                self.report(RequestEvent::Signal { request, result });
+            }
+            Request::Node {
+                gateway,
+                node,
+                command,
+            } => {
+                let result = check_unpowered(scene, gateway, node);
+                if result.is_ok() {
+                    out.push(RtCommand::Node {
+                        gateway,
+                        node,
+                        command,
+                    });
+                }
+                let request = self.requests;
+                self.report(RequestEvent::Signal { request, result });
+            }
             Request::Override { group, factor } => {
                 out.push(RtCommand::Override { group, factor });
             }

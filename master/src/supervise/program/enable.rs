@@ -1,13 +1,13 @@
 //! The step that enables axes.
 
-use ecaxis_axis::Command;
+use ecaxis_axis::{AxisStatus, Command, CommandError, EnableBlocker};
 use ecaxis_ecat::index::AxisIndex;
 
 use super::Turn;
 use crate::clock;
 use crate::config::Step;
 use crate::report::{Cause, Error, Progress};
-use crate::rt::channel::RtCommand;
+use crate::rt::channel::{RtCommand, Snapshot};
 
 impl Turn<'_, '_> {
     pub async fn enable_axes(
@@ -33,7 +33,14 @@ impl Turn<'_, '_> {
         loop {
             let snapshot = self.poll_and_query().await?;
             self.ensure_not_stopped(step, axes)?;
+            let in_time = clock::now().saturating_sub(start) <= timeout;
             if let Some((axis, reason)) = self.take_refusal(axes) {
+                // An axis that coasts may come to rest in time.
+                if in_time && matches!(reason, CommandError::StillMoving { .. }) {
+                    let command = Command::Enable;
+                    self.send_all(&[RtCommand::Axis { axis, command }]).await;
+                    continue;
+                }
                 return Err(Cause::EnableRefused {
                     reason: reason.to_string(),
                 }
@@ -51,13 +58,35 @@ impl Turn<'_, '_> {
             let Some((waiting, status)) = late else {
                 break;
             };
+            if status.waiting == Some(EnableBlocker::Held) {
+                start = clock::now();
+            }
             let failed = status.reset_failed && snapshot.commands_taken >= self.commands_sent;
-            if failed || clock::now().saturating_sub(start) > timeout {
-                return Err(self.not_enabled(waiting, status, timeout).await);
+            if failed || !in_time {
+                let (late, status) = self.late_half(waiting, status, &snapshot);
+                return Err(self.not_enabled(late, status, timeout).await);
             }
         }
         self.confirm_modes(axes).await?;
         self.report(Progress::Enabled { axes: axes.len() });
         Ok(())
+    }
+
+    /// Returns the half of the axis' gantry that keeps the gantry from being ready, or the axis.
+    fn late_half(
+        &self,
+        axis: AxisIndex,
+        status: AxisStatus,
+        snapshot: &Snapshot,
+    ) -> (AxisIndex, AxisStatus) {
+        let mut gantries = self.machine.gantries.iter();
+        let gantry = gantries.find(|gantry| gantry.axes.contains(&axis));
+        let halves = gantry.map(|gantry| gantry.axes).into_iter().flatten();
+        let mut halves = halves.filter_map(|half| Some((half, *snapshot.axes.get(half)?)));
+        match status.enabled {
+            true => halves.find(|(_, half)| !half.enabled),
+            false => None,
+        }
+        .unwrap_or((axis, status))
     }
 }

@@ -97,12 +97,23 @@ impl Turn<'_, '_> {
         )
         .await;
         let mut settling = Settling::default();
+        let mut superimposed = false;
         self.wait_until(step, start, |this, snapshot| {
             let status = |axis: AxisIndex| &snapshot.axes[axis];
             // A superimposed move lets the axis follow a generator.
             let follows = |axis: AxisIndex| snapshot.generators[axis].runs();
-            let arrived = |axis: AxisIndex| status(axis).in_target && !follows(axis);
-            let late = targets.iter().find(|(axis, _)| !arrived(*axis));
+            superimposed |= targets.iter().any(|&(axis, _)| follows(axis));
+            // Whatever replaces a move leads elsewhere.
+            let replaced = |axis: AxisIndex, target: f64| {
+                let commanded = status(axis).commanded_target;
+                aim == TargetKind::Position && !superimposed && commanded != Some(target)
+            };
+            let arrived = |axis: AxisIndex, target: f64| {
+                status(axis).in_target && !follows(axis) && !replaced(axis, target)
+            };
+            let late = targets
+                .iter()
+                .find(|&&(axis, target)| !arrived(axis, target));
             let Some(&(axis, target)) = late else {
                 return Ok(true);
             };

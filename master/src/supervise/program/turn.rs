@@ -27,15 +27,19 @@ impl<'m, 's> Turn<'m, 's> {
         Self { shared, held }
     }
 
-    /// Waits for the next snapshot, while other branches run. Fails if the cycle has stopped the
+    /// Waits for the next snapshot, while other branches run, and until stopped groups are reported.
+    /// Fails if the cycle has stopped the
     /// machine.
     pub async fn poll_and_query(&mut self) -> Result<Snapshot, Error> {
-        self.held = None;
-        clock::delay(TICK).await;
-        self.held = Some(self.shared.lock().await);
-        let snapshot = self.take_snapshot().await?;
-        self.report_stopped_groups(&snapshot).await;
-        Ok(snapshot)
+        loop {
+            self.held = None;
+            clock::delay(TICK).await;
+            self.held = Some(self.shared.lock().await);
+            let snapshot = self.take_snapshot().await?;
+            if self.report_stopped_groups(&snapshot).await {
+                return Ok(snapshot);
+            }
+        }
     }
 
     /// Runs all branches until each has ended. The first failure ends the others.

@@ -2,8 +2,8 @@
 
 use ecaxis_axis::HomingError;
 use ecaxis_axis::status::HomingStatus;
-use ecaxis_axis::{AxisStatus, Command, Mode};
-use ecaxis_ecat::index::AxisIndex;
+use ecaxis_axis::{AxisStatus, Command, CommandError, EnableBlocker, Mode};
+use ecaxis_ecat::index::{AxisIndex, GroupIndex};
 
 use super::super::Supervisor;
 use super::{SETTLE_TIMEOUT, STANDSTILL_TIME, Turn};
@@ -11,6 +11,7 @@ use crate::clock::{self, Nanos};
 use crate::config::{Action, Step, Subject, When};
 use crate::report::{Cause, Error};
 use crate::rt::channel::Snapshot;
+use crate::rt::overrides::Override;
 
 impl Turn<'_, '_> {
     /// Waits until `holds` is true for every axis. Fails after the enable timeout or the longest
@@ -22,12 +23,15 @@ impl Turn<'_, '_> {
         holds: impl Fn(&Snapshot, AxisIndex) -> bool,
         axes: &[AxisIndex],
     ) -> Result<(), Error> {
-        let begun = clock::now();
+        let mut begun = clock::now();
         let timeout = self.machine.bus.enable_timeout_ns.max(self.longest_stop());
         self.wait_until(step, start, |this, snapshot| {
             let Some(&axis) = axes.iter().find(|&&axis| !holds(snapshot, axis)) else {
                 return Ok(true);
             };
+            if snapshot.axes[axis].waiting == Some(EnableBlocker::Held) {
+                begun = clock::now();
+            }
             if let Some(mode) = snapshot.axes[axis].switch_failed
                 && matches!(step.action, Action::Mode { .. })
             {
@@ -78,8 +82,49 @@ impl Turn<'_, '_> {
         }
     }
 
-    /// Homes all axes. Each axis supervises its own timeout.
+    /// Waits until none of these axes is held.
+    async fn await_release(&mut self, axes: &[AxisIndex], start: Nanos) -> Result<(), Error> {
+        loop {
+            let snapshot = self.poll_and_query().await?;
+            let held = axes.iter().any(|&axis| self.is_held(&snapshot, axis));
+            if !held || self.over(start) {
+                return Ok(());
+            }
+        }
+    }
+
+    /// Homes all axes. A hold interrupts the search for home; it begins again afterwards.
     pub(super) async fn home(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        axes: &[AxisIndex],
+    ) -> Result<(), Error> {
+        let mut axes = axes.to_vec();
+        loop {
+            self.await_release(&axes, start).await?;
+            match self.search_home(step, start, &axes).await {
+                Ok(()) => {}
+                Err(error) if was_held(&error) => {}
+                Err(error) => return Err(error),
+            }
+            let mut snapshot = self.poll_and_query().await?;
+            let runs = |snapshot: &Snapshot, axis: &AxisIndex| {
+                snapshot.axes[*axis].homing == HomingStatus::Running
+            };
+            while axes.iter().any(|axis| runs(&snapshot, axis)) {
+                snapshot = self.poll_and_query().await?;
+            }
+            axes.retain(|&axis| snapshot.axes[axis].homing != HomingStatus::Attained);
+            if axes.is_empty() || self.over(start) {
+                return Ok(());
+            }
+        }
+    }
+
+    /// Homes all axes at the same time, until they are homed or a hold has stopped one of them. Each
+    /// axis supervises its own timeout.
+    async fn search_home(
         &mut self,
         step: &Step,
         start: Nanos,
@@ -95,10 +140,22 @@ impl Turn<'_, '_> {
         self.command(commands.map(|(&axis, &timeout_s)| (axis, Command::Home { timeout_s })))
             .await;
         self.wait_until(step, start, |this, snapshot| {
-            let mut homed = true;
+            let (mut homed, mut held) = (true, false);
             for &axis in axes {
                 let status = &snapshot.axes[axis];
-                homed &= match status.homing {
+                let powerless = status.switching.is_none() && !status.powered;
+                let found = match status.homing {
+                    // Nothing gives the axis power for the motions of its mode any more.
+                    HomingStatus::Attained if powerless => {
+                        HomingStatus::Failed(HomingError::PowerLost)
+                    }
+                    found => found,
+                };
+                homed &= match found {
+                    HomingStatus::Failed(HomingError::Held) => {
+                        held = true;
+                        continue;
+                    }
                     HomingStatus::Failed(error) => {
                         // The first half shows the failure of the second.
                         let other = this.machine.other_half(axis).filter(|&other| {
@@ -117,7 +174,7 @@ impl Turn<'_, '_> {
                     HomingStatus::None | HomingStatus::Running => false,
                 };
             }
-            Ok(homed)
+            Ok(homed || held)
         })
         .await
     }
@@ -169,7 +226,26 @@ impl Turn<'_, '_> {
     }
 }
 
+/// True if the cause of an error is the hold of an axis.
+fn was_held(error: &Error) -> bool {
+    let Cause::Refused { by_axis, .. } = &*error.cause else {
+        return false;
+    };
+    by_axis.as_deref() == Some(&CommandError::Held)
+}
+
 impl Supervisor {
+    /// Returns true if an axis is held.
+    fn is_held(&self, snapshot: &Snapshot, axis: AxisIndex) -> bool {
+        let of = |group: GroupIndex| snapshot.groups.get(group).map(|group| group.rate);
+        let machine = of(GroupIndex::MACHINE).unwrap_or_default();
+        let own = match self.group_of(axis) {
+            GroupIndex::MACHINE => Override::default(),
+            group => of(group).unwrap_or_default(),
+        };
+        machine.rate(own).is_held()
+    }
+
     /// Returns the value of a subject. An unknown value satisfies no condition.
     pub(super) fn value(&self, snapshot: &Snapshot, subject: Subject) -> f64 {
         let value = match subject {

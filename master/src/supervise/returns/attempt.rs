@@ -1,5 +1,6 @@
 //! Brings one device back to Op.
 
+use std::cell::RefCell;
 use std::time::Duration;
 
 use ecaxis_ecat::index::DeviceIndex;
@@ -7,6 +8,7 @@ use ecaxis_ecat::index::DeviceIndex;
 use super::{RunningSegment, Search};
 use crate::acyclic::{AlState, DeviceRef, al};
 use crate::bringup::device_return::{RunningBus, RunningSync, bring_back, reset};
+use crate::bringup::process_data::ControlBytes;
 use crate::bringup::{Step, enable_op_only};
 use crate::clock;
 use crate::config::AxisSetup;
@@ -40,6 +42,7 @@ impl RunningSegment {
             restarted: search.restarted,
             home: self.home(index, search),
             first: search.absent,
+            has_axes: self.machine.has_axes(self.machine.group_of(index)),
         });
     }
 
@@ -73,10 +76,14 @@ impl RunningSegment {
         let (coe, give_back) = loan.unzip();
         device.set_client(&self.machine.devices[index], coe);
         device.serial = search.serial;
-        let progress = &self.progress;
+        if search.replaced {
+            device.control_bytes = ControlBytes::default();
+        }
+        // Those of a failed attempt would come again with each of the next.
+        let warnings = RefCell::new(Vec::new());
         let report = |step| {
             if let Step::Warning(text) = step {
-                let _ = progress.send(Progress::Warning(text));
+                warnings.borrow_mut().push(text);
             }
         };
         let lost: Vec<_> = self.bus_status.lost().collect();
@@ -93,6 +100,9 @@ impl RunningSegment {
             let _ = give_back.send(coe);
         }
         returned?;
+        for text in warnings.into_inner() {
+            self.report(Progress::Warning(text));
+        }
         if search.restarted {
             // The axes need the positions of SafeOp, and their group is not released before Op.
             self.settle().await;

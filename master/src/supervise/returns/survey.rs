@@ -1,6 +1,6 @@
 //! Compares the devices that answer with those of the machine file.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 
 use ecaxis_ecat::index::{DeviceIndex, IndexVec};
 use ecaxis_ecat::registers;
@@ -9,6 +9,7 @@ use super::unknown::UnknownDevices;
 use super::{RunningSegment, STEP, Search};
 use crate::acyclic::enumerate;
 use crate::acyclic::topology::{ParentPort, in_line, parents};
+use crate::bringup::accepts;
 use crate::config::Locator;
 use crate::link::redundant::RingState;
 use crate::report::{Cause, DevicePlace, Error};
@@ -24,16 +25,16 @@ struct Answering {
 impl RunningSegment {
     /// Reads the segment. Identifies devices without an address of the machine, as far as they are
     /// behind one of the machine. Returns those of `wanted` that are there; others are reported.
-    /// `lost`: the number of missing devices.
+    /// `lost`: all missing devices, also those that must not return now.
     pub(super) async fn survey(
         &self,
-        (wanted, lost): (&[DeviceIndex], usize),
+        (wanted, lost): (&[DeviceIndex], &[DeviceIndex]),
         searches: &mut IndexVec<DeviceIndex, Search>,
         unknown: &mut UnknownDevices,
     ) -> Result<Vec<DeviceIndex>, Error> {
         let count = enumerate::count(&self.wire).await?;
         unknown.begin_survey(count);
-        if usize::from(count) <= self.devices.len().saturating_sub(lost) {
+        if usize::from(count) <= self.devices.len().saturating_sub(lost.len()) {
             unknown.end_survey();
             return Ok(Vec::new());
         }
@@ -50,7 +51,7 @@ impl RunningSegment {
             _ => None,
         };
         let status = status.map(|(status, at)| in_line(at, status, ring));
-        let own: HashMap<_, _> = self
+        let own: BTreeMap<_, _> = self
             .devices
             .enumerate()
             .map(|(d, at)| (at.at.station, d))
@@ -111,6 +112,8 @@ impl RunningSegment {
                 let has_number = matches!(locator(*index), Locator::Alias(_) | Locator::Id(_));
                 has_number && Some(*index) != expected
             });
+            let waiting = lost.iter().filter(|index| !wanted.contains(index));
+            let waiting: Vec<_> = waiting.map(|index| (*index, here(index))).collect();
             let candidates: Vec<_> = expected.into_iter().chain(moved).collect();
             if expected.is_none() && !unknown.is_due(place) {
                 continue;
@@ -130,6 +133,16 @@ impl RunningSegment {
                     found.push(device);
                 }
                 Ok(Err((numbers, error))) => {
+                    // It must not return now; the reason has been reported.
+                    let waits = |(index, is_here): &(DeviceIndex, bool)| {
+                        let serial = searches[*index].serial;
+                        let is_same = serial != 0 && serial == numbers.serial;
+                        let config = &self.machine.devices[*index];
+                        (is_same || *is_here) && accepts(config, numbers.identity)
+                    };
+                    if expected.is_none() && waiting.iter().any(waits) {
+                        continue;
+                    }
                     if let (Some(device), Some(error)) = (expected, error) {
                         self.refuse(device, &mut searches[device], &error);
                     }

@@ -345,6 +345,7 @@ impl SimDevice {
                 let services = CoeServices {
                     sdo_info: options.sdo_info.unwrap_or(self.sdo_info),
                     segmented: options.segmented,
+                    abort_index_word: options.abort_index_word,
                     buffer: self
                         .processor
                         .as_ref()
@@ -356,6 +357,7 @@ impl SimDevice {
                     pdo: &mut self.pdo,
                     state,
                     complete_access: options.complete_access.unwrap_or(self.complete_access),
+                    startup: &self.startup,
                     refuse_mapped: options.refuse_mapped,
                     forced: &self.forced_aborts,
                     ignored: &self.ignored_writes,

@@ -1,6 +1,7 @@
 //! Mailbox properties of a device that an ESI does not contain.
 
 use crate::foe::FoeOptions;
+use crate::quirks::Quirks;
 
 /// Mailbox properties of a device that an ESI does not contain.
 #[derive(Debug, Clone)]
@@ -11,6 +12,8 @@ pub struct MailboxOptions {
     pub sdo_info: Option<bool>,
     /// Overrides the ESI: support of complete access.
     pub complete_access: Option<bool>,
+    /// Aborts have the index without its low byte.
+    pub abort_index_word: bool,
     /// Support of segmented transfers. Without it, objects longer than a mailbox are rejected
     /// (abort 0x06010005). Most ESI files do not mention existing support.
     pub segmented: bool,
@@ -27,12 +30,27 @@ pub struct MailboxOptions {
     pub foe: FoeOptions,
 }
 
+impl MailboxOptions {
+    /// Returns the options with the quirks of a device.
+    pub(crate) fn with(mut self, quirks: &Quirks) -> Self {
+        if quirks.complete_access_refused {
+            self.complete_access = Some(false);
+        }
+        if let Some(delay) = quirks.mailbox_slow {
+            self.processing_ns += delay.0;
+        }
+        self.abort_index_word |= quirks.abort_index_word;
+        self
+    }
+}
+
 impl Default for MailboxOptions {
     fn default() -> Self {
         Self {
             processing_ns: 100_000,
             sdo_info: None,
             complete_access: None,
+            abort_index_word: false,
             segmented: true,
             sdo_buffer: 64 << 10,
             sdo_timeout_ns: None,

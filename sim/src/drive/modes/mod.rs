@@ -15,6 +15,7 @@ use super::control::{Demand, Feed};
 use super::io::Inputs;
 use super::objects::{HomingParameters, Parameters, float};
 use super::profile::{Interpolator, Profile};
+use crate::quirks::Quirks;
 use homing::Homing;
 pub(super) use homing::METHODS;
 use position::PointToPoint;
@@ -76,7 +77,7 @@ pub(super) struct SetPoints {
 
 impl SetPoints {
     /// True with bit 4: new set-point, or homing operation start.
-    fn starts(&self) -> bool {
+    pub(super) fn starts(&self) -> bool {
         self.controlword & 1 << 4 != 0
     }
 
@@ -112,19 +113,28 @@ pub(super) struct PositionFrame {
     pub polarity: Polarity,
 }
 
-/// 0x607E, bits 7 and 6.
+/// 0x607E, bits 7 and 6, and the bit for torques that some drives have.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Polarity {
     pub position: bool,
     pub velocity: bool,
+    /// The bit of [`Quirks::torque_polarity_bit`].
+    pub torque: bool,
 }
 
 impl Polarity {
-    pub(super) fn of(object: i64) -> Self {
+    pub(super) fn of(object: i64, quirks: &Quirks) -> Self {
+        let torque = quirks.torque_polarity_bit;
         Self {
             position: object & 1 << 7 != 0,
             velocity: object & 1 << 6 != 0,
+            torque: torque.is_some_and(|bit| object & 1 << bit != 0),
         }
+    }
+
+    /// Converts a torque between bus and drive, in either direction.
+    pub(super) fn torque(self, value: i64) -> i64 {
+        if self.torque { -value } else { value }
     }
 
     /// Converts a velocity between bus and drive, in either direction.
@@ -150,11 +160,15 @@ impl PositionFrame {
     }
 
     pub(super) fn show(&self, counts: i64) -> i64 {
+        self.wrap(counts + self.shift)
+    }
+
+    fn wrap(&self, position: i64) -> i64 {
         if self.width == 1 << 32 {
             // The usual case, without a division.
-            return (counts + self.shift) << 32 >> 32;
+            return position << 32 >> 32;
         }
-        self.min + (counts + self.shift - self.min).rem_euclid(self.width)
+        self.min + (position - self.min).rem_euclid(self.width)
     }
 
     /// Returns the shortest distance from one shown position to another.
@@ -253,6 +267,11 @@ impl Motion {
             referenced: self.referenced,
             ..Self::new(counts)
         };
+    }
+
+    /// Shifts the frame of the received targets.
+    pub(super) fn shift(&mut self, counts: i64, frame: &PositionFrame) {
+        self.received = frame.wrap(self.received + counts);
     }
 
     /// Takes the set-points of a SYNC while the operation is enabled.

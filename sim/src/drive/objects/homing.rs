@@ -4,6 +4,7 @@ use super::bind::{Binder, RW};
 use super::{float, int, uint, whole};
 use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 use crate::drive::modes::METHODS;
+use crate::quirks::Quirks;
 
 #[derive(Debug, Clone)]
 pub(super) struct HomingSlots {
@@ -60,11 +61,15 @@ pub(super) fn add(b: &mut Binder<'_>) {
 
 impl HomingSlots {
     /// Binds the objects. `per_rpm`, `per_rpm_s`: the drive's units of speed and acceleration.
-    pub(super) fn bind(b: &mut Binder<'_>, per_rpm: f64, per_rpm_s: f64) -> Self {
+    pub(super) fn bind(b: &mut Binder<'_>, per_rpm: f64, per_rpm_s: f64, quirks: &Quirks) -> Self {
         let units = |value: f64| whole(value).clamp(1, 0xffff_ffff);
         let method = b.with_default(0x6098, 0, "Homing method", 8, 37);
         b.choose(method, METHODS);
         list_methods(b);
+        let home_position = b.own(0x30b0, 0, "Home position").or(b.slot(0x607c, 0));
+        if let Some(slot) = home_position.filter(|_| quirks.home_offset_not_kept) {
+            b.store.ignore_writes(slot);
+        }
         Self {
             method,
             search_speed: b.with_default(
@@ -88,7 +93,7 @@ impl HomingSlots {
                 32,
                 units(1000.0 * per_rpm_s),
             ),
-            home_position: b.own(0x30b0, 0, "Home position").or(b.slot(0x607c, 0)),
+            home_position,
             distance: b.own(DISTANCE.0, 0, DISTANCE.1),
             current_threshold: b
                 .own(THRESHOLD.0, 0, THRESHOLD.1)

@@ -110,6 +110,23 @@ pub(super) struct Objects {
     tuning: TuningSlots,
 }
 
+/// 0x6091, if it acts.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct GearSlots(pub Option<[EntryHandle; 2]>);
+
+impl GearSlots {
+    pub(super) fn bind(store: &mut ObjectStore, axis: u16, plant: &PlantParams) -> Self {
+        let mut b = Binder::new(store, axis);
+        let encoder = plant.quirks.gear_encoder;
+        Self(encoder.map(|_| {
+            [
+                b.with_default(0x6091, 1, "Motor revolutions", 32, 1),
+                b.with_default(0x6091, 2, "Shaft revolutions", 32, 1),
+            ]
+        }))
+    }
+}
+
 #[expect(clippy::cast_possible_truncation, reason = "saturates")]
 fn whole(value: f64) -> i64 {
     value.round() as i64
@@ -148,7 +165,9 @@ impl Objects {
         }
         motor::fill(&mut b, plant);
         let tuning = TuningSlots::bind(&mut b, plant);
-        b.with_default(0x6502, 0, "Supported drive modes", 32, SUPPORTED_MODES);
+        let modes = b.with_default(0x6502, 0, "Supported drive modes", 32, SUPPORTED_MODES);
+        let listed = plant.quirks.supported_modes(b.store.get(modes));
+        b.store.set(modes, listed);
         b.with_default(0x60a8, 0, "SI unit position", 32, COUNTS);
         let parameters = ParameterSlots::bind(&mut b, plant);
         let power_on_mode = power_on_mode(&b);

@@ -158,7 +158,7 @@ impl ParameterSlots {
                 acceleration,
             ),
             max_acceleration: b.with_default(0x60c5, 0, "Max acceleration", 32, 0xffff_ffff),
-            homing: HomingSlots::bind(b, per_rpm, per_rpm_s),
+            homing: HomingSlots::bind(b, per_rpm, per_rpm_s, &plant.quirks),
             unit_velocity,
             unit_acceleration,
             polarity: b.slot(0x607e, 0),
@@ -191,14 +191,25 @@ impl ParameterSlots {
         (velocity, acceleration)
     }
 
+    fn polarity(&self, store: &ObjectStore, plant: &PlantParams) -> Polarity {
+        let object = self.polarity.map_or(0, |slot| uint(store, slot));
+        Polarity::of(object, &plant.quirks)
+    }
+
     /// Reads the homing parameters. They are needed only in homing mode.
     pub(super) fn read_homing(&self, store: &ObjectStore, plant: &PlantParams) -> HomingParameters {
         let counts_per_turn = f64::from(plant.counts_per_turn.max(1));
         let (velocity_unit, acceleration_unit) = self.units(store, counts_per_turn);
         let read = self.homing.read(store, velocity_unit, acceleration_unit);
-        let polarity = Polarity::of(self.polarity.map_or(0, |slot| uint(store, slot)));
+        let polarity = self.polarity(store, plant);
+        let negated = plant.quirks.home_offset_negated;
+        let home_position = if negated {
+            -read.home_position
+        } else {
+            read.home_position
+        };
         HomingParameters {
-            home_position: polarity.way(read.home_position),
+            home_position: polarity.way(home_position),
             ..read
         }
     }
@@ -215,7 +226,7 @@ impl ParameterSlots {
                 .filter(|&w| w < 0xffff_ffff)
                 .map(float)
         };
-        let polarity = Polarity::of(p.polarity.map_or(0, |slot| uint(store, slot)));
+        let polarity = self.polarity(store, plant);
         let cycles = |slot| cycles(uint(store, slot));
         let pair = |[min, max]: [EntryHandle; 2]| (int(store, min), int(store, max));
         let (range_min, range_max) = match pair(p.range) {
@@ -261,9 +272,9 @@ impl ParameterSlots {
                 deceleration: acceleration(p.profile_deceleration).min(max_acceleration),
             },
             quick_stop_deceleration: acceleration(p.quick_stop_deceleration),
-            velocity_unit,
+            velocity_unit: velocity_unit * plant.quirks.velocity_factor.unwrap_or(1.0),
             torque_unit: p.torque.rated(store) * 1e-3,
-            current: p.torque.read(store, plant),
+            current: p.torque.read(store, plant, polarity.torque),
             period_ns: period_ns(uint(store, p.period_value), int(store, p.period_index)),
         }
     }

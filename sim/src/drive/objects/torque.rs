@@ -119,7 +119,13 @@ impl TorqueSlots {
         float(uint(store, self.rated_torque)) / self.counts_per_newton_metre
     }
 
-    pub(super) fn read(&self, store: &ObjectStore, plant: &PlantParams) -> CurrentLimits {
+    /// Returns the limits. `inverted`: torques on the bus have the opposite sign.
+    pub(super) fn read(
+        &self,
+        store: &ObjectStore,
+        plant: &PlantParams,
+        inverted: bool,
+    ) -> CurrentLimits {
         let ampere = match plant.torque_constant {
             k if k > 0.0 => 1e-3 * self.rated(store) / k,
             _ => f64::INFINITY,
@@ -139,9 +145,13 @@ impl TorqueSlots {
             torque(self.max_torque),
             current(self.max_current),
         ]);
-        let [forward, backward] = self
+        let mut directions = self
             .directions
             .map(|limit| torque(limit).map_or(both, |limit| limit.min(both)));
+        if inverted {
+            directions.reverse();
+        }
+        let [forward, backward] = directions;
         CurrentLimits {
             forward: forward.max(0.0),
             backward: backward.max(0.0),

@@ -11,6 +11,7 @@ mod options;
 mod polarity;
 mod probes;
 mod profiles;
+mod quirks;
 mod speeds;
 mod transitions;
 

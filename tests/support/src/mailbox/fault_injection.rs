@@ -41,6 +41,8 @@ pub enum Mischief {
     Forgetful,
     /// Does not allow reading this object.
     WriteOnly(u16),
+    /// Aborts complete access with this code.
+    NoCompleteAccess(u32),
     /// Every segment is empty, and no segment is the last.
     EmptySegments,
 }

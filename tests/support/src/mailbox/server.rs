@@ -336,6 +336,13 @@ impl Inner {
     fn begin_download(&mut self, sdo: &[u8]) -> Vec<u8> {
         let (index, sub) = (u16::from_le_bytes([sdo[1], sdo[2]]), sdo[3]);
         let complete = sdo[0] & 0x10 != 0;
+        let refusal = self.mischief.iter().find_map(|mischief| match mischief {
+            Mischief::NoCompleteAccess(code) => Some(*code),
+            _ => None,
+        });
+        if let Some(code) = refusal.filter(|_| complete) {
+            return abort(index, sub, code);
+        }
         if sdo[0] & 0x02 != 0 {
             let used = if sdo[0] & 1 != 0 {
                 4 - usize::from(sdo[0] >> 2 & 3)

@@ -2,7 +2,7 @@
 
 use ecaxis_ecat::registers;
 use ecaxis_ecat::sii::control;
-use ecaxis_master::bringup::process_data::{ProcessDataPlan, RegisterBlock};
+use ecaxis_master::bringup::process_data::{ControlBytes, ProcessDataPlan, RegisterBlock};
 use ecaxis_master::bringup::{mailbox_registers, pulse_registers, watchdog_registers};
 use ecaxis_master::config::{Bus, StateTimeouts};
 use ecaxis_master::esi_library::RevisionMatch;
@@ -50,7 +50,7 @@ impl PlacedDevice<'_> {
     ) -> Result<Vec<EcatCommand>, Cause> {
         let region = image.regions.get(self.index).copied().flatten();
         // A MainDevice that polls the mailboxes needs no status in the process image.
-        let plan = ProcessDataPlan::new(self.config, region, None);
+        let plan = ProcessDataPlan::new(self.config, ControlBytes::Watched, region, None);
         let info = &self.config.device.info;
         let available = info.fmmu_count.filter(|count| *count > 0);
         let available = available.map_or(MAX_FMMUS, |count| count as usize);

@@ -229,7 +229,8 @@ impl PlacedDevice<'_> {
             sub: sdo.sub,
             complete_access: sdo.complete_access,
             data: sdo.data.clone(),
-            disabled: false,
+            // Another MainDevice stops at an object that the device lacks.
+            disabled: sdo.clears_list() && sdo.name.is_empty(),
         };
         list.map(command).collect()
     }

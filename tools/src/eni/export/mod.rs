@@ -180,7 +180,8 @@ impl<'m> Network<'m> {
             if config.parameters.is_some() {
                 add("its parameter file is not part of the ENI");
             }
-            if config.selection.startup.iter().any(|sdo| sdo.optional) {
+            let mut startup = config.selection.startup.iter();
+            if startup.any(|sdo| sdo.optional && !sdo.clears_list()) {
                 add("it may refuse 0x60C2; another MainDevice may stop there");
             }
             for idn in &config.selection.startup_idns {

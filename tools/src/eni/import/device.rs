@@ -311,8 +311,8 @@ impl<'n> ImportedDevice<'n> {
         if let Some(dc) = &keys.dc {
             lines.add("dc", &quoted(dc), "");
         }
-        if !keys.modules.is_empty() {
-            let list: Vec<_> = keys.modules.iter().map(|name| quoted(name)).collect();
+        if let Some(modules) = &keys.modules {
+            let list: Vec<_> = modules.iter().map(|name| quoted(name)).collect();
             lines.add("modules", &format!("[{}]", list.join(", ")), "");
         }
         if let Some(assignment) = &keys.assignment {

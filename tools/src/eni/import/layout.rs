@@ -18,7 +18,7 @@ const MODULE_LIST: u16 = 0xf030;
 /// The choices of a machine file for one device.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct DeviceKeys {
-    pub modules: Vec<String>,
+    pub modules: Option<Vec<String>>,
     pub assignment: Option<String>,
     pub rx: Option<Vec<(u16, u8)>>,
     pub tx: Option<Vec<(u16, u8)>>,
@@ -32,7 +32,9 @@ impl DeviceKeys {
         cycle_ns: u64,
         sdo: &[UserSdo],
     ) -> Result<Selection, SelectError> {
-        let modules: Vec<&str> = self.modules.iter().map(String::as_str).collect();
+        let names = self.modules.as_ref();
+        let modules: Option<Vec<&str>> =
+            names.map(|names| names.iter().map(String::as_str).collect());
         let entries = |list: &Option<Vec<(u16, u8)>>| {
             let list = list.as_ref()?.iter();
             let entry = |&(index, sub): &(u16, u8)| EntryRef { index, sub };
@@ -42,7 +44,7 @@ impl DeviceKeys {
         let options = SelectOptions {
             rx: rx.as_deref(),
             tx: tx.as_deref(),
-            modules: &modules,
+            modules: modules.as_deref(),
             assignment: self.assignment.as_deref(),
             dc_mode: self.dc.as_deref(),
             cycle_ns,
@@ -288,28 +290,27 @@ fn own_entries(wanted: &WantedLayout, direction: Direction) -> Option<Vec<(u16, 
 }
 
 /// Returns the lists of modules to try: those that the ENI configures, those of the ESI's default,
-/// then each module in the first slot and in all slots.
-fn modules(network: &NetworkDevice, described: &EsiMatch) -> Vec<Vec<String>> {
+/// then each module in the first slot and in all slots, then none.
+fn modules(network: &NetworkDevice, described: &EsiMatch) -> Vec<Option<Vec<String>>> {
     let Some(slots) = &described.device.slots else {
-        return vec![Vec::new()];
+        return vec![None];
     };
+    let modules = &described.file.modules;
     let sdos: Vec<_> = network.sdos.iter().map(|(_, sdo)| sdo).collect();
-    let named = |ident: &u32| {
-        let mut all = described.file.modules.iter();
-        let module = all.find(|module| module.ident == *ident);
-        module.map_or("-".to_owned(), |module| module.type_name.clone())
-    };
     let configured = written_list(&sdos, MODULE_LIST, 4);
-    let configured = configured.map(|idents| idents.iter().map(named).collect());
-    let mut lists: Vec<Vec<String>> = configured.into_iter().collect();
-    lists.push(Vec::new());
-    for module in described.file.modules.iter().take(MAX_MODULES) {
+    let mut lists: Vec<_> = configured
+        .map(|idents| Some(esi::module_names(modules, &idents)))
+        .into_iter()
+        .collect();
+    lists.push(None);
+    for module in modules.iter().take(MAX_MODULES) {
         for count in [1, slots.slots.len()] {
-            let list = vec![module.type_name.clone(); count];
+            let list = Some(vec![module.type_name.clone(); count]);
             if !lists.contains(&list) {
                 lists.push(list);
             }
         }
     }
+    lists.push(Some(Vec::new()));
     lists
 }

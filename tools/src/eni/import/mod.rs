@@ -53,7 +53,7 @@ pub struct Unsent {
 }
 
 /// The cycle of an ENI without one.
-const DEFAULT_CYCLE_US: u32 = 1000;
+const DEFAULT_CYCLE_NS: u64 = 1_000_000;
 
 /// Reads an ENI. `path`: the machine file, whose folder is the base of its paths. `nic`: the
 /// interface that it names.
@@ -72,8 +72,9 @@ pub fn import(
         Some(library) => esi_match::describe_identities(&identities, library),
         None => (vec![None; identities.len()], Vec::new()),
     };
-    let cycle_us = network.cycle_us.unwrap_or(DEFAULT_CYCLE_US);
-    let cycle_ns = u64::from(cycle_us) * 1000;
+    let stated = network.cycle_us.map(|us| u64::from(us) * 1000);
+    let by_sync0 = || sync0_cycle_ns(&network.devices);
+    let cycle_ns = stated.or_else(by_sync0).unwrap_or(DEFAULT_CYCLE_NS);
     let names = names(&network.devices);
     let devices: Vec<_> = network
         .devices
@@ -140,6 +141,9 @@ fn head(network: &Network, cycle_ns: u64, nic: &str) -> String {
     let cycle = format!("\"{}\"", duration::show(cycle_ns).replace(' ', ""));
     let comment = match network.cycle_us {
         Some(_) => String::new(),
+        None if sync0_cycle_ns(&network.devices).is_some() => {
+            format!("{MARK} the ENI has no cycle time; this is the cycle of SYNC0")
+        }
         None => format!("{MARK} the ENI has no cycle time"),
     };
     lines.add("cycle", &cycle, &comment);
@@ -149,6 +153,28 @@ fn head(network: &Network, cycle_ns: u64, nic: &str) -> String {
         lines.add("watchdog", &format!("\"{time}\""), "");
     }
     text + &lines.text()
+}
+
+/// Returns the cycle in ns that most SYNC0 signals have; of several, the longest. The SYNC0 of an
+/// oversampling device is a part of the cycle.
+fn sync0_cycle_ns(devices: &[NetworkDevice]) -> Option<u64> {
+    let mut counts: BTreeMap<u32, usize> = BTreeMap::new();
+    for device in devices {
+        let by_command = || {
+            let mut commands = device.commands.iter().map(|(_, command)| command);
+            let cycle = commands.find_map(|command| written(command, registers::DC_SYNC0_CYCLE));
+            cycle.map(u32::from_le_bytes)
+        };
+        let stated = device.clock.map(|(first, ..)| first);
+        let cycle = stated.filter(|cycle| *cycle > 0).or_else(by_command);
+        if let Some(cycle) = cycle.filter(|cycle| *cycle > 0) {
+            *counts.entry(cycle).or_default() += 1;
+        }
+    }
+    let most = counts
+        .into_iter()
+        .max_by_key(|(cycle, count)| (*count, *cycle));
+    most.map(|(cycle, _)| cycle.into())
 }
 
 /// Returns the process data watchdog in ns, if all devices that set it agree.
@@ -176,10 +202,13 @@ fn watchdog(devices: &[NetworkDevice]) -> Option<u64> {
 
 /// Returns what a command writes to a register of 16 bits.
 pub(super) fn written_word(command: &EcatCommand, register: u16) -> Option<u16> {
+    written(command, register).map(u16::from_le_bytes)
+}
+
+/// Returns the first bytes that a command writes to a register.
+fn written<const N: usize>(command: &EcatCommand, register: u16) -> Option<[u8; N]> {
     match (&command.payload, unsent::written_register(command)) {
-        (Payload::Data(data), Some(at)) if at == register => {
-            Some(u16::from_le_bytes(*data.first_chunk()?))
-        }
+        (Payload::Data(data), Some(at)) if at == register => data.first_chunk().copied(),
         _ => None,
     }
 }

@@ -94,10 +94,11 @@ pub(super) fn section(device: &Device, described: &EsiMatch) -> String {
         lines.add("velocity_unit", "\"counts/s\"", &comment);
         units.push(VelocityUnit::COUNTS_PER_SECOND);
     } else if let Some(code) = by_esi.filter(unknown) {
-        let own = drive.units.velocity_unit.and_then(unit_name);
-        let (unit, name) = own.unwrap_or((VelocityUnit::COUNTS_PER_SECOND, "counts/s"));
+        let own = drive.units.velocity_unit;
+        let own = own.and_then(VelocityUnit::from_si_code);
+        let unit = own.unwrap_or(VelocityUnit::COUNTS_PER_SECOND);
         let comment = format!("{MARK} 0x60A9 of the ESI is 0x{code:08x}: not understood");
-        lines.add("velocity_unit", &format!("\"{name}\""), &comment);
+        lines.add("velocity_unit", &format!("\"{unit}\""), &comment);
         units.push(unit);
     }
     if let Ok(scale) = Scale::new(encoder, 1.0) {
@@ -138,18 +139,6 @@ fn encoder(device: &Device, drive: &DriveInfo, lines: &mut TomlWriter) -> f64 {
     };
     lines.add("encoder", &plain(counts), &comment);
     counts
-}
-
-/// Returns a unit that the machine file can name.
-fn unit_name(code: u32) -> Option<(VelocityUnit, &'static str)> {
-    let named = [
-        (VelocityUnit::RPM, "rpm"),
-        (VelocityUnit::MILLI_RPM, "mrpm"),
-        (VelocityUnit::COUNTS_PER_SECOND, "counts/s"),
-        (VelocityUnit::TURNS_PER_SECOND, "turns/s"),
-    ];
-    let unit = VelocityUnit::from_si_code(code)?;
-    named.into_iter().find(|(known, _)| *known == unit)
 }
 
 /// Returns the default of a 32-bit object in the ESI.

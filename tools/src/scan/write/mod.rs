@@ -259,8 +259,11 @@ pub fn device_section(
         lines.add("mode", &quoted(mode.name()), &comment);
     }
     if let Some(described) = described {
-        if let Some(modules) = modules(device, described, named.mode) {
-            lines.add("modules", &modules.0, &modules.1);
+        if let Some((list, comment)) = modules(device, described, named.mode) {
+            match list {
+                Some(list) => lines.add("modules", &list, &comment),
+                None => lines.comment(&comment),
+            }
         }
         let selection = selection(described, named.mode, cycle_ns);
         if selection.is_some_and(|s| s.dc.is_some()) && !device.dc {
@@ -384,45 +387,39 @@ fn locator(device: &Device, aliases: &Aliases, lines: &mut TomlWriter) {
     lines.add("position", &position.to_string(), &comment);
 }
 
-/// Returns the modules that were found, and a comment. Empty if the mode selects the module.
-#[must_use]
-pub fn modules(
+/// Returns the modules that were found, and a comment. `None` if the mode selects the module.
+fn modules(
     device: &Device,
     described: &EsiMatch,
     mode: Option<esi::Mode>,
-) -> Option<(String, String)> {
+) -> Option<(Option<String>, String)> {
     described.device.slots.as_ref()?;
     if mode.is_some() {
         return None;
     }
     let Some(Ok(answers)) = &device.answers else {
-        let comment = format!("{MARK} the device was not asked for its modules");
-        return Some(("[]".to_owned(), comment));
+        let comment = format!("{MARK} the device was not asked for its `modules`");
+        return Some((None, comment));
     };
     let lists = [&answers.detected, &answers.configured];
     let plugged = |idents: &&Vec<u32>| idents.iter().any(|ident| *ident != 0);
-    let idents = lists.into_iter().flatten().find(plugged)?;
-    let mut names = Vec::with_capacity(idents.len());
-    let mut unknown = Vec::new();
-    for ident in idents {
-        let module = described.file.modules.iter().find(|m| m.ident == *ident);
-        names.push(match (ident, module) {
-            (0, _) => quoted("-"),
-            (_, Some(module)) => quoted(&module.type_name),
-            (ident, None) => {
-                unknown.push(format!("0x{ident:08x}"));
-                quoted(&format!("0x{ident:08x}"))
-            }
-        });
-    }
-    while names.last().is_some_and(|name| name == "\"-\"") {
-        names.pop();
-    }
-    let comment = match unknown.is_empty() {
-        true => "as they are plugged".to_owned(),
-        false => format!("{MARK} the ESI file does not know {}", unknown.join(", ")),
+    let mut answered = lists.into_iter().flatten();
+    let idents = answered.clone().find(plugged).or(answered.next())?;
+    let modules = &described.file.modules;
+    let names = esi::module_names(modules, idents);
+    let known = |ident: u32| ident == 0 || modules.iter().any(|module| module.ident == ident);
+    let unknown: Vec<_> = idents
+        .iter()
+        .filter(|ident| !known(**ident))
+        .map(|ident| format!("0x{ident:08x}"))
+        .collect();
+    let comment = match (names.is_empty(), unknown.is_empty()) {
+        (true, _) => "no module is plugged".to_owned(),
+        (_, true) => "as they are plugged".to_owned(),
+        _ => format!("{MARK} the ESI file does not know {}", unknown.join(", ")),
     };
-    Some((format!("[{}]", names.join(", ")), comment))
+    let names: Vec<_> = names.iter().map(|name| quoted(name)).collect();
+    Some((Some(format!("[{}]", names.join(", "))), comment))
 }
 
 /// Returns a first move for the axes in a position mode.

@@ -72,7 +72,7 @@ pub(super) fn device(
 
 fn identity(file: &EsiFile, device: &Device) -> Value {
     json!({
-        "type": device.type_name, "name": device.name, "vendor_name": file.vendor.name,
+        "type": device.type_name, "name": device.name, "vendor_name": file.vendor_name(device.identity.vendor),
         "vendor": device.identity.vendor, "product": device.identity.product,
         "revision": device.identity.revision,
         "mailbox": device.mailbox.as_ref().map_or_else(String::new, head::protocols),

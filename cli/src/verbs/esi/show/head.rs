@@ -8,10 +8,10 @@ use ecaxis_tools::document::{Document, Table};
 /// Returns a document with the identity.
 pub(super) fn document(file: &EsiFile, device: &Device) -> Document {
     let mut out = Document::new(format!("{} {:?}", device.type_name, device.name));
-    let vendor = format!("{} (0x{:08x})", file.vendor.name, file.vendor.id);
+    let id = device.identity;
+    let vendor = format!("{} (0x{:08x})", file.vendor_name(id.vendor), id.vendor);
     let mut table = Table::new("");
     table.row(cells!["vendor", vendor]);
-    let id = device.identity;
     table.row(cells!["product code", hex32(id.product)]);
     table.row(cells!["revision", hex32(id.revision)]);
     if let Some(profile) = device.profile {

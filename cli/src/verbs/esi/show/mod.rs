@@ -38,7 +38,7 @@ pub(crate) struct Args {
     mode: Option<Mode>,
     /// Modules by slot, `-` for an empty slot
     #[arg(long, value_delimiter = ',', value_name = "MODULE,…")]
-    modules: Vec<String>,
+    modules: Option<Vec<String>>,
     /// PDO assignment by name
     #[arg(long, value_name = "NAME")]
     assignment: Option<String>,
@@ -67,19 +67,18 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return print(&devices(&file));
     }
     let device = args.which.device(&file)?;
-    let modules: Vec<&str> = args.modules.iter().map(String::as_str).collect();
+    let names = args.modules.as_ref();
+    let modules: Option<Vec<&str>> = names.map(|names| names.iter().map(String::as_str).collect());
     let choice = SelectOptions {
         mode: args.mode,
-        modules: &modules,
+        modules: modules.as_deref(),
         assignment: args.assignment.as_deref(),
         dc_mode: args.dc.as_deref(),
         cycle_ns: args.cycle,
         ..SelectOptions::default()
     };
-    let chosen = args.mode.is_some()
-        || !modules.is_empty()
-        || args.assignment.is_some()
-        || args.dc.is_some();
+    let chosen =
+        args.mode.is_some() || modules.is_some() || args.assignment.is_some() || args.dc.is_some();
     let selection = match select(&file, device, &choice) {
         Err(error) if chosen => {
             let failure = Failure::new(hints::WRONG, error.to_string());
@@ -134,10 +133,11 @@ fn configuration(
 }
 
 fn devices(file: &EsiFile) -> Document {
+    let vendors = file.vendors.iter();
+    let vendors = vendors.map(|vendor| format!("{} (0x{:08x})", vendor.name, vendor.id));
     let mut out = Document::new(format!(
-        "{} (0x{:08x}): {}, {}",
-        file.vendor.name,
-        file.vendor.id,
+        "{}: {}, {}",
+        vendors.collect::<Vec<_>>().join(", "),
         pluralize(file.devices.len(), "device"),
         pluralize(file.modules.len(), "module"),
     ));

@@ -31,7 +31,7 @@ pub(super) fn by_mode(
     let selected = |mode| {
         let choice = SelectOptions {
             mode: Some(mode),
-            modules: &[],
+            modules: None,
             assignment: None,
             dc_mode: None,
             ..*choice

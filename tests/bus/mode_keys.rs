@@ -1,0 +1,57 @@
+//! Drives that show their mode in Operation enabled only, or change it without power only.
+
+use ecaxis_test_support::{assert_contains, machine, run_badly, run_well, virtual_time};
+
+/// Returns one drive with quirks and keys of its axis.
+fn text(quirks: &str, keys: &str, steps: &str) -> String {
+    format!(
+        "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"\nposition = 0\n\
+         mode = \"csp\"\n[device.axis]\nencoder = 2000\n\
+         limits = {{ velocity = 20.0, acceleration = 200.0, torque = 100.0, following_error = 0.5 }}\n\
+         homing = {{ method = 37 }}\n{keys}\n[device.sim]\nquirks = {{ {quirks} }}\n{steps}"
+    )
+}
+
+const MOVE: &str = "[[step]]\nmove = { x = 2.0 }\n";
+const SWITCH: &str = "[[step]]\nhome = [\"x\"]\n[[step]]\nmode = { x = \"csv\" }\n\
+    [[step]]\nmode = { x = \"csp\" }\n[[step]]\nmove = { x = 2.0 }\n";
+
+#[test]
+fn drive_that_shows_its_mode_when_enabled_runs_with_its_key() {
+    let quirk = "mode_shown_enabled = true";
+    let (error, _) = run_badly(machine(&text(quirk, "", MOVE)), virtual_time());
+    println!("{error}");
+    assert_contains(
+        &error,
+        &["`x`", "stays in Switched on", "0x6061 shows mode"],
+    );
+    let key = "mode_display = \"enabled\"";
+    let summary = run_well(machine(&text(quirk, key, MOVE)), virtual_time());
+    assert!((summary.axes[0].final_position - 2.0).abs() < 0.01);
+
+    let late = "mode_shown_enabled = true, mode_shown_late = \"3s\"";
+    let key = "mode_display = \"enabled\"\nmode_time = \"100ms\"";
+    let (error, _) = run_badly(machine(&text(late, key, MOVE)), virtual_time());
+    println!("{error}");
+    assert_contains(&error, &["`x`", "0x6061 shows mode"]);
+}
+
+#[test]
+fn drive_that_changes_its_mode_without_power_runs_with_its_key() {
+    let quirk = "mode_without_power = true";
+    let (error, _) = run_badly(machine(&text(quirk, "", SWITCH)), virtual_time());
+    println!("{error}");
+    assert_contains(&error, &["`x`", "mode"]);
+    for (quirk, key) in [
+        (quirk, "mode_change = \"no-power\""),
+        (
+            "mode_without_power = true, mode_shown_enabled = true",
+            "mode_change = \"no-power\"\nmode_display = \"enabled\"",
+        ),
+    ] {
+        let summary = run_well(machine(&text(quirk, key, SWITCH)), virtual_time());
+        let axis = &summary.axes[0];
+        assert!((axis.final_position - 2.0).abs() < 0.01, "{quirk}");
+        assert_eq!(axis.mode, "csp");
+    }
+}
