@@ -13,6 +13,7 @@ use crate::cancel::CancelToken;
 use crate::clock::{self, Nanos};
 use crate::link::pdu_loop::{MAX_DATAGRAMS, MAX_JOINED};
 use crate::link::redundant::{RingState, RingStatus};
+use crate::link::second_end::{self, SecondEnd};
 use crate::mailbox::{DatagramError, MailboxStatus, MailboxTransport};
 use crate::rt::exchange::BusStatus;
 use limiter::InFlightLimiter;
@@ -30,6 +31,8 @@ pub struct DatagramClient {
     turns: &'static InFlightLimiter,
     stop: &'static CancelToken,
     ring: Option<&'static RingStatus>,
+    /// The interface, outside of a ring and without a cycle.
+    nic: Option<&'static str>,
 }
 
 impl DatagramClient {
@@ -52,6 +55,7 @@ impl DatagramClient {
             turns: Box::leak(Box::new(InFlightLimiter::new(max))),
             stop: Box::leak(Box::default()),
             ring: None,
+            nic: None,
         }
     }
 
@@ -59,6 +63,18 @@ impl DatagramClient {
     #[must_use]
     pub fn in_ring(self, ring: Option<&'static RingStatus>) -> Self {
         Self { ring, ..self }
+    }
+
+    /// Sets the interface, as the link reports it. For a bus without a cycle.
+    #[must_use]
+    pub(crate) fn on_interface(self, nic: Option<&str>) -> Self {
+        let nic = nic.map(|nic| &*Box::leak(Box::from(nic)));
+        Self { nic, ..self }
+    }
+
+    /// Searches for another interface at which the frames arrive. Blocks.
+    pub(crate) fn find_second_end(&self) -> Option<SecondEnd> {
+        self.nic.and_then(second_end::find_second_end)
     }
 
     /// Returns the state of the ring, with cable redundancy.

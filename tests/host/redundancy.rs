@@ -84,3 +84,76 @@ fn a_ring_outlasts_each_of_its_interfaces() {
         println!("{}", String::from_utf8_lossy(&output.stdout));
     });
 }
+
+/// The output of a command that ends by itself: exit code, standard output and errors.
+fn outcome(arguments: &[&str]) -> (Option<i32>, String, String) {
+    let output = program::command().args(arguments).output();
+    let output = output.expect("the binary runs");
+    let text = |bytes| String::from_utf8_lossy(bytes).into_owned();
+    (
+        output.status.code(),
+        text(&output.stdout),
+        text(&output.stderr),
+    )
+}
+
+/// With one interface, the bus looked silent: "no SubDevice answers", and is it the right
+/// interface? The frames arrive at the other one.
+#[test]
+fn one_interface_of_a_ring_names_the_other() {
+    over_a_pair(|first| {
+        let second = VethPair::new().expect("a second pair");
+        let (file, _bus) = serve(&first, &second);
+        let line = tempfile::Builder::new().suffix(".toml").tempfile();
+        let line = line.expect("a temporary file");
+        std::fs::write(line.path(), tolerant_demo()).expect("written");
+        let line = line.path().to_str().expect("a path in UTF-8");
+        let ring = file.path().to_str().expect("a path in UTF-8");
+        let (a, b) = (first.b.as_str(), second.b.as_str());
+        let forwards = [
+            format!("no SubDevice answers; the frames of `{a}` arrive at `{b}`, "),
+            "processed by 2 SubDevices".to_owned(),
+            format!("write `redundant = \"{b}\"` into [bus], or name both: `{a},{b}`"),
+        ];
+        for arguments in [
+            &["scan", a][..],
+            &["run", line, "--nic", a, "--no-fault-report"],
+            &["compare", line, "--nic", a],
+            &["eeprom", "verify", "--nic", a, "--position", "0"],
+            &["sdo", "read", line, "x", "0x1018:01", "--nic", a],
+        ] {
+            let (code, _, errors) = outcome(arguments);
+            assert_eq!(code, Some(1), "{arguments:?}: {errors}");
+            for text in &forwards {
+                assert!(errors.contains(text), "{arguments:?}: {errors}");
+            }
+        }
+        let (code, _, errors) = outcome(&["scan", b]);
+        assert_eq!(code, Some(1), "{errors}");
+        assert!(
+            errors.contains("no SubDevice has processed them"),
+            "{errors}"
+        );
+        assert!(errors.contains(&format!("`{a},{b}`")), "{errors}");
+
+        let both = format!("{a},{b}");
+        let written = tempfile::tempdir().expect("a folder");
+        let written = written.path().join("m.toml");
+        let path = written.to_str().expect("a path in UTF-8");
+        for arguments in [
+            &["scan", &both][..],
+            &["scan", &both, "--write", path],
+            &["compare", line, "--nic", &both],
+            &["compare", ring, "--nic", a],
+            &["eeprom", "verify", "--nic", &both, "--position", "0"],
+            &["sdo", "read", line, "x", "0x1018:01", "--nic", &both],
+            &["run", line, "--nic", &both, "--no-fault-report"],
+        ] {
+            let (code, out, errors) = outcome(arguments);
+            assert_eq!(code, Some(0), "{arguments:?}: {out}\n{errors}");
+        }
+        let written = std::fs::read_to_string(&written).expect("a machine file");
+        let redundant = format!("redundant   = \"{b}\"");
+        assert!(written.contains(&redundant), "{written}");
+    });
+}

@@ -13,6 +13,7 @@ use ecaxis_master::link::{self, Link, SocketKind};
 use ecaxis_master::session::{self, Cause, Error, Options};
 
 use crate::access::signals;
+use crate::args::nic::NicArg;
 use crate::hints::{self, Failure};
 use crate::render::note;
 use crate::render::output;
@@ -67,13 +68,13 @@ impl Bus {
         }
     }
 
-    pub fn interface(nic: &str) -> Self {
-        let (nic, back_end) = (nic.to_owned(), SocketKind::default());
+    /// Returns the bus on the interfaces of an option.
+    pub fn interface(nic: &NicArg) -> Self {
         Self {
             on: BusKind::Interface {
-                nic,
-                second: None,
-                back_end,
+                nic: nic.first.clone(),
+                second: nic.second.clone(),
+                back_end: SocketKind::default(),
             },
             options: Options::default(),
             alone: false,
@@ -98,6 +99,14 @@ impl Bus {
         match &self.on {
             BusKind::Interface { nic, .. } => Nic::Interface(nic.clone()),
             BusKind::Sim(_) => Nic::Sim,
+        }
+    }
+
+    /// The interface at the other end of a ring.
+    pub fn second(&self) -> Option<&str> {
+        match &self.on {
+            BusKind::Interface { second, .. } => second.as_deref(),
+            BusKind::Sim(_) => None,
         }
     }
 

@@ -18,6 +18,7 @@ use ecaxis_master::parameters::dump::Origin;
 use ecaxis_master::report::{Cause, Error};
 
 use crate::access::bus::{self, Bus};
+use crate::args::nic::NicArg;
 use crate::args::numbers::number_16;
 use crate::hints::{self, Failure};
 use crate::render::note;
@@ -26,9 +27,10 @@ use crate::render::note;
 #[derive(Debug, Clone, clap::Args)]
 #[command(next_help_heading = "Which device")]
 pub(crate) struct DeviceArgs {
-    /// Use this network interface instead of the machine file's, or without a machine file
+    /// Use this network interface instead of the machine file's, or without a machine file;
+    /// `IF,IF`: both ends of a ring
     #[arg(long, value_name = "IF", conflicts_with = "sim")]
-    nic: Option<String>,
+    nic: Option<NicArg>,
     /// Use the machine file's simulated bus
     #[arg(long)]
     sim: bool,
@@ -68,7 +70,7 @@ impl DeviceArgs {
         let alias = self.alias.map(Locator::Alias);
         let at = position.or(alias).or(self.id.map(Locator::Id));
         if let (Some(nic), Some(at)) = (&self.nic, at) {
-            if nic == "sim" {
+            if nic.is_sim() {
                 let message = "the simulated bus is a machine file's: `FILE DEVICE --sim`";
                 return Err(Failure::new(hints::WRONG, message));
             }
@@ -89,10 +91,10 @@ impl DeviceArgs {
         };
         let file = PathBuf::from(file);
         let mut machine = config::load(&file).map_err(|error| hints::config(&file, &error))?;
-        if self.sim || self.nic.as_deref() == Some("sim") {
+        if self.sim {
             machine.bus.nic = Nic::Sim;
         } else if let Some(nic) = &self.nic {
-            machine.bus.nic = Nic::Interface(nic.clone());
+            nic.replace(&mut machine.bus);
         }
         let device = selected(&machine, name)?;
         Ok((Target::of_device(machine, device), rest))

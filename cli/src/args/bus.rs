@@ -6,14 +6,15 @@ use ecaxis_master::config::{self, ConfigError, Machine, Nic};
 use ecaxis_master::session;
 use ecaxis_sim::{FaultScript, SecondPort};
 
+use crate::args::nic::NicArg;
 use crate::failure::{Failure, WRONG};
 use crate::hints;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct BusArgs {
-    /// Use this network interface instead of the file's
+    /// Use this network interface instead of the file's; `IF,IF`: both ends of a ring
     #[arg(long, value_name = "IF", conflicts_with = "sim")]
-    pub nic: Option<String>,
+    pub nic: Option<NicArg>,
     /// Use the simulated bus instead of the file's interface
     #[arg(long)]
     pub sim: bool,
@@ -26,10 +27,10 @@ impl BusArgs {
     /// Loads a machine file. The options override the bus of the file.
     pub fn load(&self, file: &Path) -> Result<Machine, ConfigError> {
         let mut machine = config::load(file)?;
-        if self.sim || self.nic.as_deref() == Some("sim") {
+        if self.sim {
             machine.bus.nic = Nic::Sim;
         } else if let Some(nic) = &self.nic {
-            machine.bus.nic = Nic::Interface(nic.clone());
+            nic.replace(&mut machine.bus);
         }
         Ok(machine)
     }

@@ -3,6 +3,7 @@
 pub(crate) mod bus;
 pub(crate) mod can_log;
 pub(crate) mod files;
+pub(crate) mod nic;
 pub(crate) mod numbers;
 pub(crate) mod record;
 pub(crate) mod report;

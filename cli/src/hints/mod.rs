@@ -11,6 +11,7 @@ use ecaxis_ecat::mailbox::abort_code as abort;
 use ecaxis_esi::{SDO_OF_MACHINE_FILE, address};
 use ecaxis_master::acyclic::StateError;
 use ecaxis_master::config::{ConfigError, LimitConflict, Nic, UnitProblem};
+use ecaxis_master::link::second_end::SecondEnd;
 use ecaxis_master::mailbox::{CoeCause, SdoError};
 use ecaxis_master::report::{Cause, Error};
 use ecaxis_master::rt::gateway::NodeState;
@@ -48,7 +49,9 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
     let failure = Failure::new(FAILED, error.to_string());
     let hint = match &*error.cause {
         Cause::Open(open) => return interface(failure, open),
-        Cause::NoAnswer => {
+        Cause::NoAnswer { second_end: Some(end) } => second_end(end),
+        Cause::NoAnswer { second_end: None } => {
+
             return match nic {
                 Nic::Interface(name) => failure
                     .hint(format!("is `{name}` the right interface? {}", interfaces()))
@@ -366,6 +369,23 @@ fn units(problem: &UnitProblem) -> String {
             "correct `sdo`, or the drive's motor data; `rated_torque` takes precedence".to_owned()
         }
         ref other => other.advice().to_owned(),
+    }
+}
+
+/// Returns what to plug or to write where the frames arrive at another interface.
+fn second_end(end: &SecondEnd) -> String {
+    let SecondEnd {
+        nic,
+        second,
+        processed_by,
+    } = end;
+    match processed_by {
+        0 => format!(
+            "plug the cable of `{nic}` into the IN port of the first SubDevice; for a ring whose IN port is at `{second}`, write `nic = \"{second}\"` and `redundant = \"{nic}\"` into [bus], or name both: `{second},{nic}`"
+        ),
+        _ => format!(
+            "a ring needs both interfaces: write `redundant = \"{second}\"` into [bus], or name both: `{nic},{second}`; for a line, unplug `{second}`"
+        ),
     }
 }
 

@@ -65,6 +65,15 @@ fn every_failure_has_a_hint() {
         found: 1,
         missing: vec!["`y`".into()],
     };
+    let ring = |processed_by| {
+        let (nic, second) = ("eth9".to_owned(), "eth8".to_owned());
+        let second_end = Some(SecondEnd {
+            nic,
+            second,
+            processed_by,
+        });
+        Error::from(Cause::NoAnswer { second_end })
+    };
     let units = |problem| {
         let problems = vec![problem];
         Cause::Units { problems }.with_device(device())
@@ -127,9 +136,19 @@ fn every_failure_has_a_hint() {
             "this computer has",
         ),
         (
-            Cause::NoAnswer.into(),
+            Cause::NoAnswer { second_end: None }.into(),
             FAILED,
             "is `eth9` the right interface?",
+        ),
+        (
+            ring(2),
+            FAILED,
+            "write `redundant = \"eth8\"` into [bus], or name both: `eth9,eth8`",
+        ),
+        (
+            ring(0),
+            FAILED,
+            "`redundant = \"eth9\"` into [bus], or name both: `eth8,eth9`",
         ),
         (missing.into(), FAILED, "the first one missing"),
         (

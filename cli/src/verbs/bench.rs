@@ -20,6 +20,7 @@ use ecaxis_tools::host::Host;
 
 use crate::access::signals;
 use crate::args::files::{Inputs, check_output, unwritable};
+use crate::args::nic::NicArg;
 use crate::hints::{self, Failure};
 use crate::render::progress::ProgressPrinter;
 use crate::render::{note, print_json, print_page};
@@ -69,9 +70,9 @@ pub(crate) struct Args {
     /// Measure on the bus of this machine file; axes are not enabled
     #[arg(long, value_name = "FILE")]
     machine: Option<PathBuf>,
-    /// Use this network interface instead of the file's
+    /// Use this network interface instead of the file's; `IF,IF`: both ends of a ring
     #[arg(long, value_name = "IF", requires = "machine", conflicts_with = "sim")]
-    nic: Option<String>,
+    nic: Option<NicArg>,
     /// Enable the axes and run the file's program: THE MACHINE MOVES
     #[arg(long, requires = "machine")]
     enable: bool,
@@ -289,7 +290,7 @@ fn plan(args: &Args) -> Result<Plan, Failure> {
             if args.sim {
                 machine.bus.nic = Nic::Sim;
             } else if let Some(nic) = &args.nic {
-                machine.bus.nic = Nic::Interface(nic.clone());
+                nic.replace(&mut machine.bus);
             }
             if let Some(cycle) = args.cycle
                 && cycle != machine.bus.cycle_ns

@@ -13,6 +13,7 @@ use serde_json::{Value, json};
 
 use crate::access::bus::{self, Bus};
 use crate::args::files::{back_up, replace};
+use crate::args::nic::NicArg;
 use crate::hints::{self, Failure};
 use crate::render::{note, page, print_json};
 use crate::verbs::eni::machine_of;
@@ -36,9 +37,9 @@ pub(crate) struct Args {
     /// Machine file, or ENI file of another tool
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// Use this network interface instead of the file's
+    /// Use this network interface instead of the file's; `IF,IF`: both ends of a ring
     #[arg(long, value_name = "IF", conflicts_with = "sim")]
-    nic: Option<String>,
+    nic: Option<NicArg>,
     /// Compare with the simulated bus of this machine file
     #[arg(long, value_name = "FILE")]
     sim: Option<PathBuf>,
@@ -87,7 +88,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             other.bus.nic = Nic::Sim;
             Bus::of(&other)
         }
-        (None, Some(nic)) => Bus::interface(nic),
+        (None, Some(nic)) => {
+            let mut other = machine.clone();
+            nic.replace(&mut other.bus);
+            Bus::of(&other)
+        }
         (None, None) => Bus::of(&machine),
     };
     let nic = bus.nic();

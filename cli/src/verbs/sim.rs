@@ -22,6 +22,7 @@ use crate::access::{console, signals};
 use crate::args::bus;
 use crate::args::can_log::CanLog;
 use crate::args::files::{Inputs, check_output, unwritable, write_new};
+use crate::args::nic::NicArg;
 use crate::args::trace::Trace;
 use crate::hints::{self, Failure};
 use crate::render::{note, result};
@@ -51,9 +52,9 @@ pub(crate) struct Args {
     /// Machine file
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// Network interface to answer on
+    /// Network interface to answer on; `IF,IF`: as `--nic` and `--nic2`
     #[arg(long, value_name = "IF")]
-    nic: String,
+    nic: NicArg,
     /// Second interface of a MainDevice with cable redundancy: closes the bus to a ring
     #[arg(long, value_name = "IF")]
     nic2: Option<String>,
@@ -87,7 +88,14 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let nics: Vec<&str> = [Some(&args.nic), args.nic2.as_ref()]
+    let second = match (&args.nic.second, &args.nic2) {
+        (Some(_), Some(_)) => {
+            let message = "--nic names both ends of the ring, and --nic2 names one of them again";
+            return Err(Failure::new(hints::WRONG, message).hint("omit `--nic2`"));
+        }
+        (second, nic2) => second.as_ref().or(nic2.as_ref()),
+    };
+    let nics: Vec<&str> = [Some(&args.nic.first), second]
         .into_iter()
         .flatten()
         .map(String::as_str)
@@ -104,7 +112,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut can_log = can_log
         .map(|path| CanLog::create(&mut machine, path, args.force, &inputs))
         .transpose()?;
-    let ring = args.nic2.as_ref().map(|_| SecondPort::Listens);
+    let ring = second.map(|_| SecondPort::Listens);
     let faults = args.faults.as_deref();
     let faults = faults.map(|f| bus::faults(f, &machine, ring)).transpose()?;
     let seed = faults

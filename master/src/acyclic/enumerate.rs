@@ -152,7 +152,8 @@ pub async fn read_device(wire: &DatagramClient, position: u16) -> Result<Enumera
 /// Returns the number of devices that answer a broadcast; at least 1.
 ///
 /// # Errors
-/// [`Cause::NoAnswer`], [`Cause::Datagram`].
+/// [`Cause::NoAnswer`], with the second interface of the ring if there is one;
+/// [`Cause::Datagram`].
 pub async fn count(wire: &DatagramClient) -> Result<u16, Error> {
     for _ in 0..MAX_ATTEMPTS {
         match wire.count().await {
@@ -161,7 +162,8 @@ pub async fn count(wire: &DatagramClient) -> Result<u16, Error> {
             Err(error) => return Err(Error::from(Cause::Datagram(error)).with_action(STEP)),
         }
     }
-    Err(Cause::NoAnswer.into())
+    let second_end = wire.find_second_end();
+    Err(Cause::NoAnswer { second_end }.into())
 }
 
 /// Reads bytes of a device by its position.

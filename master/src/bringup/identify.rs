@@ -33,7 +33,7 @@ pub(super) async fn explain_scan(
     failure: ScanFailure,
 ) -> report::Error {
     let Ok(count) = count(wire).await else {
-        return Cause::NoAnswer.into();
+        return Cause::NoAnswer { second_end: None }.into();
     };
     let (mut behind, mut unaddressed) = (None, None);
     let mut all = Vec::new();

@@ -277,6 +277,10 @@ impl Link for CapturingLink {
         self.inner.ring()
     }
 
+    fn nic(&self) -> Option<&str> {
+        self.inner.nic()
+    }
+
     fn take_sim_inputs(&mut self) -> Option<super::sim::SimInputSender> {
         self.inner.take_sim_inputs()
     }

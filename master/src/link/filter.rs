@@ -12,7 +12,7 @@ const HEADERS: usize = 16;
 /// All frames of this program are broadcasts from this source address. The last two bytes of the
 /// address distinguish them.
 const TO_ALL: [u8; 6] = [0xff; 6];
-const SOURCE: [u8; 4] = [0x10; 4];
+pub(super) const SOURCE: [u8; 4] = [0x10; 4];
 
 /// The first SubDevice sets this bit in the first byte of the source address.
 const PROCESSED: u8 = 0x02;

@@ -115,6 +115,13 @@ pub(super) fn index(nic: &str) -> Result<i32, OpenError> {
     packet::interface_index(nic).ok_or_else(missing)
 }
 
+/// Returns the index of the other end of a virtual cable in this network namespace.
+pub(super) fn peer_index(nic: &str) -> Option<i32> {
+    let peer = SysfsNic::of(Path::new(SYS), nic).read("iflink").ok()?;
+    let peer = peer.parse().ok()?;
+    (index(nic).ok()? != peer).then_some(peer)
+}
+
 /// Returns warnings about a usable interface.
 #[must_use]
 pub fn concerns(nic: &str) -> Vec<NicWarning> {

@@ -123,6 +123,10 @@ impl Link for LockedLink {
         self.link.ring()
     }
 
+    fn nic(&self) -> Option<&str> {
+        self.link.nic()
+    }
+
     fn exhausted_reason(&self) -> Option<&'static str> {
         self.link.exhausted_reason()
     }

@@ -9,6 +9,7 @@
 //!   interface;
 //! - [`capture`]: records the frames of any link;
 //! - [`replay`]: a recording in place of a bus;
+//! - [`second_end`]: finds the second interface of a ring that only one interface names;
 //! - [`redundant`]: cable redundancy, two interfaces as one link;
 //! - [`scan_answers`]: answers ethercrab's scan from what was found before;
 //! - [`pdu_loop`]: connects ethercrab to a link.
@@ -27,6 +28,7 @@ pub mod pdu_loop;
 pub mod redundant;
 pub mod replay;
 pub mod scan_answers;
+pub mod second_end;
 pub mod sim;
 mod socket_kind;
 pub mod source_address;
@@ -77,6 +79,11 @@ pub trait Link: fmt::Debug + Send {
 
     /// Returns the state of the ring, if the link has both ends of one.
     fn ring(&self) -> Option<&'static redundant::RingStatus> {
+        None
+    }
+
+    /// Returns the network interface, if the link has exactly one. Not for the cycle.
+    fn nic(&self) -> Option<&str> {
         None
     }
 

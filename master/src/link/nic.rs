@@ -24,6 +24,7 @@ const PASSED_OVER: usize = 32;
 /// One interface, receiving EtherCAT frames only.
 #[derive(Debug)]
 pub struct NicLink {
+    nic: String,
     // Declared before the socket, so that it is dropped first.
     ring: Option<Ring>,
     socket: PacketSocket,
@@ -63,6 +64,7 @@ impl NicLink {
         };
         interface::bind(nic, &socket, index)?;
         Ok(Self {
+            nic: nic.to_owned(),
             ring,
             socket,
             stats: LinkStats::default(),
@@ -100,6 +102,10 @@ impl Link for NicLink {
     fn stats(&mut self) -> LinkStats {
         interface::add_drops(&self.socket, &mut self.stats);
         self.stats
+    }
+
+    fn nic(&self) -> Option<&str> {
+        Some(&self.nic)
     }
 }
 

@@ -10,6 +10,17 @@ const TAIL: std::ops::Range<usize> = 10..12;
 /// The tag of programs without a cycle; ethercrab's is 0x10, the cycle's is 0x20.
 const ACYCLIC_BIT: u8 = 0x30;
 
+/// Returns the source address of a program without a cycle. `number` distinguishes programs.
+pub(super) fn acyclic_address(number: u32) -> [u8; 6] {
+    let [s0, s1, s2, s3] = super::filter::SOURCE;
+    let [tail, kind] = acyclic_tail(number);
+    [s0, s1, s2, s3, tail, kind]
+}
+
+const fn acyclic_tail(number: u32) -> [u8; 2] {
+    [number.to_le_bytes()[0], ACYCLIC_BIT]
+}
+
 /// True if a frame was sent by a program without a cycle.
 pub(super) fn is_acyclic_client_frame(frame: &[u8]) -> bool {
     frame.get(TAIL).is_some_and(|tail| tail[1] == ACYCLIC_BIT)
@@ -32,7 +43,7 @@ impl PrivateMacLink {
     pub fn new(link: Box<dyn Link>, number: u32) -> Self {
         Self {
             link,
-            tail: [number.to_le_bytes()[0], ACYCLIC_BIT],
+            tail: acyclic_tail(number),
             given: [0; 2],
             frame: Box::new([0; MAX_FRAME]),
             others: 0,
@@ -84,6 +95,10 @@ impl Link for PrivateMacLink {
 
     fn ring(&self) -> Option<&'static RingStatus> {
         self.link.ring()
+    }
+
+    fn nic(&self) -> Option<&str> {
+        self.link.nic()
     }
 
     fn finish(self: Box<Self>) -> std::io::Result<Option<super::capture::RecordStats>> {

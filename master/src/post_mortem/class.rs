@@ -42,7 +42,7 @@ impl Class {
             } if *state != AlState::Op => Self::of_watchdog(error.device(), evidence),
             Cause::LeftOp { state, code } => Self::of_state(*state, *code, evidence),
             Cause::State(error) => Self::of_change(error, evidence),
-            Cause::NoAnswer
+            Cause::NoAnswer { .. }
             | Cause::Silent { .. }
             | Cause::Datagram(_)
             | Cause::NotTaken { .. }

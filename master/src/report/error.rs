@@ -10,6 +10,7 @@ use ecaxis_axis::{CommandError, EnableBlocker, Mode, State, Statusword, Trip};
 
 use crate::config::duration::show;
 use crate::config::{LimitConflict, UnitProblem};
+use crate::link::second_end::SecondEnd;
 use crate::link::{LinkError, OpenError};
 use crate::mailbox::{DatagramError, EoeError, EoeSetting, IdnElement, InfoError, SdoError};
 use crate::rt::gateway::NodeState;
@@ -76,8 +77,14 @@ pub enum Cause {
     NotMapped(NotMapped),
     #[error(transparent)]
     Axis(ecaxis_axis::ConfigError),
-    #[error("no SubDevice answers")]
-    NoAnswer,
+    #[error(
+        "no SubDevice answers{}",
+        second_end.as_ref().map_or_else(String::new, |end| format!("; {end}"))
+    )]
+    NoAnswer {
+        /// The interface at which the frames arrive instead.
+        second_end: Option<SecondEnd>,
+    },
     #[error("the units of the drive are not those with which the machine has started")]
     OtherUnits,
     #[error(

@@ -60,7 +60,9 @@ pub fn run_on_link<T>(
 ) -> Result<T, Error> {
     let (main_device, mut port) = main_device(0, StateTimeouts::DEFAULT.back_to_init);
     let run = AssertUnwindSafe(|| {
-        let wire = DatagramClient::without_cycle(main_device).in_ring(link.ring());
+        let wire = DatagramClient::without_cycle(main_device)
+            .in_ring(link.ring())
+            .on_interface(link.nic());
         let work = Box::pin(work(wire));
         let ends = wire.stop();
         drive_pdu_loop(

@@ -472,7 +472,9 @@ fn bring_up_catching_panics(
     let run = std::panic::AssertUnwindSafe(|| {
         let answers = port.scan_answers.clone();
         // ethercrab's tables make the future large: nothing holds it on the stack.
-        let wire = DatagramClient::without_cycle(main_device).in_ring(link.ring());
+        let wire = DatagramClient::without_cycle(main_device)
+            .in_ring(link.ring())
+            .on_interface(link.nic());
         let bring_up = Box::pin(bring_up(wire, &answers, machine, image, &report, log));
         drive_pdu_loop(port, link, clock, stop.run_until_requested(bring_up))
     });

@@ -69,6 +69,7 @@ pub fn apply(
         .map_err(|error: toml_edit::TomlError| ApplyError::NotToml(error.to_string()))?;
     let place = OutputPath {
         nic: "",
+        redundant: None,
         folder: path.parent().unwrap_or(Path::new("")),
     };
     let differences = &actual.comparison.differences;

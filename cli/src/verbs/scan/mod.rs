@@ -8,6 +8,7 @@ use ecaxis_tools::compare;
 use ecaxis_tools::scan::{self, EsiMatch, MainDeviceEvidence, Scan, esi_match};
 
 use crate::access::bus::{self, Bus};
+use crate::args::nic::NicArg;
 use crate::hints::{self, Failure};
 use crate::render::{note, print_json, print_page, shown};
 use crate::verbs;
@@ -33,9 +34,9 @@ Examples:
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// Network interface
+    /// Network interface; `IF,IF`: both ends of a ring
     #[arg(value_name = "IF")]
-    nic: Option<String>,
+    nic: Option<NicArg>,
     /// Scan the simulated bus of this machine file instead
     #[arg(long, value_name = "FILE", conflicts_with = "nic")]
     sim: Option<PathBuf>,
@@ -88,7 +89,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
                 .hint("`--sim FILE` scans the simulated bus of a machine file"));
         }
     };
-    let nic = bus.nic();
+    let (nic, second) = (bus.nic(), bus.second().map(str::to_owned));
     let expected = args.expected(&nic)?;
     let identify = simulated.as_ref().is_some_and(scan::needs_identification)
         || matches!(&expected, Some((_, machine, _)) if scan::needs_identification(machine));
@@ -117,7 +118,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return write::imported(path, text, args.force);
     }
     if let Some(path) = &args.write {
-        return write::machine_file(&seen, path, library.is_some(), args.force);
+        return write::machine_file(
+            &seen,
+            second.as_deref(),
+            path,
+            library.is_some(),
+            args.force,
+        );
     }
     if args.json {
         print_json(&report::json(&seen))

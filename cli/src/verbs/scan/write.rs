@@ -50,12 +50,14 @@ fn write_with_schema(path: &Path, text: &str, force: bool) -> Result<(), Failure
 
 pub(super) fn machine_file(
     seen: &ScanResult,
+    redundant: Option<&str>,
     path: &Path,
     library: bool,
     force: bool,
 ) -> Result<(), Failure> {
     let place = OutputPath {
         nic: &seen.nic,
+        redundant,
         folder: path.parent().unwrap_or(Path::new("")),
     };
     let MachineFile { text, images } = write::machine_file(&seen.scan, &seen.described, place);

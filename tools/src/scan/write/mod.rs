@@ -35,6 +35,8 @@ const CYCLES: [u64; 5] = [1_000_000, 2_000_000, 4_000_000, 500_000, 250_000];
 pub struct OutputPath<'a> {
     /// `"sim"`, or a network interface.
     pub nic: &'a str,
+    /// The interface at the other end of a ring.
+    pub redundant: Option<&'a str>,
     /// The machine file's folder; paths in the file are relative to it.
     pub folder: &'a Path,
 }
@@ -114,6 +116,9 @@ fn head(named: &[DeviceName], place: OutputPath<'_>, cycle_ns: u64) -> String {
     lines.header("[bus]");
     let nic = quoted(place.nic);
     lines.add("nic", &nic, "`ecaxis run FILE --sim` simulates the bus");
+    if let Some(second) = place.redundant {
+        lines.add("redundant", &quoted(second), "");
+    }
     let cycle = quoted(&duration::show(cycle_ns).replace(' ', ""));
     lines.add("cycle", &cycle, "");
     let comment = format!("{MARK} a machine wants 3");

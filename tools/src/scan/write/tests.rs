@@ -45,6 +45,7 @@ fn written(drive: Option<DriveInfo>) -> String {
     let folder = configs();
     let place = OutputPath {
         nic: "sim",
+        redundant: None,
         folder: &folder,
     };
     machine_file(&scan, &described, place).text
