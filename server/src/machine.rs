@@ -1,26 +1,20 @@
 //! The thread that keeps the machine up: one run after another, until the server ends.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock;
 use ecaxis_master::report::{Home, Observer, Progress};
-use ecaxis_master::session::{self, Attachments, Options};
+use ecaxis_master::session::{self, Attachments, Options, RetryDelay};
 use serde_json::json;
 
 use crate::external::{Hold, external};
 use crate::hub::{BusState, BusStatus, Count, Describe, Hub, RunningStep};
 use crate::operator::ServerOperator;
 
-/// The first and the longest time until the next attempt to bring the bus up.
-const RETRY_S: [u64; 2] = [1, 10];
-/// A run that lasted as long ends the series of failed attempts.
-const LASTED_NS: u64 = 10_000_000_000;
-
 /// Runs the machine until the server ends. Blocks.
 pub fn keep_up(hub: &Arc<Hub>, options: &Options, stop: &Arc<CancelToken>, describe: &Describe) {
-    let mut retry_s = RETRY_S[0];
+    let mut delay = RetryDelay::default();
     while hub.await_wanted() && !stop.is_cancelled() {
         hub.set_bus(status(BusState::Starting));
         let hold = hub.options.virtual_time.then(|| {
@@ -62,20 +56,18 @@ pub fn keep_up(hub: &Arc<Hub>, options: &Options, stop: &Arc<CancelToken>, descr
         let (message, help) = describe(&error);
         tracing::error!(%message, "the run has ended");
         hub.fail_all(&message);
-        if up_since.is_some_and(|since| clock::now().saturating_sub(since) > LASTED_NS) {
-            retry_s = RETRY_S[0];
-        }
+        let up_ns = up_since.map(|since| clock::now().saturating_sub(since));
+        let retry = delay.after_failure(up_ns);
         hub.set_bus(BusStatus {
             error: Some(message),
             help,
-            retry_s: Some(retry_s as f64),
+            retry_s: Some(retry.as_secs_f64()),
             ..status(BusState::Failed)
         });
         if stop.is_cancelled() {
             break;
         }
-        hub.await_retry(Duration::from_secs(retry_s));
-        retry_s = (retry_s * 2).min(RETRY_S[1]);
+        hub.await_retry(retry);
     }
 }
 

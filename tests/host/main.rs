@@ -14,3 +14,4 @@ mod redundancy;
 mod signals;
 mod stop_trials;
 mod veth;
+mod wait;

@@ -3,11 +3,16 @@
 use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
+use ecaxis_master::bringup::Step;
 use ecaxis_master::cancel::CancelToken;
 use ecaxis_master::clock::Clock;
 use ecaxis_master::config::{Machine, Nic, duration};
-use ecaxis_master::session::{self, Attachments, Options, Outcome, Summary};
+use ecaxis_master::session::{
+    self, Attachments, Cause, Error, Observer, Options, Outcome, Progress, RetryDelay, Summary,
+};
+use ecaxis_master::supervise::ProgramControl;
 use serde_json::{Value, json};
 
 use crate::access::{console, rights, signals};
@@ -32,6 +37,7 @@ Examples:
   ecaxis run m.toml --record bus.pcapng     record all frames for Wireshark
   ecaxis run m.toml --sim --faults f.toml   with a fault script
   ecaxis run m.toml --no-enable             to Op, axes without power
+  ecaxis run m.toml --wait                  wait for devices without power
   ecaxis run m.toml --json                  the result as JSON
 
 During the run, the lines `p` (pause), `s` (one step), `c` (continue) and, on
@@ -53,6 +59,9 @@ pub(crate) struct Args {
     /// Run in virtual time: as fast as possible, the same every time (simulated bus only)
     #[arg(long = "virtual")]
     virtual_time: bool,
+    /// Wait until all devices answer, and start then; report what is missing
+    #[arg(long, conflicts_with_all = ["virtual_time", "replay"])]
+    wait: bool,
     /// Repeat the program for this time, such as 10s or 1h
     #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse, allow_hyphen_values = true)]
     time: Option<u64>,
@@ -132,6 +141,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let outputs = args.report.files(&machine.bus.nic);
     let mut needed = rights::with_outputs(needed, args.record.iter().chain(&outputs));
     needed.read.extend(args.replay.clone());
+    needed.one_bring_up = !args.wait;
     rights::limit(&needed).inspect_err(|f| print_failure(args, &f.message, &f.hints, json!([])))?;
     let (nic, devices) = (machine.bus.nic.clone(), machine.devices.len());
     let stop = Arc::<CancelToken>::default();
@@ -146,7 +156,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         result: ended,
         fault_report,
         ..
-    } = session::run_attached(machine, options, stop, &mut teller, attachments);
+    } = match args.wait {
+        true => run_when_present(&machine, &options, &stop, &mut teller, &attachments.control),
+        false => session::run_attached(machine, options, stop, &mut teller, attachments),
+    };
     drop(teller);
     if let Some(error) = can_log.as_mut().and_then(|log| log.write().err()) {
         note(&format!("warning: writing the CAN log: {error}"));
@@ -183,6 +196,76 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             .map_or(Ok(()), |summary| print(&report::summary(summary)))
     };
     failure.map_or(written, Err)
+}
+
+/// Runs the machine like [`session::run_attached`], again and again as long as devices are absent.
+fn run_when_present(
+    machine: &Machine,
+    options: &Options,
+    stop: &Arc<CancelToken>,
+    printer: &mut ProgressPrinter,
+    control: &Arc<ProgramControl>,
+) -> Outcome {
+    /// How soon Ctrl-C ends the waiting.
+    const TURN: Duration = Duration::from_millis(50);
+    let mut delay = RetryDelay::default();
+    let (mut reported, mut printed) = (None, Vec::new());
+    loop {
+        let attachments = Attachments {
+            control: Arc::clone(control),
+            ..Attachments::default()
+        };
+        let mut observer = AttemptObserver {
+            printer,
+            printed: &mut printed,
+        };
+        let (stop_run, options) = (Arc::clone(stop), options.clone());
+        let outcome = session::run_attached(
+            machine.clone(),
+            options,
+            stop_run,
+            &mut observer,
+            attachments,
+        );
+        let Some(error) = outcome.result.as_ref().err().filter(|e| e.is_absence()) else {
+            return outcome;
+        };
+        let failure = hints::failure(error, &machine.bus.nic);
+        if reported.as_ref() != Some(&failure.message) {
+            note(&format!("waiting (Ctrl-C ends it): {}", failure.message));
+            for hint in &failure.hints {
+                note(&format!("  = help: {hint}"));
+            }
+            reported = Some(failure.message);
+        }
+        let end = Instant::now() + delay.after_failure(None);
+        while Instant::now() < end && !stop.is_cancelled() {
+            std::thread::sleep(TURN);
+        }
+        if stop.is_cancelled() {
+            return Error::from(Cause::Interrupted).into();
+        }
+    }
+}
+
+/// Prints the begin of the scan, and each warning about the interface, in one attempt only.
+struct AttemptObserver<'p> {
+    printer: &'p mut ProgressPrinter,
+    printed: &'p mut Vec<String>,
+}
+
+impl Observer for AttemptObserver<'_> {
+    fn progress(&mut self, progress: &Progress) {
+        let line = match progress {
+            Progress::Step(step @ Step::Scan) => step.to_string(),
+            Progress::Concern(concern) => concern.to_string(),
+            _ => return self.printer.progress(progress),
+        };
+        if !self.printed.contains(&line) {
+            self.printed.push(line);
+            self.printer.progress(progress);
+        }
+    }
 }
 
 /// Returns what a run that ended without an error did not complete. A stopped group takes

@@ -546,6 +546,20 @@ impl Error {
         self.step == Some(FailedStep::BringUp)
     }
 
+    /// Returns `true` if devices or their power or cable are absent, so that a later attempt to
+    /// bring the bus up may succeed.
+    #[must_use]
+    pub fn is_absence(&self) -> bool {
+        match &*self.cause {
+            Cause::NoAnswer { second_end } => second_end.is_none(),
+            Cause::Open(OpenError::NoCarrier { .. } | OpenError::Down { .. })
+            | Cause::Missing { .. } => true,
+            // A device that is switched on during the scan, or off again.
+            Cause::Silent { .. } | Cause::NotLocated { .. } => self.is_in_bring_up(),
+            _ => false,
+        }
+    }
+
     /// Returns the device of the error.
     #[must_use]
     pub fn device(&self) -> Option<&DeviceRef> {

@@ -34,6 +34,7 @@ mod cycle_thread;
 mod fault_evidence;
 mod open;
 mod prepare;
+mod retry;
 mod signals;
 
 use crate::report::events;
@@ -52,6 +53,7 @@ use fault_evidence::{BringUpEvidence, RunEvidence};
 pub use open::{recorded, recording_comment, ring, simulated_bus, simulated_link, topology};
 pub use prepare::{Prepared, RunBuilder};
 use prepare::{broadcast_init, prefer_replay_end};
+pub use retry::RetryDelay;
 pub use signals::{SignalReport, stop_on_signals};
 
 /// The stack size in bytes of the thread that owns the link. ethercrab's futures hold its tables by
