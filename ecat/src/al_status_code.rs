@@ -102,6 +102,9 @@ pub fn al_status_hint(code: u16) -> Option<&'static str> {
         INVALID_STATE_CHANGE | UNKNOWN_STATE => {
             "the state must be changed step by step; power-cycle the device if it persists"
         }
+        BOOTSTRAP_UNSUPPORTED => {
+            "the device has no Bootstrap: update its firmware as its manual describes, often in PreOp or with its vendor's tool"
+        }
         INVALID_BOOTSTRAP_MAILBOX | INVALID_PRE_OP_MAILBOX => {
             "mailbox addresses and lengths must be those of SM0 and SM1 in the ESI file of this very revision"
         }
@@ -118,7 +121,7 @@ pub fn al_status_hint(code: u16) -> Option<&'static str> {
             "frames arrive at the wrong time; check the host's jitter and the DC shift of the ESI's mode"
         }
         SYNC_MANAGER_WATCHDOG => {
-            "no process data for longer than the watchdog allows: a cable, lost frames, or a delayed host"
+            "no process data for longer than the watchdog allows: a cable, lost frames, or a delayed host; if the device refuses Op, no outputs have reached it in SafeOp"
         }
         INVALID_OUTPUT_CONFIGURATION => {
             "the length of the outputs' SyncManager differs from the assigned RxPDOs (0x1C12); did a start-up SDO fail, or does the mapping differ? Some firmware refuses the watchdog trigger: see `watchdog_trigger`"
@@ -157,6 +160,9 @@ pub fn al_status_hint(code: u16) -> Option<&'static str> {
         COE_ERROR => "a start-up SDO was refused or never answered",
         NO_EEPROM_ACCESS | EEPROM_ERROR | NO_VALID_FIRMWARE => {
             "the EEPROM or firmware must be written again with the manufacturer's tool"
+        }
+        HARDWARE_NOT_READY => {
+            "the device waits for what is connected to it: check the supply of its power stage, its encoder, modules and safety inputs, then start again"
         }
         RESTARTED => "the device restarted; look at its supply",
         MODULES_DIFFER => {

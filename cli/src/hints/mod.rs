@@ -6,10 +6,10 @@ use std::path::Path;
 use ecaxis_axis::cia402::describe;
 use ecaxis_axis::scale::UnitMismatch;
 use ecaxis_axis::{CommandError, EnableBlocker, HomingError, State, Trip, VelocityUnit};
-use ecaxis_ecat::al_status_code::al_status_hint;
+use ecaxis_ecat::al_status_code::{SYNC_MANAGER_WATCHDOG, al_status_hint};
 use ecaxis_ecat::mailbox::abort_code as abort;
 use ecaxis_esi::{SDO_OF_MACHINE_FILE, address};
-use ecaxis_master::acyclic::StateError;
+use ecaxis_master::acyclic::{AlState, StateError};
 use ecaxis_master::config::{ConfigError, LimitConflict, Nic, UnitProblem};
 use ecaxis_master::link::second_end::SecondEnd;
 use ecaxis_master::mailbox::{CoeCause, SdoError};
@@ -51,7 +51,6 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         Cause::Open(open) => return interface(failure, open),
         Cause::NoAnswer { second_end: Some(end) } => second_end(end),
         Cause::NoAnswer { second_end: None } => {
-
             return match nic {
                 Nic::Interface(name) => failure
                     .hint(format!("is `{name}` the right interface? {}", interfaces()))
@@ -118,7 +117,8 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         Cause::NotLocated { .. } => {
             "set the device's alias or ID switch, or find it by `position`".to_owned()
         }
-        Cause::StartUp { source, origin, .. } => sdo(source, origin),
+        Cause::StartUp { index, sub, source, origin, .. } => pdo_selection((*index, *sub), source, origin)
+            .map_or_else(|| sdo(source, origin), str::to_owned),
         Cause::StartUpIdn { source, origin, .. } => sdo(source, origin),
         Cause::IdnValue { .. } => "correct the value in `idn`; `ecaxis soe read` shows the attribute".into(),
         Cause::NotHeld { .. } => {
@@ -389,6 +389,49 @@ fn second_end(end: &SecondEnd) -> String {
     }
 }
 
+/// The advice for a device that does not let its PDO assignment be changed.
+const KEPT_ASSIGNMENT: &str = "the device keeps its PDO assignment: `ecaxis sdo read` shows its PDOs (0x1C12, 0x1C13); use the ESI file of its firmware, or choose these PDOs with `mode` or `assignment`";
+
+/// Returns the hint for a refused PDO assignment or mapping that is not the user's own.
+fn pdo_selection((index, sub): (u16, u8), error: &SdoError, origin: &str) -> Option<&'static str> {
+    let is_assignment = matches!(index, 0x1c10..=0x1c2f);
+    let is_mapping = matches!(index, 0x1600..=0x17ff | 0x1a00..=0x1bff);
+    let code = error.abort_code()?;
+    if origin == SDO_OF_MACHINE_FILE || !is_assignment && !is_mapping {
+        return None;
+    }
+    Some(match code {
+        abort::SUBINDEX_0_NOT_ZERO => {
+            "the device has not emptied this list (subindex 0 = 0): switch it off and on; if it refuses again, its PDOs are fixed: use the ESI file of its firmware"
+        }
+        abort::UNSUPPORTED_ACCESS..=abort::READ_ONLY if is_assignment => KEPT_ASSIGNMENT,
+        abort::OUT_OF_RANGE..=abort::MAX_BELOW_MIN | abort::INCOMPATIBLE_PARAMETERS
+            if is_assignment && sub == 0 =>
+        {
+            KEPT_ASSIGNMENT
+        }
+        abort::UNSUPPORTED_ACCESS..=abort::READ_ONLY => {
+            "the device keeps the contents of this PDO: omit `pdo`, or list in it what `ecaxis sdo read` shows; or use the ESI file of its firmware"
+        }
+        code if abort::is_no_such_object(code) && is_assignment => {
+            "the device has fewer PDOs than its ESI file, or fixed ones: use the ESI file of its firmware"
+        }
+        abort::OUT_OF_RANGE..=abort::MAX_BELOW_MIN
+        | abort::NOT_MAPPABLE..=abort::INCOMPATIBLE_PARAMETERS
+            if is_assignment =>
+        {
+            "the device does not accept this PDO, alone or with the others of its SyncManager: choose other PDOs with `mode`, `assignment` or `pdo`"
+        }
+        abort::INCOMPATIBLE_PARAMETERS => {
+            "the device cannot map this object with the others of the PDO: choose fewer or other objects with `pdo.rx` and `pdo.tx`"
+        }
+        abort::DEVICE_STATE => {
+            "the device changes its PDOs in PreOp only, and its modules must be ready: switch it off and on, and end other programs at its mailbox"
+        }
+        _ => return None,
+    })
+}
+
 /// Returns the hint for an SDO error. `origin` is the source of the request; [`SDO_OF_MACHINE_FILE`] for the
 /// user's own list.
 fn sdo(error: &SdoError, origin: &str) -> String {
@@ -410,10 +453,16 @@ fn sdo(error: &SdoError, origin: &str) -> String {
             abort::OUT_OF_RANGE..=abort::MAX_BELOW_MIN => {
                 "the value is outside what the drive allows: its firmware does not match the ESI file"
             }
-            abort::UNSUPPORTED_ACCESS..=abort::SUBINDEX_0_NOT_ZERO if own => {
+            abort::SUBINDEX_0_NOT_ZERO if own => {
+                "write in this order: subindex 0 = 0, the entries, subindex 0 = their number"
+            }
+            abort::SUBINDEX_0_NOT_ZERO => {
+                "the drive has not emptied this list (subindex 0 = 0): switch it off and on"
+            }
+            abort::UNSUPPORTED_ACCESS..=abort::READ_ONLY if own => {
                 "the object cannot be written: remove it from `sdo`"
             }
-            abort::UNSUPPORTED_ACCESS..=abort::SUBINDEX_0_NOT_ZERO => {
+            abort::UNSUPPORTED_ACCESS..=abort::READ_ONLY => {
                 "the object is read-only in the drive: its firmware does not match the ESI file"
             }
             abort::TYPE_MISMATCH..=abort::DATA_TOO_SHORT if own => {
@@ -429,6 +478,7 @@ fn sdo(error: &SdoError, origin: &str) -> String {
             abort::LOCAL_CONTROL => "the drive is under local control: end its panel or commissioning tool; an object that is mapped now may not be writable either",
             abort::NO_MEMORY | abort::NOT_STORED | abort::HARDWARE => "the drive cannot store it now: switch it off and on, then check its own error history",
             abort::INCOMPATIBLE_PARAMETERS | abort::INTERNAL_INCOMPATIBILITY if own => "the value contradicts another setting of the drive: the order of `sdo` matters, and the mode must allow it",
+            abort::INCOMPATIBLE_PARAMETERS | abort::INTERNAL_INCOMPATIBILITY => "the value contradicts another setting that the drive holds: `ecaxis sdo compare` shows what differs from a saved file, `ecaxis sdo defaults` loads the drive's defaults",
             abort::DEVICE_STATE => "the drive refuses it in its present state: switch it off and on",
             _ => "look the code up in the drive's manual; `ecaxis explain` shows where the value comes from",
         },
@@ -467,7 +517,13 @@ const fn soe(code: u16) -> &'static str {
 
 fn state(error: &StateError) -> String {
     match error {
+        StateError::Refused {
+            wanted: AlState::Op,
+            code: SYNC_MANAGER_WATCHDOG,
+            ..
+        } => NO_OUTPUTS.to_owned(),
         StateError::Refused { code, .. } => al_status(*code).to_owned(),
+        StateError::Timeout { code, .. } if *code != 0 => al_status(*code).to_owned(),
         StateError::Timeout { .. } => {
             "switch the device off and on, then check its own display or error history".to_owned()
         }
@@ -475,6 +531,9 @@ fn state(error: &StateError) -> String {
         StateError::Wire { .. } => "check the cables".to_owned(),
     }
 }
+
+/// The advice for a device that refuses Op because its watchdog has seen no outputs.
+const NO_OUTPUTS: &str = "no outputs have reached the device in SafeOp, or too rarely for its watchdog: `ecaxis explain` shows its outputs; give it a longer `watchdog` than `cycle`, and look for lost frames in front of it";
 
 /// Returns the advice for an AL status code (ETG.1020).
 pub(crate) fn al_status(code: u16) -> &'static str {

@@ -107,6 +107,12 @@ pub(super) fn parameter(error: &SdoError) -> String {
         Some(abort::WRITE_ONLY | abort::READ_ONLY) => {
             "`ecaxis sdo list` shows what can be read and written"
         }
+        Some(abort::SUBINDEX_0_NOT_ZERO) => {
+            "write in this order: subindex 0 = 0, the entries, subindex 0 = their number"
+        }
+        Some(abort::INCOMPATIBLE_PARAMETERS | abort::INTERNAL_INCOMPATIBILITY) => {
+            "the value contradicts another setting of the device: write that one first"
+        }
         Some(
             abort::UNSUPPORTED_ACCESS | abort::NO_COMPLETE_ACCESS | abort::LONGER_THAN_MAILBOX,
         ) => "read or write its subindices one by one",

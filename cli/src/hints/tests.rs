@@ -1,5 +1,5 @@
 use ecaxis_axis::Mode;
-use ecaxis_master::acyclic::{AlState, DeviceRef};
+use ecaxis_master::acyclic::DeviceRef;
 use ecaxis_master::eoe::TapStep;
 use ecaxis_master::link::OpenError;
 use ecaxis_master::mailbox::{NamedObject, Subject};
@@ -49,6 +49,19 @@ fn every_failure_has_a_hint() {
         };
         Cause::State(refused).with_device(device())
     };
+    let state = |error| Cause::State(error).with_device(device());
+    let list = |index, sub, code| {
+        Cause::StartUp {
+            index,
+            sub,
+            name: String::new(),
+            value: "1".into(),
+            origin: "<Sm> 2".into(),
+            source: sdo_error(index, sub, CoeCause::Abort(code)),
+        }
+        .with_device(device())
+    };
+    let pdos = |index, code| list(index, 1, code);
     let waiting = |state, code, waiting| {
         Cause::NotEnabled {
             state,
@@ -174,6 +187,71 @@ fn every_failure_has_a_hint() {
             "from `pdo.rx`",
         ),
         (refused(0x001e), FAILED, "assigned TxPDOs"),
+        (refused(0x0013), FAILED, "no Bootstrap"),
+        (refused(0x001b), FAILED, "if the device refuses Op"),
+        (
+            state(StateError::Refused {
+                wanted: AlState::Op,
+                actual: AlState::SafeOp,
+                code: 0x001b,
+            }),
+            FAILED,
+            "a longer `watchdog` than `cycle`",
+        ),
+        (
+            state(StateError::Timeout {
+                wanted: AlState::SafeOp,
+                actual: AlState::PreOp,
+                code: 0x0052,
+                timeout: std::time::Duration::from_secs(1),
+            }),
+            FAILED,
+            "the supply of its power stage, its encoder",
+        ),
+        (refused(0x0052), FAILED, "what is connected to it"),
+        (refused(0x0070), FAILED, "`ecaxis compare` shows both"),
+        (
+            start_up(0x0601_0003, SDO_OF_MACHINE_FILE),
+            FAILED,
+            "subindex 0 = their number",
+        ),
+        (start_up(0x0601_0003, "ESI"), FAILED, "has not emptied"),
+        (
+            start_up(0x0604_0043, SDO_OF_MACHINE_FILE),
+            FAILED,
+            "the order of `sdo` matters",
+        ),
+        (
+            start_up(0x0604_0043, "ESI"),
+            FAILED,
+            "`ecaxis sdo defaults`",
+        ),
+        (pdos(0x1c12, 0x0601_0003), FAILED, "its PDOs are fixed"),
+        (pdos(0x1a00, 0x0601_0003), FAILED, "its PDOs are fixed"),
+        (
+            pdos(0x1c13, 0x0601_0002),
+            FAILED,
+            "keeps its PDO assignment",
+        ),
+        (
+            list(0x1c12, 0, 0x0604_0043),
+            FAILED,
+            "keeps its PDO assignment",
+        ),
+        (pdos(0x1600, 0x0601_0002), FAILED, "omit `pdo`"),
+        (
+            pdos(0x1c12, 0x0609_0030),
+            FAILED,
+            "does not accept this PDO",
+        ),
+        (
+            pdos(0x1c12, 0x0604_0043),
+            FAILED,
+            "does not accept this PDO",
+        ),
+        (pdos(0x1c12, 0x0602_0000), FAILED, "fewer PDOs"),
+        (pdos(0x1600, 0x0604_0043), FAILED, "cannot map this object"),
+        (pdos(0x1c12, 0x0800_0022), FAILED, "in PreOp only"),
         (refused(0x0035), FAILED, "cycle time"),
         (not_enabled(State::SwitchOnDisabled, None), FAILED, "STO"),
         (
