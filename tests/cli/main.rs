@@ -9,6 +9,7 @@ mod doctor;
 mod documents;
 mod eni;
 mod esi;
+mod findings;
 mod identity;
 mod init;
 mod messages;

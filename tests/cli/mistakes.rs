@@ -38,7 +38,7 @@ const IN_THE_FILE: [(&str, &str, &str, &str); 22] = [
     ("move  = { x = 50.0, y = -20.0 }", "move_by = { x = 200.0 }", "a way of 200 mm is longer than the axis' range", "`limits.position`"),
     ("esi/IDX.xml", "esi/IDY.xml", "cannot read esi/IDY.xml", "did you mean `IDX.xml`?"),
     ("\"esi/EPOS4.xml\"", "\"esi\\EPOS4.xml\"", "`\\` begins an escape", "write paths with `/`, or in single quotes"),
-    ("esi/IDX.xml", "esi/IO8.xml", "offers no mode csp", "an I/O device has no `mode`"),
+    ("esi/IDX.xml", "esi/IO8.xml", "offers no mode csp: no PDO has 0x6040", "an I/O device has no `mode`"),
     ("position = 1", "position = 0", "position 0 is taken", "line 25 has it"),
     ("repeat = 1 ", "enable = no ", "`no` is not a value", "write `false`"),
     ("per_turn = 5.0 ", "# per_turn ", "`unit` is mm, but nothing says how many", "add `per_turn = 5.0`"),

@@ -30,8 +30,13 @@ pub enum SelectError {
         available: String,
     },
     /// No PDO of the device carries the objects of the mode.
-    #[error("{device} offers no mode {mode}; the ESI offers {offered}")]
+    #[error(
+        "{device} offers no mode {mode}{}; the ESI offers {offered}",
+        missing.map_or_else(String::new, |index| format!(": no PDO has 0x{index:04X}"))
+    )]
     ModeNotOffered {
+        /// The object that the mode needs and that no PDO carries.
+        missing: Option<u16>,
         /// The type name of the device.
         device: String,
         /// The mode.

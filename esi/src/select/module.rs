@@ -254,6 +254,7 @@ fn for_mode<'a>(
         Some(module) => Ok(Some(module)),
         None if all.iter().any(|module| mode_of(module).is_some()) => {
             Err(SelectError::ModeNotOffered {
+                missing: None,
                 device: device.name.clone(),
                 mode,
                 offered: describe(all),

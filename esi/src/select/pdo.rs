@@ -124,6 +124,7 @@ impl PdoSelector<'_> {
         };
         for pdo in &mut chosen {
             let sm = self.sm_of(pdo)?;
+            notes.extend(self.other_direction(pdo, sm));
             if pdo.excluded_sm.contains(&sm) {
                 return Err(SelectError::ExcludedSyncManager {
                     device: self.device.name.clone(),
@@ -303,6 +304,9 @@ impl PdoSelector<'_> {
             return SelectError::NoControlword { device, mode };
         }
         SelectError::ModeNotOffered {
+            missing: needed
+                .into_iter()
+                .find(|index| !contains(available, *index)),
             device,
             mode,
             offered: offered_by_pdos(available),
@@ -450,6 +454,27 @@ impl PdoSelector<'_> {
             Direction::Rx => "pdo.rx",
             Direction::Tx => "pdo.tx",
         }
+    }
+
+    /// Reports a SyncManager that does not carry process data of this direction.
+    fn other_direction(&self, pdo: &Pdo, sm: u8) -> Option<String> {
+        let usage = self.device.sync_managers.get(usize::from(sm))?.usage;
+        let carries = match (self.direction, usage) {
+            (Direction::Rx, SmUse::Outputs)
+            | (Direction::Tx, SmUse::Inputs)
+            | (_, SmUse::Other) => {
+                return None;
+            }
+            (_, SmUse::Outputs) => "outputs",
+            (_, SmUse::Inputs) => "inputs",
+            (_, SmUse::MBoxOut | SmUse::MBoxIn) => "a mailbox",
+        };
+        Some(format!(
+            "warning: {} 0x{:04x} is assigned to SyncManager {sm}, which carries {carries}: the \
+             device exchanges nothing there; correct `Sm` in the ESI file",
+            direction_name(self.direction),
+            pdo.index
+        ))
     }
 
     fn sm_of(&self, pdo: &Pdo) -> Result<u8, SelectError> {

@@ -190,6 +190,7 @@ impl Selector<'_> {
         if let Some(mode) = self.choice.mode {
             let (command, feedback, _) =
                 mode_idns(mode).ok_or_else(|| SelectError::ModeNotOffered {
+                    missing: None,
                     device: self.device.name.clone(),
                     mode,
                     offered: "csp, csv and cst by S-0-0032".to_owned(),

@@ -357,7 +357,7 @@ fn absent(config: &DeviceConfig, index: u16) -> BusDevice {
     let info = &config.device.info;
     let at = DeviceRef {
         name: config.name.clone(),
-        position: u16::MAX,
+        position: DeviceRef::ABSENT,
         station: FIRST_ABSENT + index,
     };
     let coe = mailbox::expected(config, &at);

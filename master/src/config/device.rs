@@ -19,6 +19,7 @@ use crate::rt::config::ProcessDataCopy;
 
 mod axes;
 mod esi_files;
+mod findings;
 mod watchdog;
 
 pub(crate) use axes::CheckedAxis;
@@ -67,6 +68,8 @@ pub(crate) fn check(
         let damage = image.iter().filter_map(|image| image.sii.damage.first());
         let damage = damage.map(|damage| format!("the EEPROM image is damaged: {damage}"));
         chosen.notes.extend(damage);
+        let sii = image.as_ref().map(|image| &image.sii);
+        chosen.notes.extend(sii.and_then(findings::checksum));
         chosen
             .notes
             .extend(mailbox_note(device, image.as_deref(), mailbox));
@@ -76,10 +79,14 @@ pub(crate) fn check(
         if let Some((cycle_ns, _)) = &files.cycle {
             chosen.notes.extend(fixed_sync0(chosen, *cycle_ns));
         }
+        chosen.notes.extend(findings::long_shift(chosen));
         further_axes(chosen);
         repeated_outputs(chosen);
         profile_objects(&raw, chosen, p);
         reported_position(&raw, chosen, p);
+    }
+    if let Some(device) = device {
+        findings::mailbox(&raw, device, mailbox, p);
     }
     if let (Some(chosen), Some((cycle_ns, _))) = (chosen.as_ref(), &files.cycle) {
         let setups = axes.iter().filter_map(|axis| axis.setup.as_ref());

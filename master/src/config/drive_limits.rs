@@ -384,5 +384,24 @@ pub(super) fn check(
         }
     }
     notes.extend(whole_range(axis, drive));
+    for index in MAX_TORQUES {
+        let is_zero = |bytes: &Vec<u8>| number(bytes, false) == 0;
+        // The outputs have a value of their own.
+        let is_output = selection.layout.rx_field(index, 0).is_some();
+        if is_output || !drive(index, 0).as_ref().is_some_and(is_zero) {
+            continue;
+        }
+        let object = NamedObject { index, sub: 0 };
+        let message = format!("{object} = 0 leaves the drive without torque: it cannot move");
+        match sdos.iter().rev().find(|s| s.address() == (index, 0)) {
+            Some(own) => {
+                let hint = "write the largest torque in 0.1 % of the rated torque, such as 1000";
+                p.add_hint(own.value.span(), message, hint);
+            }
+            None => notes.push(format!(
+                "{message}; the ESI says so: if the drive does not hold another value, write it with `sdo`"
+            )),
+        }
+    }
     notes
 }

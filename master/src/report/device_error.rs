@@ -20,13 +20,18 @@ pub struct DeviceRef {
     pub station: u16,
 }
 
+impl DeviceRef {
+    /// The position of an optional device that is absent.
+    pub(crate) const ABSENT: u16 = u16::MAX;
+}
+
 impl fmt::Display for DeviceRef {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
-            "`{}` (position {}, station 0x{:04x})",
-            self.name, self.position, self.station
-        )
+        let (name, station) = (&self.name, self.station);
+        match self.position {
+            Self::ABSENT => write!(f, "`{name}` (absent, station 0x{station:04x})"),
+            position => write!(f, "`{name}` (position {position}, station 0x{station:04x})"),
+        }
     }
 }
 
@@ -102,4 +107,22 @@ pub enum EepromError {
     Smaller { bytes: usize },
     #[error("word 0x{word:04x}: 0x{wanted:04x} was written, 0x{found:04x} is there")]
     NotKept { word: u32, wanted: u16, found: u16 },
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An absent device was "at position 65535".
+    #[test]
+    fn absent_device_has_no_position() {
+        let device = |position| DeviceRef {
+            name: "x".into(),
+            position,
+            station: 0x2001,
+        };
+        let text = device(DeviceRef::ABSENT).to_string();
+        assert_eq!(text, "`x` (absent, station 0x2001)");
+        assert_eq!(device(3).to_string(), "`x` (position 3, station 0x2001)");
+    }
 }

@@ -1,0 +1,65 @@
+//! What a bus or a device would refuse, found before the run.
+
+use ecaxis_esi as esi;
+
+use super::{KeyExt, MailboxSource, Problems, RawDevice, show};
+
+/// The shortest mailbox for one SDO: mailbox header, CoE header, SDO header and data.
+const MIN_MAILBOX: u16 = 16;
+
+/// Reports a mailbox of the ESI that cannot carry a message.
+pub(super) fn mailbox(
+    raw: &RawDevice,
+    device: &esi::Device,
+    source: MailboxSource,
+    p: &mut Problems<'_>,
+) {
+    use esi::SmUse::{MBoxIn, MBoxOut};
+    if device.mailbox.is_none() || source == MailboxSource::Eeprom {
+        return;
+    }
+    let mut managers = (0..).zip(&device.sync_managers);
+    let short = managers.find(|(_, sm): &(u8, _)| {
+        matches!(sm.usage, MBoxOut | MBoxIn) && sm.default_size < MIN_MAILBOX
+    });
+    if let Some((number, sm)) = short {
+        let message = format!(
+            "the mailbox of {} (SyncManager {number}) has {} bytes, an SDO needs {MIN_MAILBOX}",
+            device.name, sm.default_size
+        );
+        let hint = match raw.sii.place() {
+            Some(_) => "use an image of the device with the sizes of its mailboxes",
+            None => {
+                "`mailbox = \"eeprom\"` uses the mailboxes of the device; or correct `DefaultSize` in the ESI file"
+            }
+        };
+        let at = raw.esi.place().or(raw.sii.place());
+        p.add_hint(at.unwrap_or(raw.span.clone()), message, hint);
+    }
+}
+
+/// Reports a shift of SYNC0 that exceeds its cycle.
+pub(super) fn long_shift(selection: &esi::Selection) -> Option<String> {
+    let dc = selection.dc.as_ref().filter(|dc| dc.activates_sync())?;
+    let (shift, cycle) = (dc.sync0_shift_ns, dc.sync0_cycle_ns);
+    (cycle > 0 && shift.unsigned_abs() >= cycle).then(|| {
+        format!(
+            "warning: the OpMode \"{}\" ({}) shifts SYNC0 by {}{}, and its cycle is {}: the OpMode is meant for a longer \
+             cycle; raise `cycle`, or choose another `dc`",
+            dc.name,
+            dc.position.origin(),
+            if shift < 0 { "-" } else { "" },
+            show(u64::from(shift.unsigned_abs())),
+            show(u64::from(cycle)),
+        )
+    })
+}
+
+/// Reports an EEPROM image that a SubDevice controller ignores.
+pub(super) fn checksum(sii: &esi::sii::Sii) -> Option<String> {
+    (!sii.checksum_ok).then(|| {
+        "warning: the checksum of the EEPROM image is wrong, so a controller ignores its \
+         configuration area; `ecaxis esi sii` generates an image from an ESI file"
+            .to_owned()
+    })
+}
