@@ -6,7 +6,8 @@ use ecaxis_esi::{FmmuUse, ObjectCode, SmUse, Writable, parse};
 #[test]
 fn every_vendor_file_parses() {
     let files = common::files("esi", &["xml"]);
-    for path in &files {
+    let others = common::vendor_files("esi", &["xml"]);
+    for path in files.iter().chain(&others) {
         let bytes = std::fs::read(path).unwrap();
         let file = parse(&bytes).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
         assert!(!file.devices.is_empty(), "{}", path.display());

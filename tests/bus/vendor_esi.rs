@@ -1,6 +1,6 @@
 //! Every device of the vendors' ESI files, alone on the simulated bus, in each mode, module,
 //! assignment and OpMode that its file offers. It reaches Op, and an axis moves; or it is refused
-//! with a message that names the reason. [`REFUSED`] lists every refusal.
+//! with a message that names the reason. [`REFUSED`] and [`REFUSED_OF_PROJECTS`] list every refusal.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -12,11 +12,36 @@ use ecaxis_master::config;
 use ecaxis_master::session::run_on;
 use ecaxis_sim::Segment;
 use ecaxis_test_support::wire::{WatchedBus, Watcher};
-use ecaxis_test_support::{Heard, fixture, virtual_time};
+use ecaxis_test_support::{Heard, fixture, vendor_file, virtual_time};
 
-/// The refusals: the start of the file's name, a part of the case, a part of the message, and their
-/// number among all cases.
-const REFUSED: &[(&str, &str, &str, usize)] = &[
+/// A refusal: the start of the file's name, a part of the case, a part of the message, and the number
+/// among all cases.
+type Refusal = (&'static str, &'static str, &'static str, usize);
+
+/// The refusals of open projects' files. Simulated device and ecaxis are right in each: the file
+/// contradicts itself, or describes no process data.
+const REFUSED_OF_PROJECTS: &[Refusal] = &[
+    // Its TxPdo is on SyncManager 2, which is the one of the outputs.
+    ("BogusIO", " default", "0x001e", 1),
+    // The SYNC0 shift is 2.0002 s; no SYNC0 comes before Op.
+    ("Orbita2d", " OpMode 2", "0x002c", 1),
+    // No PDO has `Sm`, and CoE has neither PdoAssign nor PdoConfig: there is no process data.
+    (
+        "BogusServo",
+        "",
+        "does not let its PDO assignment be changed",
+        14,
+    ),
+    (
+        "BogusServo",
+        " own PDOs",
+        "does not let its PDOs be configured",
+        6,
+    ),
+];
+
+/// The refusals of vendors' files.
+const REFUSED: &[Refusal] = &[
     // A Sercos drive has IDNs.
     (
         "Beckhoff AX5xxx",
@@ -156,7 +181,8 @@ fn choices(device: &Device) -> Vec<(String, String)> {
     choices
 }
 
-fn cases_of(path: &Path) -> Vec<Case> {
+/// Returns the cases of a file. With `alone`, drives are devices without an axis, too.
+fn cases_of(path: &Path, alone: bool) -> Vec<Case> {
     let file = std::fs::read(path).expect("readable");
     let file = ecaxis_esi::parse(&file).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
     let (mut drives, mut others) = (Vec::new(), Vec::new());
@@ -201,7 +227,7 @@ fn cases_of(path: &Path) -> Vec<Case> {
             for mode in &modes {
                 drives.push(case(&choice, &keys, Some(*mode)));
             }
-            if modes.is_empty() {
+            if modes.is_empty() || alone {
                 others.push(case(&choice, &keys, None));
             }
         }
@@ -305,20 +331,30 @@ fn run(case: &Case) -> Result<Result<(), String>, String> {
         .ok_or(format!("moved {turned:.3} turns")))
 }
 
-/// The vendors' ESI files say what the devices offer (ETG.2000), and the simulated drive turns its
-/// shaft.
-#[test]
-fn every_vendor_device_reaches_op_or_is_refused_with_its_reason() {
-    let Some(folder) = fixture("esi") else {
-        return;
-    };
+/// The results of all cases of one folder.
+#[derive(Default)]
+struct Tally {
+    cases: usize,
+    /// Cases whose axis moved.
+    moved: usize,
+    /// Devices without an axis in Op.
+    done: usize,
+    /// The number of refusals by row of the table.
+    refused: Vec<usize>,
+    /// Results that the table does not have.
+    wrong: Vec<String>,
+}
+
+/// Runs every case of the ESI files in the folders of vendors.
+fn sweep(folder: &Path, alone: bool, refusals: &[Refusal]) -> Tally {
     let mut files = Vec::new();
     for vendor in std::fs::read_dir(folder).expect("a folder").flatten() {
         let inside = std::fs::read_dir(vendor.path()).expect("a folder");
         files.extend(inside.flatten().map(|entry| entry.path()));
     }
     files.sort();
-    let cases: Vec<Case> = files.iter().flat_map(|file| cases_of(file)).collect();
+    let cases = files.iter().flat_map(|file| cases_of(file, alone));
+    let cases: Vec<Case> = cases.collect();
     let next = AtomicUsize::new(0);
     let results = Mutex::new(Vec::new());
     let workers = std::thread::available_parallelism().map_or(2, usize::from);
@@ -334,33 +370,66 @@ fn every_vendor_device_reaches_op_or_is_refused_with_its_reason() {
     });
     let mut results = results.into_inner().expect("no panic");
     results.sort_by_key(|(case, ..)| (&case.file, &case.name));
-    let (mut done, mut moved) = (0, 0);
-    let mut refused = vec![0; REFUSED.len()];
-    let mut wrong = Vec::new();
+    let mut tally = Tally {
+        cases: results.len(),
+        refused: vec![0; refusals.len()],
+        ..Tally::default()
+    };
     for (case, result) in &results {
         let file = case.file.file_name().unwrap_or_default().to_string_lossy();
         match result {
-            Ok(Ok(())) if case.drive.is_some() => moved += 1,
-            Ok(Ok(())) => done += 1,
-            Ok(Err(text)) => wrong.push(format!("{file} {}: {text}", case.name)),
+            Ok(Ok(())) if case.drive.is_some() => tally.moved += 1,
+            Ok(Ok(())) => tally.done += 1,
+            Ok(Err(text)) => tally.wrong.push(format!("{file} {}: {text}", case.name)),
             Err(text) => {
-                let known = |(start, part, reason, _): &(&str, &str, &str, usize)| {
+                let known = |(start, part, reason, _): &Refusal| {
                     file.starts_with(start) && case.name.contains(part) && text.contains(reason)
                 };
-                match REFUSED.iter().position(known) {
-                    Some(row) => refused[row] += 1,
-                    None => wrong.push(format!("{file} {}: {text}", case.name)),
+                match refusals.iter().position(known) {
+                    Some(row) => tally.refused[row] += 1,
+                    None => tally.wrong.push(format!("{file} {}: {text}", case.name)),
                 }
             }
         }
     }
     println!(
-        "{} cases: {moved} axes moved, {done} devices in Op, {} refused",
-        results.len(),
-        refused.iter().sum::<usize>()
+        "{} cases: {} axes moved, {} devices in Op, {} refused",
+        tally.cases,
+        tally.moved,
+        tally.done,
+        tally.refused.iter().sum::<usize>()
     );
-    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
-    let expected: Vec<usize> = REFUSED.iter().map(|row| row.3).collect();
-    assert_eq!(refused, expected);
-    assert_eq!((moved, done), (2212, 638));
+    tally
+}
+
+impl Tally {
+    /// Checks that the table has every refusal.
+    fn check(&self, refusals: &[Refusal]) {
+        assert!(self.wrong.is_empty(), "{}", self.wrong.join("\n"));
+        let expected: Vec<usize> = refusals.iter().map(|row| row.3).collect();
+        assert_eq!(self.refused, expected);
+    }
+}
+
+/// The vendors' ESI files say what the devices offer (ETG.2000), and the simulated drive turns its
+/// shaft.
+#[test]
+fn every_vendor_device_reaches_op_or_is_refused_with_its_reason() {
+    let Some(folder) = fixture("esi") else {
+        return;
+    };
+    let tally = sweep(&folder, false, REFUSED);
+    tally.check(REFUSED);
+    assert_eq!((tally.moved, tally.done), (2212, 638));
+}
+
+/// The same for files of open projects. Each device is also without an axis on the bus.
+#[test]
+fn every_device_of_a_project_reaches_op_or_is_refused_with_its_reason() {
+    let Some(folder) = vendor_file("esi") else {
+        return;
+    };
+    let tally = sweep(&folder, true, REFUSED_OF_PROJECTS);
+    tally.check(REFUSED_OF_PROJECTS);
+    assert_eq!((tally.moved, tally.done), (4, 83));
 }

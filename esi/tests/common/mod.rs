@@ -26,6 +26,17 @@ pub fn fixtures() -> Option<PathBuf> {
     None
 }
 
+/// Returns the files of open projects, which are in a folder next to the fixtures.
+pub fn vendor_files(folder: &str, extensions: &[&str]) -> Vec<PathBuf> {
+    let found = files(&format!("../vendor-files/{folder}"), extensions);
+    if fixtures().is_some() && found.is_empty() {
+        let on_ci = std::env::var_os("CI").is_some();
+        assert!(!on_ci, "no vendor-files/{folder} next to the fixtures");
+        println!("skipped: no vendor-files/{folder} next to the fixtures (set ECAXIS_FIXTURES)");
+    }
+    found
+}
+
 pub fn files(folder: &str, extensions: &[&str]) -> Vec<PathBuf> {
     let mut found = Vec::new();
     let mut folders: Vec<PathBuf> = fixtures()

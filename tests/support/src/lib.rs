@@ -60,6 +60,13 @@ pub fn fixture(path: &str) -> Option<PathBuf> {
     shared("ECAXIS_FIXTURES", "fixtures", path)
 }
 
+/// Returns a file or folder of open projects, next to the folder of [`fixture`], or skips the test.
+#[track_caller]
+pub fn vendor_file(path: &str) -> Option<PathBuf> {
+    let path = format!("../vendor-files/{path}");
+    shared("ECAXIS_FIXTURES", "fixtures", &path)
+}
+
 /// Returns a machine file or fault script of a review, or skips the test.
 #[track_caller]
 pub fn case(path: &str) -> Option<PathBuf> {
