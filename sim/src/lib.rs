@@ -35,6 +35,7 @@ mod random;
 pub mod serve;
 mod soe;
 
+pub use coe::MissingSubindices;
 pub use coe::startup::StartupWrite;
 pub use device::{DeviceOptions, MailboxOptions, SimDevice, SimError};
 pub use drive::{ElasticLoad, PitchError, PlantParams, Track};

@@ -64,6 +64,8 @@ pub enum QuirkPoint {
     Statusword,
     /// All inputs.
     Inputs,
+    /// The working counter of any device.
+    WorkingCounter,
     /// Mode of operation and its display.
     Mode,
     /// Target velocity and velocity actual value.
@@ -78,7 +80,7 @@ pub enum QuirkPoint {
     Unit,
     /// The shaft.
     Shaft,
-    /// Answers in the mailbox of any device.
+    /// The mailbox of any device.
     Mailbox,
     /// State changes of any device.
     State,
@@ -92,6 +94,7 @@ impl QuirkPoint {
             Self::Controlword => "0x6040",
             Self::Statusword => "0x6041",
             Self::Inputs => "all inputs",
+            Self::WorkingCounter => "working counter",
             Self::Mode => "0x6060, 0x6061",
             Self::Velocity => "0x60FF, 0x606C",
             Self::Position => "0x6064, 0x607A",
@@ -107,7 +110,7 @@ impl QuirkPoint {
     /// True if devices without a drive have such quirks, too.
     #[must_use]
     pub fn is_of_any_device(self) -> bool {
-        matches!(self, Self::Mailbox | Self::State)
+        matches!(self, Self::Mailbox | Self::State | Self::WorkingCounter)
     }
 }
 
@@ -293,6 +296,25 @@ quirks! {
     complete_access_refused: bool = Flag at Mailbox,
     /// An answer in the mailbox takes this much longer
     mailbox_slow: Option<Delay> = Time at Mailbox,
+    /// Requests stay in the mailbox without an answer for this time after the device has left Init
+    mailbox_late: Option<Delay> = Time at Mailbox,
+    /// An emergency of the device, 0xFF00, precedes each answer in the mailbox
+    unsolicited_emergencies: bool = Flag at Mailbox,
+    /// An SDO request of the device, the upload of 0x1000, precedes each answer in the mailbox
+    unsolicited_requests: bool = Flag at Mailbox,
+    /// The last subindex that subindex 0 counts does not exist, except in PDOs, their assignment and
+    /// module lists
+    last_subindex_missing: bool = Flag at Mailbox,
+    /// 0x1C10 to 0x1C1F have no subindex except 0
+    assignment_subindices_missing: bool = Flag at Mailbox,
+    /// The first data packet of a file write is refused with FoE error 0x8003 (disk full)
+    foe_disk_full: bool = Flag at Mailbox,
+    /// A request to read or write a file is refused with FoE error 0x8004 (illegal)
+    foe_illegal: bool = Flag at Mailbox,
+    /// The first data packet of a file write is answered with busy for this time
+    foe_busy: Option<Delay> = Time at Mailbox,
+    /// The device never fills its inputs; the working counter has no share of them
+    inputs_unfilled: bool = Flag at WorkingCounter,
     /// A ControlByte that is not exactly that of the ESI leads to a refusal of SafeOp with 0x001D or
     /// 0x001E
     exact_control_byte: bool = Flag at State,

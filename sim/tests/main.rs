@@ -32,6 +32,7 @@ mod modules;
 mod motion;
 mod network;
 mod network_properties;
+mod quirks;
 mod registers;
 mod sdo_info;
 mod selection;

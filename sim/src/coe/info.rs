@@ -154,7 +154,7 @@ fn record_type(index: u16) -> u16 {
 
 fn entry(dictionary: &Dictionary<'_>, index: u16, sub: u8, asked: u8) -> Result<Vec<u8>, Abort> {
     let store = &*dictionary.store;
-    let found = store.slot(index, sub);
+    let found = dictionary.slot(index, sub);
     let Some((slot, item)) = found.and_then(|slot| Some((slot, store.item(slot)?))) else {
         return Err(match store.has_object(index) {
             true => Abort::NO_SUBINDEX,

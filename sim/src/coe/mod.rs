@@ -25,6 +25,7 @@ pub mod startup;
 mod word;
 
 pub use abort::Abort;
+pub use objects::MissingSubindices;
 pub(crate) use objects::{Dictionary, ParameterCommand, read_item};
 
 use crate::device::mailbox::{Answer, Detail, MailboxCapacity};
@@ -86,6 +87,13 @@ impl CoeServer {
     pub(crate) fn expire(&mut self) -> Option<Vec<u8>> {
         self.sdo.expire()
     }
+}
+
+/// Returns a request of the device: the upload of 0x1000.
+pub(crate) fn own_request() -> Vec<u8> {
+    let mut message = header(service::SDO_REQUEST).to_vec();
+    message.extend_from_slice(&[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]);
+    message
 }
 
 pub(crate) fn emergency(code: u16, register: u8, data: [u8; 5]) -> Vec<u8> {

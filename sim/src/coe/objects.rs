@@ -13,6 +13,8 @@ use crate::firmware::BootLoader;
 const STORE_PARAMETERS: u16 = 0x1010;
 const RESTORE_PARAMETERS: u16 = 0x1011;
 
+const ASSIGNMENTS: std::ops::RangeInclusive<u16> = 0x1c10..=0x1c1f;
+
 /// The index range of enumeration objects, which have a variable length.
 const ENUMERATIONS: std::ops::Range<u16> = 0x0800..0x1000;
 
@@ -21,6 +23,15 @@ const ENUMERATIONS: std::ops::Range<u16> = 0x0800..0x1000;
 pub(crate) enum ParameterCommand {
     Store,
     Restore,
+}
+
+/// Subindices that the dictionary counts and the device does not have.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct MissingSubindices {
+    /// The last one of each object, except PDOs, their assignment and module lists.
+    pub last: bool,
+    /// All of 0x1C10 to 0x1C1F.
+    pub assignment: bool,
 }
 
 /// The data that an SDO request works on.
@@ -38,6 +49,8 @@ pub(crate) struct Dictionary<'a> {
     pub(crate) forced: &'a [(u16, u8, u32)],
     /// Writes that are confirmed and change nothing: index, subindex.
     pub(crate) ignored: &'a [(u16, u8)],
+    /// Subindices that the store has and clients do not find.
+    pub(crate) missing: MissingSubindices,
     pub(crate) command: Option<ParameterCommand>,
     /// The processor, which serves the objects of its program itself.
     pub(crate) processor: Option<&'a mut BootLoader>,
@@ -54,9 +67,23 @@ impl Dictionary<'_> {
         abort.map_or(Ok(()), |(.., code)| Err(Abort(*code)))
     }
 
+    /// True if clients do not find this subindex, although the dictionary has it.
+    fn is_missing(&self, index: u16, sub: u8) -> bool {
+        let is_assignment = ASSIGNMENTS.contains(&index);
+        let is_last =
+            !is_assignment && !self.pdo.is_list(index) && sub == self.store.highest_sub(index);
+        sub > 0 && (self.missing.assignment && is_assignment || self.missing.last && is_last)
+    }
+
+    /// Returns the entry of a subindex that clients find.
+    pub(super) fn slot(&self, index: u16, sub: u8) -> Option<EntryHandle> {
+        let slot = self.store.slot(index, sub);
+        slot.filter(|_| !self.is_missing(index, sub))
+    }
+
     fn find(&self, index: u16, sub: u8) -> Result<(EntryHandle, &Item), Abort> {
         self.check_forced(index, sub)?;
-        let slot = self.store.slot(index, sub);
+        let slot = self.slot(index, sub);
         slot.and_then(|slot| Some((slot, self.store.item(slot)?)))
             .ok_or(if self.store.has_object(index) {
                 Abort::NO_SUBINDEX
@@ -116,6 +143,7 @@ impl Dictionary<'_> {
             .object(index)
             .filter_map(|slot| Some((slot, self.store.item(slot)?)))
             .filter(move |(_, item)| item.sub >= first && !(list && i64::from(item.sub) > count))
+            .filter(move |(_, item)| !self.is_missing(index, item.sub))
             .map(move |(slot, item)| (slot, item, (item.bit_offset as usize).saturating_sub(start)))
     }
 

@@ -337,6 +337,9 @@ impl SimDevice {
             && let Some(mailbox) = &mut self.mailbox
         {
             mailbox.reset();
+            if let Some(time) = self.quirks.mailbox_late {
+                mailbox.be_silent_until(self.local.saturating_add(time.0));
+            }
             if let Some(sercos) = &mut self.sercos {
                 sercos.reset();
             }

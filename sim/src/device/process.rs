@@ -110,7 +110,8 @@ impl SimDevice {
     }
 
     pub(super) fn latch_inputs(&mut self) {
-        if self.al.state < AlState::SafeOp && !self.esc.emulates_device() {
+        let is_early = self.al.state < AlState::SafeOp && !self.esc.emulates_device();
+        if is_early || self.quirks.inputs_unfilled {
             return;
         }
         self.show();

@@ -28,6 +28,12 @@ pub struct FoeOptions {
     pub read_only: Vec<String>,
     /// Every n-th data packet of a write is first answered with BUSY, like during erasing; 0: none.
     pub busy_every: u32,
+    /// The time in ns in which the first data packet of a write is answered with BUSY.
+    pub busy_ns: u64,
+    /// The first data packet of a write is refused as if the medium was full.
+    pub is_full: bool,
+    /// Requests to read or write are refused as illegal.
+    pub is_illegal: bool,
 }
 
 impl Default for FoeOptions {
@@ -38,6 +44,9 @@ impl Default for FoeOptions {
             bootstrap_only: Vec::new(),
             read_only: Vec::new(),
             busy_every: 0,
+            busy_ns: 0,
+            is_full: false,
+            is_illegal: false,
         }
     }
 }

@@ -31,8 +31,8 @@ enum Transfer {
         data: Vec<u8>,
         /// The number of the next packet.
         packet: u32,
-        /// True if the packet was already answered with BUSY.
-        was_busy: bool,
+        /// The local time of the first BUSY answer to the packet.
+        busy_since: Option<Nanos>,
     },
 }
 
@@ -202,7 +202,7 @@ impl FoeServer {
             name,
             data: Vec::new(),
             packet: 1,
-            was_busy: false,
+            busy_since: None,
         });
         Ok(Some(message(opcode::ACK, 0)))
     }
@@ -219,7 +219,7 @@ impl FoeServer {
             name,
             mut data,
             packet,
-            was_busy,
+            busy_since,
         } = transfer
         else {
             return Err(FoeError::Illegal);
@@ -227,23 +227,27 @@ impl FoeServer {
         if number != packet {
             return Err(FoeError::PacketNumber);
         }
-        if !files.has_room(&name, data.len() + bytes.len(), request.options) {
+        let (options, now) = (request.options, request.now);
+        if options.is_full || !files.has_room(&name, data.len() + bytes.len(), options) {
             return Err(FoeError::DiskFull);
         }
         let is_last = bytes.len() < request.room.receive - HEADER;
-        let every = request.options.busy_every;
+        let every = options.busy_every;
+        let is_selected = every > 0 && packet.is_multiple_of(every) && busy_since.is_none();
+        let busy_since = busy_since.unwrap_or(now);
+        let is_erasing = packet == 1 && now - busy_since < options.busy_ns;
         let busy = match files {
             // The reported progress is 50 of 100.
-            _ if every > 0 && packet.is_multiple_of(every) && !was_busy => Some((50, 100)),
+            _ if is_selected || is_erasing => Some((50, 100)),
             Target::Files(_) => None,
-            Target::Program(flash) => flash.take(&data, bytes, is_last, request.now)?,
+            Target::Program(flash) => flash.take(&data, bytes, is_last, now)?,
         };
         if let Some((done, entire)) = busy {
             self.transfer = Some(Transfer::Write {
                 name,
                 data,
                 packet,
-                was_busy: true,
+                busy_since: Some(busy_since),
             });
             let progress = u32::from(entire) << 16 | u32::from(done);
             return Ok(Some(message(opcode::BUSY, progress)));
@@ -256,7 +260,7 @@ impl FoeServer {
                 name,
                 data,
                 packet: packet.wrapping_add(1),
-                was_busy: false,
+                busy_since: None,
             });
         }
         Ok(Some(message(opcode::ACK, packet)))
@@ -267,6 +271,9 @@ impl FoeServer {
 /// invalid UTF-8 is replaced.
 fn allowed(request: FoeRequest<'_>, password: u32, name: &[u8]) -> Result<String, FoeError> {
     let options = request.options;
+    if options.is_illegal {
+        return Err(FoeError::Illegal);
+    }
     if options.password != 0 && password != options.password {
         return Err(FoeError::NoRights);
     }

@@ -25,6 +25,8 @@ use crate::foe::{FoeRequest, FoeServer, Target};
 /// The time in ns from the arrival of a request until the device fetches it.
 const FETCH_NS: u64 = 100_000;
 const HEADER: usize = 6;
+/// The error code of emergencies that precede an answer: specific to the device (CiA 301).
+const OWN_EMERGENCY: u16 = 0xff00;
 
 /// Mailbox types (ETG.1000.4 table 29).
 mod protocol {
@@ -78,6 +80,8 @@ pub(super) struct Mailbox {
     fetch_due: u64,
     answer_due: u64,
     transfer_due: u64,
+    /// The local time before which the device fetches no request.
+    silent_until: u64,
     /// The request in progress.
     request: Vec<u8>,
     coe: CoeServer,
@@ -95,6 +99,7 @@ impl Mailbox {
             fetch_due: u64::MAX,
             answer_due: u64::MAX,
             transfer_due: u64::MAX,
+            silent_until: 0,
             request: Vec::new(),
             coe: CoeServer::default(),
             foe: FoeServer::default(),
@@ -109,6 +114,11 @@ impl Mailbox {
             eoe,
             ..Self::new(self.receive, self.send)
         };
+    }
+
+    /// Lets requests wait until this local time.
+    pub(super) fn be_silent_until(&mut self, local: u64) {
+        self.silent_until = local;
     }
 
     /// Postpones all work to this local time or later.
@@ -184,7 +194,8 @@ impl SimDevice {
             && !mailbox.is_working()
             && mailbox.queue.takes_requests()
         {
-            mailbox.fetch_due = local.saturating_add(FETCH_NS);
+            let fetch = local.saturating_add(FETCH_NS);
+            mailbox.fetch_due = fetch.max(mailbox.silent_until);
         }
     }
 
@@ -322,6 +333,9 @@ impl SimDevice {
         if self.obey_program_control() {
             return;
         }
+        if !matches!(answer, Answer::None) {
+            self.send_unsolicited();
+        }
         let Some(mailbox) = &mut self.mailbox else {
             return;
         };
@@ -330,6 +344,25 @@ impl SimDevice {
             Answer::One(message) => mailbox.queue.push(protocol, &message, Class::Answer),
             Answer::Parts(parts) => mailbox.queue.push_parts(protocol, &parts),
             Answer::Error(detail) => mailbox.queue.error(detail),
+        }
+    }
+
+    /// Queues what the device sends before an answer. Only the application sends, not a boot loader.
+    fn send_unsolicited(&mut self) {
+        let options = &self.mailbox_options;
+        let Some(mailbox) = &mut self.mailbox else {
+            return;
+        };
+        if !self.has_coe || self.al.state == AlState::Boot {
+            return;
+        }
+        let queue = &mut mailbox.queue;
+        if options.sends_emergencies {
+            let message = coe::emergency(OWN_EMERGENCY, 1, [0; 5]);
+            queue.push(protocol::COE, &message, Class::Emergency);
+        }
+        if options.sends_requests {
+            queue.push(protocol::COE, &coe::own_request(), Class::Notice);
         }
     }
 
@@ -361,6 +394,7 @@ impl SimDevice {
                     refuse_mapped: options.refuse_mapped,
                     forced: &self.forced_aborts,
                     ignored: &self.ignored_writes,
+                    missing: options.missing,
                     command: None,
                     processor: self.processor.as_mut(),
                 };

@@ -1,5 +1,6 @@
 //! Mailbox properties of a device that an ESI does not contain.
 
+use crate::coe::MissingSubindices;
 use crate::foe::FoeOptions;
 use crate::quirks::Quirks;
 
@@ -14,6 +15,12 @@ pub struct MailboxOptions {
     pub complete_access: Option<bool>,
     /// Aborts have the index without its low byte.
     pub abort_index_word: bool,
+    /// An SDO request of the device precedes each answer.
+    pub sends_requests: bool,
+    /// An emergency of the device precedes each answer.
+    pub sends_emergencies: bool,
+    /// Subindices that the dictionary counts and the device does not have.
+    pub missing: MissingSubindices,
     /// Support of segmented transfers. Without it, objects longer than a mailbox are rejected
     /// (abort 0x06010005). Most ESI files do not mention existing support.
     pub segmented: bool,
@@ -40,6 +47,15 @@ impl MailboxOptions {
             self.processing_ns += delay.0;
         }
         self.abort_index_word |= quirks.abort_index_word;
+        self.sends_requests |= quirks.unsolicited_requests;
+        self.sends_emergencies |= quirks.unsolicited_emergencies;
+        self.missing.last |= quirks.last_subindex_missing;
+        self.missing.assignment |= quirks.assignment_subindices_missing;
+        self.foe.is_full |= quirks.foe_disk_full;
+        self.foe.is_illegal |= quirks.foe_illegal;
+        if let Some(time) = quirks.foe_busy {
+            self.foe.busy_ns = time.0;
+        }
         self
     }
 }
@@ -51,6 +67,9 @@ impl Default for MailboxOptions {
             sdo_info: None,
             complete_access: None,
             abort_index_word: false,
+            sends_requests: false,
+            sends_emergencies: false,
+            missing: MissingSubindices::default(),
             segmented: true,
             sdo_buffer: 64 << 10,
             sdo_timeout_ns: None,
