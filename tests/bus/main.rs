@@ -17,6 +17,7 @@ mod copy;
 mod cycles;
 mod damaged_eeprom;
 mod demo;
+mod device_quirks;
 mod eeproms;
 mod eoe;
 mod flow;

@@ -2,6 +2,7 @@
 //! After each interruption, the same command succeeds.
 
 mod cli;
+mod quirks;
 mod refusals;
 
 use std::sync::Arc;

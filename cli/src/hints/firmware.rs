@@ -96,6 +96,9 @@ fn foe(error: &FoeError) -> Option<&'static str> {
                 "the device wants a password or another name: `--password`, `--name`"
             }
             0x8003 => "the file is larger than the device's program memory",
+            0x8004 => {
+                "the device takes no file this way: try `--via program`, or ask its vendor for another"
+            }
             0x800b | 0x8011 => {
                 "the device could not write its program memory: try again, then ask its vendor"
             }

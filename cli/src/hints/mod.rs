@@ -165,6 +165,9 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         Cause::NoProcessData { .. } => {
             "`ecaxis explain` shows the expected layout; a device without an FMMU left answers no process data".to_owned()
         }
+        Cause::NoInputs { .. } => {
+            "switch the device off and on; if it happens again, ask its vendor when its firmware fills the inputs".to_owned()
+        }
         Cause::PhaseNotLocked { .. } => {
             "wake-ups are too irregular: run with real-time priority (`ecaxis run` warns if it has none), or a longer `cycle`".to_owned()
         }

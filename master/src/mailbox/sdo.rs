@@ -134,7 +134,7 @@ impl CoeClient {
     }
 
     /// Reads subindices 1 to n of an array with n in subindex 0; `None` if the device has no such
-    /// object.
+    /// object, or counts a subindex that it refuses.
     pub async fn upload_list<W: MailboxTransport>(
         &mut self,
         w: &W,
@@ -148,7 +148,7 @@ impl CoeClient {
         for sub in 1..=count {
             match self.upload_integer(w, index, sub).await? {
                 Some(value) => list.push(value),
-                None => break,
+                None => return Ok(None),
             }
         }
         Ok(Some(list))

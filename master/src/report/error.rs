@@ -280,6 +280,12 @@ pub enum Cause {
     MailboxMoved { expected: String, actual: String },
     #[error("no process data comes back in SafeOp: {}", al_note(*al_status))]
     NoProcessData { al_status: Option<(u8, u16)> },
+    /// A buffered SyncManager without data does not answer reads, and the working counter is lower.
+    #[error(
+        "going to Op: does not fill its inputs: SyncManager {sm} (0x{start:04x}, {len} bytes) has no \
+         data, so the working counter is too low"
+    )]
+    NoInputs { sm: u8, start: u16, len: u16 },
     #[error("the release of frames does not lock to SYNC0: phase error {error_ns} ns")]
     PhaseNotLocked { error_ns: i64 },
     #[error(transparent)]
@@ -595,6 +601,7 @@ impl Error {
             *self.cause,
             Cause::State(_)
                 | Cause::NoProcessData { .. }
+                | Cause::NoInputs { .. }
                 | Cause::PhaseNotLocked { .. }
                 | Cause::ClockNotSettled { .. }
         )

@@ -25,7 +25,7 @@ use crate::datagram::{CyclicMailboxTransport, DatagramClient};
 use crate::eoe::Ethernet;
 use crate::link::sim::SimInputSender;
 use crate::mailbox::worker::{MailboxWorker, run_with_workers};
-use crate::mailbox::{DatagramError, Mailboxes};
+use crate::mailbox::{DatagramError, MailboxTransport, Mailboxes};
 use crate::mailbox_gateway::LivePublisher;
 use crate::post_mortem::Witnessed;
 use crate::report::events::{clock_off, common_time_jumped, reference_replaced};
@@ -369,13 +369,37 @@ impl Supervisor {
                     (Some(phase), None) if inputs_fresh => Cause::PhaseNotLocked {
                         error_ns: phase.error_ns,
                     },
-                    _ => Cause::NoProcessData {
-                        al_status: snapshot.al_status,
+                    _ => match self.unfilled_inputs().await {
+                        Some(error) => return Err(error),
+                        None => Cause::NoProcessData {
+                            al_status: snapshot.al_status,
+                        },
                     },
                 };
                 return Err(cause.into());
             }
         }
+    }
+
+    /// Returns the error of the first device with inputs that do not answer a read.
+    async fn unfilled_inputs(&self) -> Option<Error> {
+        let devices = self.machine.devices.iter().zip(&self.bus.devices);
+        for (config, device) in devices.filter(|(_, device)| device.present) {
+            let inputs = config.selection.layout.inputs.iter();
+            for sm in inputs.filter(|sm| !config.device.op_only(sm).sync_manager) {
+                let mut area = vec![0; sm.len.into()];
+                let (station, start) = (device.at.station, sm.start_address);
+                if let Ok(0) = self.wire.read(station, start, &mut area).await {
+                    let cause = Cause::NoInputs {
+                        sm: sm.sm,
+                        start,
+                        len: sm.len,
+                    };
+                    return Some(cause.with_device(&device.at));
+                }
+            }
+        }
+        None
     }
 
     /// True if the process data of all groups is fresh, except those with an absent device.
