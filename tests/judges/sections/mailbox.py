@@ -111,14 +111,20 @@ def files(bench, slave, how):
 
 def file_errors(bench):
     """pysoem does not return FoE errors; the recording contains them."""
-    exchanges, _ = pcapng.exchanges(bench.folder / "mailbox.pcapng")
+    codes = error_codes(bench.folder / "mailbox.pcapng")
+    bench.report.equal("its FoE error code", codes, {NOT_FOUND}, lambda c: ", ".join(map(hex, c)))
+
+
+def error_codes(recording):
+    """Returns the FoE error codes in the answers of devices."""
+    exchanges, _ = pcapng.exchanges(recording)
     codes = set()
     for exchange in exchanges:
         for answer in exchange.answer or []:
             data = answer.data
             if answer.wkc == 1 and len(data) >= 12 and data[5] & 0x0F == FOE and data[6] == FOE_ERROR:
                 codes.add(struct.unpack_from("<I", data, 8)[0])
-    bench.report.equal("its FoE error code", codes, {NOT_FOUND}, lambda c: ", ".join(map(hex, c)))
+    return codes
 
 
 def bootstrap(bench, master, slave):
