@@ -268,6 +268,39 @@ fn oversampled_inputs_have_one_sample_or_those_of_an_op_mode() {
     }
 }
 
+/// ETG.2000: `OSFac` of a PDO is the number of samples unless an OpMode says otherwise. The objects have
+/// them at power-on, as further PDOs or a longer entry; the EEPROM (ETG.2010) has one.
+#[test]
+fn oversampled_pdo_has_its_own_samples_at_power_on() {
+    const S: u16 = 0x1001;
+    let assignable = "<Mailbox><CoE PdoAssign=\"1\"/></Mailbox>";
+    for (increment, assigned, bits) in [(16, &[0x1a00_u16, 0x1a01][..], 16), (0, &[0x1a00], 32)] {
+        let mut device = oversampler(assignable, increment);
+        device.tx_pdos[0].oversampling.as_mut().unwrap().factor = 2;
+        let mut bus = Bus::new(vec![sim(&device)]);
+        bus.mailboxes = [(0x1000, 128), (0x1080, 128)];
+        bus.address_all();
+        bus.preop(S);
+        let count = bus.upload(S, 0x1c13, 0).unwrap()[0];
+        let listed: Vec<u16> = (1..=count)
+            .map(|sub| {
+                let pdo = bus.upload(S, 0x1c13, sub).unwrap();
+                u16::from_le_bytes(pdo.try_into().unwrap())
+            })
+            .collect();
+        assert_eq!(listed, assigned, "increment {increment}");
+        for (n, pdo) in (0..).zip(assigned) {
+            let [low, high] = (0x6000 + n * increment).to_le_bytes();
+            assert_eq!(bus.upload(S, *pdo, 1).unwrap(), [bits, 1, low, high]);
+        }
+        let sii = ecaxis_esi::sii::parse(bus.segment.device(0).unwrap().sii()).unwrap();
+        let described: Vec<_> = sii.tx_pdos.iter().map(|p| (p.index, p.bit_len())).collect();
+        assert_eq!(described, [(0x1a00, 16)]);
+        bus.sm(S, 3, 0x1400, 4, 0x20);
+        bus.to(S, SAFEOP);
+    }
+}
+
 /// The object of an oversampled PDO has all samples of a cycle; a mapping entry may have fewer.
 #[test]
 fn oversampled_pdo_is_mapped_with_any_number_of_samples() {
