@@ -4,7 +4,8 @@ use std::cell::Cell;
 
 use crate::common::{Drive, LIMITS, Rig, all};
 use ecaxis_axis::{
-    Axis, AxisConfig, Brake, Command, CommandError, HomingError, HomingStatus, Mode, State, Trip,
+    Axis, AxisConfig, Brake, Command, CommandError, HomingError, HomingStatus, Mode, State,
+    StopMethod, StopPhase, Trip,
 };
 
 fn config() -> AxisConfig {
@@ -231,6 +232,58 @@ fn power_does_not_return_after_a_stop() {
     rig.drive.fault();
     rig.run(2000);
     assert_eq!(rig.drive.state, State::Fault);
+}
+
+/// The end of a stop during homing is an axis without power, whose homing has ended: the way back to the
+/// previous mode would give power again.
+#[test]
+fn power_does_not_return_after_a_stop_of_homing() {
+    let command = |command| move |axis: &mut Axis| drop(axis.command(command));
+    let stops: [(&str, &dyn Fn(&mut Axis)); 7] = [
+        ("disable", &command(Command::Disable)),
+        ("quick stop", &command(Command::QuickStop)),
+        ("disable voltage", &command(Command::DisableVoltage)),
+        ("emergency stop", &command(Command::EmergencyStop)),
+        ("ramp from outside", &|axis| axis.stop_by(StopMethod::Ramp)),
+        ("quick stop from outside", &|axis| {
+            axis.stop_by(StopMethod::QuickStop);
+        }),
+        ("no voltage from outside", &|axis| {
+            axis.stop_by(StopMethod::DisableVoltage);
+        }),
+    ];
+    for (name, stop) in stops {
+        for (cycles, repeated) in (0..400).step_by(3).flat_map(|n| [(n, false), (n, true)]) {
+            let mut rig = unpowered(config());
+            rig.axis.command(Command::Home { timeout_s: 5.0 }).unwrap();
+            rig.run(cycles);
+            if rig.axis.status().homing == HomingStatus::Attained && rig.axis.status().ready {
+                assert!(cycles > 100, "{name}: {cycles}");
+                break;
+            }
+            stop(&mut rig.axis);
+            let mut off = 0;
+            for cycle in 0..3000 {
+                if repeated {
+                    stop(&mut rig.axis);
+                }
+                let status = rig.cycle();
+                let enables = rig.out.controlword & 0x0F == 0x0F;
+                off += u32::from(!status.state.has_power());
+                assert!(
+                    !(enables && off > 0),
+                    "{name} after {cycles}: power at {cycle}"
+                );
+            }
+            let status = rig.axis.status();
+            let (stop, homing) = (status.stop, status.homing);
+            // The drive stays in Quick stop active.
+            let stays = name == "quick stop"
+                && stop.is_some_and(|stop| stop.phase == StopPhase::Standstill);
+            assert!(stop.is_none() || stays, "{name} after {cycles}: {stop:?}");
+            assert_ne!(homing, HomingStatus::Running, "{name} after {cycles}");
+        }
+    }
 }
 
 #[test]

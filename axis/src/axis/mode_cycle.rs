@@ -23,8 +23,12 @@ pub(super) struct ModeCycle {
 }
 
 impl Axis {
-    /// Removes the power of an axis at rest for a mode switch.
+    /// Removes the power of an axis at rest for a mode switch. Has no effect during a stop, which ends
+    /// without power: nothing may give it back.
     pub(super) fn begin_mode_cycle(&mut self, to: Mode) {
+        if self.goal != PowerGoal::On {
+            return;
+        }
         self.switch_failed = None;
         self.remove_power_at_rest();
         self.mode_cycle = Some(ModeCycle {

@@ -1,6 +1,6 @@
 //! A drive that may answer anything: a drive of the standard, and settings that deviate from it.
 
-use ecaxis_axis::{Inputs, Outputs, State};
+use ecaxis_axis::{AxisConfig, Inputs, Outputs, State};
 
 /// The cycle. Long, so that the time-outs of the axis take few cycles.
 pub const DT: f64 = 0.01;
@@ -181,6 +181,10 @@ pub enum Homing {
 #[derive(Debug, Clone)]
 pub struct Drive {
     pub settings: Settings,
+    /// The mode changes without power only.
+    mode_unpowered: bool,
+    /// The mode is shown in Operation enabled only.
+    mode_enabled: bool,
     pub state: State,
     pub mode: i8,
     pub homing: Homing,
@@ -194,9 +198,12 @@ pub struct Drive {
 }
 
 impl Drive {
-    pub fn new() -> Self {
+    /// Creates a drive for which the axis has the right keys.
+    pub fn new(config: &AxisConfig) -> Self {
         Self {
             settings: Settings::default(),
+            mode_unpowered: config.mode_change_unpowered,
+            mode_enabled: config.mode_display_enabled,
             state: State::NotReadyToSwitchOn,
             mode: 0,
             homing: Homing::NotStarted,
@@ -301,7 +308,12 @@ impl Drive {
         let rose = out.controlword & !self.controlword & 0x10 != 0;
         let edge = out.controlword & !self.controlword & 0x80 != 0;
         self.controlword = out.controlword;
-        if self.settings.mode != ModeShown::Kept && self.mode != out.mode {
+        let powered = matches!(
+            self.state,
+            State::SwitchedOn | State::OperationEnabled | State::QuickStopActive
+        );
+        let changes = !(self.mode_unpowered && powered);
+        if changes && self.settings.mode != ModeShown::Kept && self.mode != out.mode {
             self.mode = out.mode;
             (self.set_point, self.acknowledged) = (None, false);
         }
@@ -411,6 +423,7 @@ impl Drive {
             torque: Some(self.torque),
             mode_display: Some(match self.settings.mode {
                 ModeShown::Zero => 0,
+                _ if self.mode_enabled && self.state != State::OperationEnabled => 0,
                 ModeShown::Requested | ModeShown::Kept => self.mode,
             }),
             fresh: self.settings.frames == Frames::Arrive,

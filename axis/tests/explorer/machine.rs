@@ -121,7 +121,7 @@ impl Machine {
         let mut machine = Self {
             setup: Rc::clone(setup),
             axis: Axis::new(setup.config).unwrap(),
-            drive: Drive::new(),
+            drive: Drive::new(&setup.config),
             out: Outputs::default(),
             monitor: Monitor::new(),
             stream: false,

@@ -234,3 +234,23 @@ fn pp() {
 fn pv() {
     search("PV", config(Mode::Pv), &[Mode::Csp, Mode::Pv]);
 }
+
+#[test]
+fn drive_that_changes_its_mode_without_power_only() {
+    let config = AxisConfig {
+        mode_change_unpowered: true,
+        ..config(Mode::Csp)
+    };
+    let modes = [Mode::Csv, Mode::Csp];
+    search("CSP, modes without power", config, &modes);
+}
+
+#[test]
+fn drive_that_shows_its_mode_in_operation_enabled_only() {
+    let config = AxisConfig {
+        mode_display_enabled: true,
+        ..config(Mode::Csp)
+    };
+    let modes = [Mode::Csv, Mode::Csp];
+    search("CSP, mode shown when enabled", config, &modes);
+}

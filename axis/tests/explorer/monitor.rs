@@ -37,6 +37,10 @@ pub const HOMED: &str = "8 homed by evidence only";
 pub const SUPERVISED: &str = "9 supervised while powered";
 
 pub const STRANGE: &str = "10 no reaction to a few strange words";
+pub const ENDS: &str = "11 a stop without power is over";
+
+/// Consecutive fresh cycles in which the drive shows no power, until a stop must be over.
+const STOPPED_CYCLES: u8 = 20;
 
 /// What a word says of the power.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -90,6 +94,9 @@ pub struct Monitor {
     ended: bool,
     /// Power may be removed at speed.
     removes: bool,
+    /// A command switches the mode of a drive that does so without power: the power is lost for that,
+    /// and returns by the same command.
+    switches: bool,
     target: Option<Target>,
     stop: Option<StopWatch>,
     home_low: bool,
@@ -98,6 +105,8 @@ pub struct Monitor {
     difference: f64,
     strange: u8,
     unfollowed: u8,
+    /// Fresh cycles of a stop for which the drive shows no power.
+    stopped: u8,
     /// Counts per cycle: of the target, and of the axis as it began to follow, by both reports.
     step: f64,
     taken_over: [f64; 2],
@@ -138,6 +147,7 @@ impl Monitor {
             followed: 0,
             ended: false,
             removes: false,
+            switches: false,
             target: None,
             stop: None,
             home_low: false,
@@ -146,6 +156,7 @@ impl Monitor {
             difference: 0.0,
             strange: 0,
             unfollowed: 0,
+            stopped: 0,
             step: 0.0,
             taken_over: [0.0; 2],
             position: 0.0,
@@ -225,7 +236,11 @@ impl Monitor {
         if lost || released {
             let enabled_now = cycle.command == Some(Command::Enable);
             (self.powered, self.followed) = (false, 0);
-            self.permit &= enabled_now;
+            self.permit &= enabled_now || self.switches;
+        }
+        if self.ended && self.switches {
+            self.permit &= self.powered;
+            self.switches = false;
         }
 
         // Rule 1.
@@ -254,6 +269,16 @@ impl Monitor {
         self.check_steps(cycle, &was, &sent, reported)?;
         self.check_done(cycle)?;
         let fastest = (moved / COUNTS_PER_UNIT / DT).abs().max(reported.abs());
+        // Rule 11.
+        let powerless = status.stop.is_some() && self.shown == Shown::Off;
+        match powerless {
+            true if believed => self.stopped = self.stopped.saturating_add(1),
+            true => {}
+            false => self.stopped = 0,
+        }
+        if self.stopped >= STOPPED_CYCLES {
+            return violation(ENDS, format!("after {} cycles without power", self.stopped));
+        }
         self.check_stop(cycle, &was, reported, [speed, fastest], moves)?;
         self.check_homing(cycle, &was)?;
 
@@ -310,6 +335,7 @@ impl Monitor {
             self.taken_over = taken.map(|step| step.clamp(-most, most));
         }
         if self.powered && status.enabled {
+            self.switches &= status.switching.is_some() || status.homing == HomingStatus::Running;
             self.followed = self.followed.saturating_add(1).min(3);
         }
         if status.trip.is_some() || status.fault.is_some() && !status.resetting {
@@ -322,7 +348,8 @@ impl Monitor {
     fn is_cause(&self, cycle: &Cycle<'_>, was: &AxisStatus) -> bool {
         let trip = cycle.status.trip.is_some();
         match cycle.status.power_loss_cause {
-            Some(PowerLossCause::Command | PowerLossCause::Fault) => self.ended,
+            Some(PowerLossCause::Command) => self.ended || self.switches,
+            Some(PowerLossCause::Fault) => self.ended,
             // A reset may have acknowledged the trip in its first cycle.
             Some(PowerLossCause::Trip) => {
                 trip || self.ended || cycle.command == Some(Command::ResetFault)
@@ -357,7 +384,12 @@ impl Monitor {
             Some(Command::DisableVoltage) => {
                 (self.ended, self.removes, stops, self.target) = (true, true, true, None);
             }
-            Some(Command::Stop | Command::HoldHoming) => (stops, self.target) = (true, None),
+            Some(Command::HoldHoming) => (stops, self.target) = (true, None),
+            Some(Command::Stop) => {
+                // Power does not return after a stop.
+                self.ended |= self.switches;
+                (stops, self.target) = (true, None);
+            }
             Some(Command::MoveTo { position, .. }) => {
                 (self.stop, self.target) = (None, Some(Target::Position(position)));
             }
@@ -365,12 +397,15 @@ impl Monitor {
             Some(Command::Velocity { velocity, .. }) => {
                 (self.stop, self.target) = (None, Some(Target::Velocity(velocity)));
             }
-            Some(Command::Torque { .. } | Command::SetMode(_)) => {
+            Some(Command::Torque { .. }) => (self.stop, self.target) = (None, None),
+            Some(Command::SetMode(_)) => {
                 (self.stop, self.target) = (None, None);
+                self.switches |= config.mode_change_unpowered && self.powered;
             }
             Some(Command::Home { .. }) => {
                 (self.stop, self.target) = (None, None);
                 self.home_low = false;
+                self.switches |= config.mode_change_unpowered && self.powered;
             }
             Some(Command::ResetFault | Command::ArmProbe { .. } | Command::DisarmProbe { .. })
             | None => {}
@@ -650,7 +685,7 @@ impl Monitor {
         let class = |n: u8, bounds: &[u8]| bounds.iter().filter(|&&bound| n >= bound).count();
         (
             (self.permit, self.shown, self.powered, self.followed),
-            (self.ended, self.removes),
+            (self.ended, self.removes, self.switches),
             self.target.map(|target| std::mem::discriminant(&target)),
             self.stop
                 .map(|stop| (stop.moving_s > 1.0, stop.moving_s > 2.0)),
@@ -661,6 +696,7 @@ impl Monitor {
             ),
             class(self.strange, &[1, 3, 10]),
             class(self.unfollowed, &[1, 9, 10, 11]),
+            class(self.stopped, &[1, 10]),
         )
             .hash(hasher);
     }

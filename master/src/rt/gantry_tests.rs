@@ -135,11 +135,12 @@ fn bits() -> AxisBits {
 
 impl Pair {
     fn new(second_at: f64, absolute: bool) -> Self {
-        let mut second = Drive::new();
+        let axes = [axis(absolute), axis(absolute)];
+        let [first, mut second] = [0, 1].map(|half| Drive::new(axes[half].config()));
         second.position = second_at * COUNTS_PER_UNIT;
         Self {
-            axes: [axis(absolute), axis(absolute)],
-            drives: [Drive::new(), second],
+            axes,
+            drives: [first, second],
             out: [Outputs::default(); 2],
             monitors: [Monitor::new(), Monitor::new()],
             coupling: Coupling::Pending,
