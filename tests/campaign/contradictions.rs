@@ -1,9 +1,11 @@
 //! Machines of the campaign with one entry more, which contradicts them: `ecaxis check` must refuse
-//! each. An accepted one could move an axis past its limits, or leave a hold without effect.
+//! each, or warn of it. An accepted one could move an axis past its limits, take a wrong angle as
+//! home, or leave a hold without effect.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
 
+use super::esi;
 use super::generate::{self, Plan};
 use super::random::Random;
 use super::run;
@@ -14,11 +16,11 @@ const SEEDS: u64 = 120;
 /// The fewest refusals of each kind: most machines permit most kinds.
 const FEWEST: usize = 10;
 
-/// Returns the machine file with a contradiction; `None` if the machine permits none of this kind.
-type Contradiction = fn(&Plan, &mut Random) -> Option<String>;
+/// Returns the plan with a contradiction; `None` if the machine permits none of this kind.
+type Contradiction = fn(&Plan, &mut Random) -> Option<Plan>;
 
 /// Each kind with parts of its refusal, of which one is enough.
-const KINDS: [(&str, Contradiction, &[&str]); 4] = [
+const KINDS: [(&str, Contradiction, &[&str]); 5] = [
     (
         "`sdo` of an object that the cycle writes",
         object_of_cycle,
@@ -39,6 +41,7 @@ const KINDS: [(&str, Contradiction, &[&str]); 4] = [
         unseen_condition,
         &["without which the machine goes on"],
     ),
+    ("polarity of the drive", polarity, &["0x607e:00 is 0x"]),
 ];
 
 #[test]
@@ -53,17 +56,13 @@ fn no_contradiction_is_accepted() {
             wrong.push(format!("seed {seed}, without a contradiction: {text}"));
         }
         for ((kind, contradict, parts), refused) in KINDS.into_iter().zip(&mut refused) {
-            let Some(machine_file) = contradict(&plan, &mut random) else {
+            let Some(changed) = contradict(&plan, &mut random) else {
                 continue;
-            };
-            let changed = Plan {
-                machine_file,
-                ..plan.clone()
             };
             match check(&changed, folder.path()) {
                 Err(text) if parts.iter().any(|part| text.contains(part)) => *refused += 1,
                 Err(text) => wrong.push(format!("seed {seed}, {kind}: {text}")),
-                Ok(()) => {
+                Ok(_) => {
                     let file = &changed.machine_file;
                     wrong.push(format!("seed {seed}, {kind}: accepted\n{file}"));
                 }
@@ -75,8 +74,35 @@ fn no_contradiction_is_accepted() {
     assert!(refused.iter().all(|n| *n >= FEWEST), "{refused:?}");
 }
 
-/// Returns the text of the refusal.
-fn check(plan: &Plan, folder: &Path) -> Result<(), String> {
+/// An angle of a shaft that is a whole number of the encoder's counts in each wrap of the drive's
+/// 2^32 counts, or not: only the latter is warned of.
+#[test]
+fn an_absolute_angle_that_a_start_loses_is_warned_of() {
+    const WARNING: &str = "a start finds a wrong position";
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut seen = [0, 0];
+    for seed in 1..=SEEDS {
+        let plan = generate::plan(seed, None);
+        let mut random = Random::new(seed);
+        let Some((changed, is_lost)) = absolute_angle(&plan, &mut random) else {
+            continue;
+        };
+        let text = check(&changed, folder.path());
+        let file = &changed.machine_file;
+        let text = text.unwrap_or_else(|error| panic!("seed {seed}: {error}\n{file}"));
+        assert_eq!(
+            text.contains(WARNING),
+            is_lost,
+            "seed {seed}: {text}\n{file}"
+        );
+        seen[usize::from(is_lost)] += 1;
+    }
+    println!("[kept, lost]: {seen:?}");
+    assert!(seen.iter().all(|n| *n >= FEWEST), "{seen:?}");
+}
+
+/// Returns the text of the acceptance, or of the refusal.
+fn check(plan: &Plan, folder: &Path) -> Result<String, String> {
     run::write(plan, folder);
     let output = Command::new(run::binary())
         .current_dir(folder)
@@ -84,10 +110,19 @@ fn check(plan: &Plan, folder: &Path) -> Result<(), String> {
         .stdin(Stdio::null())
         .output()
         .expect("the program starts");
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
     if output.status.success() {
-        return Ok(());
+        return Ok(text(&output.stdout) + &text(&output.stderr));
     }
-    Err(String::from_utf8_lossy(&output.stderr).into_owned())
+    Err(text(&output.stderr))
+}
+
+/// Returns the plan with another machine file.
+fn changed(plan: &Plan, machine_file: String) -> Plan {
+    Plan {
+        machine_file,
+        ..plan.clone()
+    }
 }
 
 /// Returns an EtherCAT drive of CiA 402 that fits.
@@ -104,15 +139,16 @@ fn drive<'a>(
 }
 
 /// Returns the text with an entry at the begin of the `sdo` of a drive.
-fn with_sdo(plan: &Plan, axis: &Axis, entry: &str) -> Option<String> {
+fn with_sdo(plan: &Plan, axis: &Axis, entry: &str) -> Option<Plan> {
     let text = &plan.machine_file;
     let device = text.find(&format!("name = \"{}\"", axis.name))?;
     let list = "sdo = [";
     let at = device + text[device..].find(list)? + list.len();
-    Some(format!("{}{entry}, {}", &text[..at], &text[at..]))
+    let text = format!("{}{entry}, {}", &text[..at], &text[at..]);
+    Some(changed(plan, text))
 }
 
-fn object_of_cycle(plan: &Plan, random: &mut Random) -> Option<String> {
+fn object_of_cycle(plan: &Plan, random: &mut Random) -> Option<Plan> {
     let axis = drive(plan, random, |_| true)?;
     let mut entries = vec![
         "{ index = 0x6040, value = 6 }",
@@ -125,17 +161,16 @@ fn object_of_cycle(plan: &Plan, random: &mut Random) -> Option<String> {
     with_sdo(plan, axis, entry)
 }
 
-fn output_of_axis(plan: &Plan, random: &mut Random) -> Option<String> {
+fn output_of_axis(plan: &Plan, random: &mut Random) -> Option<Plan> {
     let axis = drive(plan, random, |_| true)?;
     let place = random.pick(&axis.outputs);
     let output = format!("{}.\"0x{:04X}\"", axis.name, place.object);
-    Some(format!(
-        "{}\n[[step]]\nset = {{ {output} = 0 }}\n",
-        plan.machine_file
-    ))
+    let text = &plan.machine_file;
+    let step = format!("{text}\n[[step]]\nset = {{ {output} = 0 }}\n");
+    Some(changed(plan, step))
 }
 
-fn output_of_node(plan: &Plan, random: &mut Random) -> Option<String> {
+fn output_of_node(plan: &Plan, random: &mut Random) -> Option<Plan> {
     let nodes: Vec<&Axis> = plan
         .machine
         .axes
@@ -149,16 +184,16 @@ fn output_of_node(plan: &Plan, random: &mut Random) -> Option<String> {
     let text = &plan.machine_file;
     if random.chance(0.5) {
         let step = format!("[[step]]\nset = {{ gateway.\"Output byte {byte:04}\" = 1 }}\n");
-        return Some(format!("{text}\n{step}"));
+        return Some(changed(plan, format!("{text}\n{step}")));
     }
     let copy = format!(
         "[[copy]]\nfrom = \"gateway.Input byte 0060\"\nto = \"gateway.Output byte {byte:04}\"\n"
     );
-    Some(format!("{text}\n{copy}"))
+    Some(changed(plan, format!("{text}\n{copy}")))
 }
 
 /// Adds a terminal in a group, with a drive, without which the machine goes on.
-fn unseen_condition(plan: &Plan, random: &mut Random) -> Option<String> {
+fn unseen_condition(plan: &Plan, random: &mut Random) -> Option<Plan> {
     let text = &plan.machine_file;
     let axis = drive(plan, random, |_| true)?;
     if text.contains("[[stop.group]]") || !plan.machine.gantries.is_empty() {
@@ -171,10 +206,73 @@ fn unseen_condition(plan: &Plan, random: &mut Random) -> Option<String> {
         true => "[override]\nhold = { lone.\"Input 1\" = true }",
         false => "[stop]\nemergency = { lone.\"Input 1\" = true }",
     };
-    Some(format!(
+    let text = format!(
         "{text}\n[[device]]\nname = \"lone\"\nesi = \"esi/IO8.xml\"\nposition = {positions}\n\
          \n{condition}\n\n[[stop.group]]\nname = \"lone\"\naxes = [\"{}\"]\n\
          devices = [\"lone\"]\noutside = \"continue\"\n",
         axis.name
-    ))
+    );
+    Some(changed(plan, text))
+}
+
+/// Replaces the ESI of a drive.
+fn with_esi(plan: &Plan, axis: &Axis, name: &str, esi: String) -> Option<Plan> {
+    let text = &plan.machine_file;
+    let device = text.find(&format!("name = \"{}\"", axis.name))?;
+    let file = "esi/EPOS4.xml";
+    let at = device + text[device..].find(file)?;
+    let text = format!("{}{name}{}", &text[..at], &text[at + file.len()..]);
+    let mut plan = changed(plan, text);
+    plan.files.push((name.to_string(), esi));
+    Some(plan)
+}
+
+/// True for an axis with the ESI of the EPOS4.
+fn is_epos4(plan: &Plan, axis: &Axis) -> bool {
+    let text = &plan.machine_file;
+    let device = text.find(&format!(
+        "name = \"{}\"\nesi = \"esi/EPOS4.xml\"",
+        axis.name
+    ));
+    device.is_some()
+}
+
+/// A drive that turns positions, velocities or torques, with torques among its targets.
+fn polarity(plan: &Plan, random: &mut Random) -> Option<Plan> {
+    let torques = |axis: &Axis| axis.outputs.iter().any(|place| place.object == 0x6071);
+    let axis = drive(plan, random, |axis| torques(axis) && is_epos4(plan, axis))?;
+    let value = random.pick(&[0x20, 0x40, 0x60, 0x80, 0xa0, 0xc0, 0xe0]);
+    let plan = with_esi(plan, axis, "polarity.xml", esi::with_polarity())?;
+    with_sdo(
+        &plan,
+        axis,
+        &format!("{{ index = 0x607E, value = {value} }}"),
+    )
+}
+
+/// Gives an endless axis, alone on its bus, an absolute encoder and a gear. True: the counts of a wrap
+/// are no whole number of turns of the shaft.
+fn absolute_angle(plan: &Plan, random: &mut Random) -> Option<(Plan, bool)> {
+    let axis = drive(plan, random, |axis| axis.range.is_none())?;
+    let tables = || plan.machine_file.split("\n[[device]]\n");
+    let bus = tables().next()?;
+    let device = tables().find(|table| table.starts_with(&format!("name = \"{}\"", axis.name)))?;
+    let device = device.split("\n\n").next()?;
+    let (head, keys) = device.split_once("[device.axis]\n")?;
+    let head = head.replace(
+        &format!("\nposition = {}\n", axis.position),
+        "\nposition = 0\n",
+    );
+    // The window of the drive is in counts.
+    let keys = keys[keys.find("limits = ")?..].replace(", following_error = 4.0", "");
+    let bits = 13 + random.below(11);
+    let (motor, shaft) = random.pick(&[(1, 1), (4, 1), (64, 1), (1, 8), (49, 3), (10, 1), (7, 5)]);
+    // 2^32 counts are so many turns of the shaft: 2^32 · shaft / (2^bits · motor).
+    let is_lost = (shaft << (32 - bits)) % motor != 0;
+    let text = format!(
+        "{bus}\n[[device]]\n{head}[device.axis]\nunit = \"deg\"\nencoder = {}\ngear = [{motor}, {shaft}]\n\
+         feed = 360.0\nmodulo = 360.0\nabsolute = true\n{keys}\n",
+        1_u32 << bits
+    );
+    Some((changed(plan, text), is_lost))
 }

@@ -3,7 +3,9 @@
 
 use std::fmt::Write as _;
 
+use super::esi;
 use super::faults::{Effect, Fault};
+use super::foreign;
 use super::generate::Draft;
 use super::scenes::random_fault;
 use super::shaft::Feed;
@@ -21,6 +23,8 @@ struct Member {
     plain: bool,
     every_mode: bool,
     homes: bool,
+    /// Every change of mode removes the power.
+    cycles_power: bool,
     /// The group of axes that stop together; 0: the rest of the machine.
     group: usize,
 }
@@ -46,23 +50,28 @@ const FEATURES: [&str; 16] = [
 ];
 
 /// The range of every axis with a range, in units to both sides.
-const REACH: f64 = 100.0;
+pub const REACH: f64 = 100.0;
 /// Objects and gear of the axes here.
 const PER_TURN: f64 = 5.0;
 
 /// Keys of an axis under construction.
 #[derive(Default)]
-struct Keys {
-    esi: &'static str,
+pub struct Keys {
+    pub esi: &'static str,
     encoder: u32,
     rpm: bool,
     /// Outputs and inputs of the file, or those of the ESI.
     outputs: Vec<u16>,
     inputs: Vec<u16>,
     mapped: bool,
-    endless: bool,
-    axis: String,
-    sim: String,
+    pub endless: bool,
+    /// The drive shows its mode in Operation enabled only, or changes it without power only.
+    pub hides_mode: bool,
+    pub cycles_power: bool,
+    /// Keys of `[[device]]`.
+    pub device: String,
+    pub axis: String,
+    pub sim: String,
 }
 
 /// Quirks of simulated drives with their values (`docs/drive.md`, "Quirks").
@@ -133,9 +142,10 @@ fn axis(draft: &mut Draft, keys: &Keys) -> usize {
     let _ = write!(
         text,
         "\n[[device]]\nname = \"{name}\"\nesi = \"{}\"\nposition = {position}\nmode = \"csp\"\n\
-         sdo = [{{ index = 0x6065, value = {} }}]\n",
+         sdo = [{{ index = 0x6065, value = {} }}]\n{}",
         keys.esi,
-        keys.encoder * 20
+        keys.encoder * 20,
+        keys.device
     );
     if keys.mapped {
         let (outputs, inputs) = (list(&keys.outputs), list(&keys.inputs));
@@ -160,7 +170,8 @@ fn axis(draft: &mut Draft, keys: &Keys) -> usize {
         keys.axis.replace("NAME", &name)
     );
     let mut sim = keys.sim.clone();
-    let quirk = draft.random.chance(draft.quirks).then(|| {
+    let has_quirk = sim.contains("quirks");
+    let quirk = (!has_quirk && draft.random.chance(draft.quirks)).then(|| {
         let (kind, values) = draft.random.pick(&QUIRKS);
         let value = draft.random.pick(values);
         let key = kind.trim_start_matches("quirk ");
@@ -186,6 +197,7 @@ fn axis(draft: &mut Draft, keys: &Keys) -> usize {
         inputs: packed(&keys.inputs, 0),
         period: 1,
         enables: 1,
+        shows_mode: !keys.hides_mode,
         follows_bit: true,
         goal: None,
         counts,
@@ -219,6 +231,7 @@ fn member(draft: &Draft, index: usize) -> Member {
         plain: axis.period == 1,
         every_mode: false,
         homes: false,
+        cycles_power: false,
         group: 0,
     }
 }
@@ -251,7 +264,7 @@ fn plain(draft: &mut Draft, endless: bool) -> Member {
 /// Adds an axis that may change its mode, and may be homed: certainly with `homes`.
 fn every_mode(draft: &mut Draft, homes: bool) -> Member {
     let endless = draft.random.chance(0.5);
-    let homes = draft.random.chance(0.5) || homes;
+    let mut homes = draft.random.chance(0.5) || homes;
     let mut keys = Keys {
         esi: "esi/EPOS4.xml",
         encoder: 2000,
@@ -268,10 +281,15 @@ fn every_mode(draft: &mut Draft, homes: bool) -> Member {
             "homing = {{ method = {method}, search = 10.0, zero = 5.0, acceleration = 200.0, timeout = \"10s\" }}\n"
         );
     }
+    let is_foreign = draft.random.chance(draft.foreign);
+    if is_foreign {
+        homes |= foreign::draw(draft, &mut keys);
+    }
     let index = axis(draft, &keys);
     Member {
         every_mode: true,
         homes,
+        cycles_power: keys.cycles_power,
         ..member(draft, index)
     }
 }
@@ -293,35 +311,15 @@ fn second_encoder(draft: &mut Draft) -> Member {
         ..Keys::default()
     };
     let index = axis(draft, &keys);
-    draft.files.push(("load.xml".to_string(), load_esi()));
+    draft
+        .files
+        .push(("load.xml".to_string(), esi::with_load_position()));
     let found = Member {
         homes: true,
         ..member(draft, index)
     };
     draft.step(&format!("home = [\"{}\"]", found.name));
     found
-}
-
-/// Returns the ESI of the EPOS4 with a position of the load.
-fn load_esi() -> String {
-    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/esi/EPOS4.xml");
-    let text = std::fs::read_to_string(path).expect("our file");
-    let item = |sub, name, kind, bits, at| {
-        format!(
-            "<SubItem><SubIdx>{sub}</SubIdx><Name>{name}</Name><Type>{kind}</Type><BitSize>{bits}</BitSize>\
-             <BitOffs>{at}</BitOffs><Flags><Access>ro</Access><PdoMapping>T</PdoMapping></Flags></SubItem>"
-        )
-    };
-    let kind = format!(
-        "<DataType><Name>DT60E4</Name><BitSize>48</BitSize>{}{}</DataType><DataType><Name>BOOL</Name>",
-        item(0, "Highest subindex", "USINT", 8, 0),
-        item(1, "Position of the load", "DINT", 32, 16)
-    );
-    let object = "<Object><Index>#x60E4</Index><Name>Additional position actual value</Name><Type>DT60E4</Type>\
-        <BitSize>48</BitSize><Info><SubItem><Name>Highest subindex</Name><Info><DefaultValue>1</DefaultValue></Info></SubItem>\
-        </Info><Flags><Access>ro</Access><PdoMapping>T</PdoMapping></Flags></Object>\n              <Object>\n                <Index>#x6065</Index>";
-    let text = text.replacen("<DataType><Name>BOOL</Name>", &kind, 1);
-    text.replacen("<Object>\n                <Index>#x6065</Index>", object, 1)
 }
 
 /// Adds an axis with a sensor along its way.
@@ -411,6 +409,7 @@ fn gateway(draft: &mut Draft) -> Vec<Member> {
             inputs: vec![place(0x6041, at), place(0x6064, at + 2)],
             period: (SYNC_NS / draft.machine.cycle_ns).max(1) as usize,
             enables: 1,
+            shows_mode: true,
             follows_bit: false,
             goal: None,
             counts: 400.0,
@@ -462,6 +461,7 @@ fn sercos(draft: &mut Draft) -> Vec<Member> {
             inputs: packed(&[0x6041, 0x6064], channel * 10),
             period: 1,
             enables: 1,
+            shows_mode: true,
             follows_bit: true,
             goal: None,
             counts,
@@ -788,6 +788,7 @@ fn any_fault(draft: &mut Draft, at: f64) -> Fault {
 /// Draws a machine whose program has this feature.
 fn with(draft: &mut Draft, wanted: &'static str) {
     draft.quirks = if wanted == "quirk" { 0.6 } else { 0.07 };
+    draft.foreign = if wanted == "foreign drive" { 1.0 } else { 0.2 };
     let chosen = |draft: &mut Draft, feature: &str, chance: f64| {
         wanted == feature || draft.random.chance(chance)
     };
@@ -810,7 +811,8 @@ fn with(draft: &mut Draft, wanted: &'static str) {
         note("gantry");
         pool.push(gantry(draft));
     }
-    if chosen(draft, "profile modes", 0.25) {
+    let is_foreign = wanted == "foreign drive";
+    if chosen(draft, "profile modes", 0.25) || is_foreign {
         note("profile modes");
         pool.push(every_mode(draft, false));
     }
@@ -865,7 +867,8 @@ fn with(draft: &mut Draft, wanted: &'static str) {
     if let Some(sensor) = &sensor {
         probe_steps(draft, sensor);
     }
-    steps(draft, wanted, &pool);
+    let first = if is_foreign { "profile modes" } else { wanted };
+    steps(draft, first, &pool);
     for _ in 0..2 + draft.random.below(4) {
         let feature = if draft.random.chance(0.3) {
             "profile modes"
@@ -893,6 +896,14 @@ fn with(draft: &mut Draft, wanted: &'static str) {
     draft.features.sort_unstable();
     draft.features.dedup();
     ending(draft);
+    for member in pool.iter().filter(|of| of.cycles_power) {
+        let count = |step: String| draft.steps.matches(&step).count();
+        let name = &member.name;
+        let switches =
+            count(format!("mode = {{ {name} = ")) + 2 * count(format!("home = [\"{name}\"]"));
+        let enables = if draft.once { 1 + switches } else { usize::MAX };
+        draft.machine.axes[member.index].enables = enables;
+    }
     if !draft.once {
         draft
             .machine
@@ -980,3 +991,4 @@ scene!(gateway_axis, "gateway axis");
 scene!(sercos_axes, "Sercos");
 scene!(held, "hold");
 scene!(quirks, "quirk");
+scene!(foreign_drives, "foreign drive");

@@ -89,6 +89,8 @@ pub struct Draft {
     pub once: bool,
     /// The probability that a drive has a quirk.
     pub quirks: f64,
+    /// The probability that a drive of every mode needs keys of its own.
+    pub foreign: f64,
     pub files: Vec<(String, String)>,
     pub features: Vec<&'static str>,
     pub shaft: Option<Feed>,
@@ -140,6 +142,7 @@ impl Draft {
             tables: String::new(),
             once: false,
             quirks: 0.0,
+            foreign: 0.0,
             files: Vec::new(),
             features: Vec::new(),
             shaft: None,
@@ -262,6 +265,7 @@ impl Draft {
             inputs: packed(inputs, 0),
             period: 1,
             enables: 1,
+            shows_mode: true,
             follows_bit: true,
             goal: None,
             counts,

@@ -1,10 +1,14 @@
 //! Judges a run: the data that reached the drives, and whether exit code and report match.
 
+use super::esi;
 use super::relations;
 use super::rules;
 use super::stops;
 use super::view::{Machine, Moment, views};
-use super::wire::{Inputs, Wire};
+use super::wire::{Download, Inputs, Wire};
+
+/// A command to the drive, which nobody gave.
+const RESTORE_DEFAULTS: u16 = 0x1011;
 
 /// One violated rule.
 #[derive(Debug, Clone)]
@@ -84,6 +88,29 @@ pub fn judge(machine: &Machine, wire: &Wire, report: &Report) -> Vec<Finding> {
             at: *at as f64 * 1e-9,
             detail: "not EtherCAT as ETG.1000.4 has it".to_string(),
             count: wire.malformed.len(),
+        });
+    }
+    let of_a_unit = |write: &&Download| {
+        esi::OF_A_UNIT
+            .iter()
+            .any(|(index, subs)| *index == write.index && subs.contains(&write.sub))
+            || write.index == RESTORE_DEFAULTS
+    };
+    let mut writes = wire.downloads.iter().filter(of_a_unit);
+    if let Some(write) = writes.next() {
+        let Download {
+            index,
+            sub,
+            station,
+            ..
+        } = *write;
+        list.push(Finding {
+            rule: "write-of-unit-data",
+            axis: "-".to_string(),
+            cycle: 0,
+            at: write.at as f64 * 1e-9,
+            detail: format!("0x{index:04x}:{sub:02x} of station 0x{station:04x} was written"),
+            count: 1 + writes.count(),
         });
     }
     for (drive, (axis, view)) in machine.axes.iter().zip(&views).enumerate() {

@@ -16,8 +16,10 @@
 mod by_hand;
 mod contradictions;
 mod determinism;
+mod esi;
 mod faults;
 mod features;
+mod foreign;
 mod generate;
 mod judge;
 mod pcapng;

@@ -102,7 +102,7 @@ fn mode_before_operation(
     findings: &mut Findings<'_>,
 ) {
     let requested = |moment: &Moment| moment.requests_operation();
-    if !requested(moment) || previous.is_some_and(requested) {
+    if !axis.shows_mode || !requested(moment) || previous.is_some_and(requested) {
         return;
     }
     let asked = moment.asked(axis);

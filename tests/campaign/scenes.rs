@@ -10,7 +10,7 @@ use super::view::{CSP, CST, CSV, PP, PV};
 pub type Scene = (&'static str, fn(&mut Draft));
 
 /// All scenes. Mode changes appear most often, because they have the most phases.
-pub const SCENES: [Scene; 32] = [
+pub const SCENES: [Scene; 33] = [
     ("anything", anything),
     ("two-faults", two_faults),
     ("device-missing", device_missing),
@@ -43,6 +43,7 @@ pub const SCENES: [Scene; 32] = [
     ("hold", features::held),
     ("line-shaft", features::line_shaft),
     ("quirks", features::quirks),
+    ("foreign-drives", features::foreign_drives),
 ];
 
 /// An upper bound of the time from the first frame to motion: bring-up and enabling.

@@ -25,6 +25,7 @@ fn machine() -> Machine {
             inputs: packed(&INPUTS, 0),
             period: 1,
             enables: 1,
+            shows_mode: true,
             follows_bit: true,
             goal: None,
             counts: 2000.0,

@@ -59,6 +59,8 @@ pub struct Axis {
     pub period: usize,
     /// How often the program may give power.
     pub enables: usize,
+    /// The drive shows its mode before Operation enabled.
+    pub shows_mode: bool,
     /// The drive serves Statusword bit 12, or the file says so.
     pub follows_bit: bool,
     /// The position in units at which the program ends, if it ends.

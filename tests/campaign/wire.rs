@@ -116,10 +116,20 @@ pub struct AlRequest {
     pub state: u8,
 }
 
+/// A write of an object by SDO.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Download {
+    pub at: u64,
+    pub station: u16,
+    pub index: u16,
+    pub sub: u8,
+}
+
 #[derive(Debug, Default)]
 pub struct Wire {
     pub cycles: Vec<Cycle>,
     pub al_requests: Vec<AlRequest>,
+    pub downloads: Vec<Download>,
     /// The times of sent frames that violate ETG.1000.4.
     pub malformed: Vec<u64>,
     pub duplicates: usize,
@@ -176,6 +186,24 @@ fn datagrams(frame: &[u8]) -> Option<Vec<Datagram<'_>>> {
             return Some(datagrams);
         }
     }
+}
+
+/// Reads an SDO request that begins a download (ETG.1000.6, 5.6.2.1) from a mailbox with CoE
+/// (ETG.1000.4, 5.6: length, address, channel, type 3).
+fn download(at: u64, datagram: &Datagram<'_>) -> Option<Download> {
+    const COE: u8 = 3;
+    const SDO_REQUEST: u8 = 2;
+    const DOWNLOAD: u8 = 1;
+    let held = datagram.data.get(..12)?;
+    let is_mailbox = datagram.command == FPWR && datagram.register() >= PROCESS_RAM;
+    let is_download =
+        held[5] & 0x0f == COE && held[7] >> 4 == SDO_REQUEST && held[8] >> 5 == DOWNLOAD;
+    (is_mailbox && is_download).then(|| Download {
+        at,
+        station: datagram.device(),
+        index: u16::from_le_bytes([held[9], held[10]]),
+        sub: held[11],
+    })
 }
 
 /// A section of the logical address space that an FMMU of a device maps.
@@ -255,6 +283,10 @@ pub fn read(packets: &[Packet<'_>], drives: &[DriveLayout], terminals: &[u16]) -
 
 impl Reader<'_> {
     fn sent(&mut self, at: u64, frame: &[u8], datagrams: &[Datagram<'_>]) {
+        let downloads = datagrams
+            .iter()
+            .filter_map(|datagram| download(at, datagram));
+        self.wire.downloads.extend(downloads);
         let logical: Vec<(u8, u32)> = datagrams
             .iter()
             .filter(|datagram| self.carries_process_data(datagram))

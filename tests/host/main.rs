@@ -13,5 +13,6 @@ mod link;
 mod redundancy;
 mod signals;
 mod stop_trials;
+mod vendors;
 mod veth;
 mod wait;
