@@ -75,7 +75,7 @@ pub struct Keys {
 }
 
 /// Quirks of simulated drives with their values (`docs/drive.md`, "Quirks").
-const QUIRKS: [(&str, &[&str]); 28] = [
+const QUIRKS: [(&str, &[&str]); 33] = [
     ("quirk bit12_never", &["true"]),
     ("quirk bit12_late", &["\"5ms\"", "\"40ms\"", "\"300ms\""]),
     ("quirk bit12_lost_at_rest", &["\"20ms\"", "\"200ms\""]),
@@ -108,6 +108,11 @@ const QUIRKS: [(&str, &[&str]); 28] = [
     ("quirk abort_index_word", &["true"]),
     ("quirk complete_access_refused", &["true"]),
     ("quirk mailbox_slow", &["\"5ms\"", "\"80ms\""]),
+    ("quirk mailbox_late", &["\"20ms\"", "\"300ms\""]),
+    ("quirk unsolicited_emergencies", &["true"]),
+    ("quirk unsolicited_requests", &["true"]),
+    ("quirk last_subindex_missing", &["true"]),
+    ("quirk assignment_subindices_missing", &["true"]),
     ("quirk exact_control_byte", &["true"]),
     ("quirk error_bit_missing", &["true"]),
 ];
