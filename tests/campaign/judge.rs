@@ -7,7 +7,7 @@ use super::stops;
 use super::view::{Machine, Moment, views};
 use super::wire::{Download, Inputs, Wire};
 
-/// A command to the drive, which nobody gave.
+/// A command to the drive; no machine of the campaign has it.
 const RESTORE_DEFAULTS: u16 = 0x1011;
 
 /// One violated rule.
