@@ -370,3 +370,24 @@ fn scan_names_esi_files_that_it_cannot_read() {
     assert!(ran.err.contains("broken.xml"), "{}", ran.err);
     assert!(ran.out.contains("EPOS4"), "{}", ran.out);
 }
+
+/// Two files of one folder describe the same revision, as those of two firmwares do.
+#[test]
+fn scan_write_names_another_file_of_the_same_revision() {
+    let bench = bench();
+    let write = ["scan", "--sim", "bench.toml", "--write"];
+    bench.well(&[&write[..], &["one.toml"]].concat());
+    assert!(!bench.read("one.toml").contains("has the same revision"));
+    bench.write("esi/EPOS4-second.xml", &bench.read("esi/EPOS4.xml"));
+    bench.well(&[&write[..], &["two.toml"]].concat());
+    let text = bench.read("two.toml");
+    let comment = "CHECK: EPOS4.xml has the same revision: take the file of this firmware";
+    let drives = text
+        .lines()
+        .filter(|line| line.contains("EPOS4-second.xml"));
+    assert_eq!(
+        drives.filter(|line| line.contains(comment)).count(),
+        1,
+        "{text}"
+    );
+}

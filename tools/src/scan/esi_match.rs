@@ -15,6 +15,8 @@ use ecaxis_master::esi_library::{self, Entry, Library, LoadError, RevisionMatch}
 pub struct EsiMatch {
     /// The ESI file; `None`: the device's own EEPROM describes it.
     pub path: Option<PathBuf>,
+    /// Other files that describe the same revision.
+    pub others: Vec<PathBuf>,
     pub file: Arc<esi::EsiFile>,
     pub device: Arc<esi::Device>,
     /// The strictest revision rule that accepts the description.
@@ -34,6 +36,7 @@ impl EsiMatch {
         let device = Arc::new(file.devices.first()?.clone());
         Some(Self {
             path: None,
+            others: Vec::new(),
             file,
             device,
             rule: RevisionMatch::Equal,
@@ -111,8 +114,17 @@ pub fn describe_identities(
             (id.vendor, id.product, id.revision) == (entry.vendor, entry.product, entry.revision)
         };
         let device = Arc::new(file.devices.iter().find(of)?.clone());
+        let is_same = |other: &&Entry| {
+            other.file != entry.file
+                && (other.vendor, other.product, other.revision)
+                    == (entry.vendor, entry.product, entry.revision)
+        };
+        let others = library.entries().iter().filter(is_same);
+        let mut others: Vec<PathBuf> = others.map(|other| other.file.clone()).collect();
+        others.dedup();
         Some(EsiMatch {
             path: Some(path),
+            others,
             device,
             file,
             rule,

@@ -328,7 +328,18 @@ pub(crate) fn esi_keys(
     };
     let path = described.path.as_deref().unwrap_or(Path::new(""));
     let path = relative(path, folder);
-    lines.add("esi", &quoted(&path.display().to_string()), "");
+    let comment = match &described.others[..] {
+        [] => String::new(),
+        [other, rest @ ..] => {
+            let more = match rest.len() {
+                0 => String::new(),
+                more => format!(" and {more} more"),
+            };
+            let other = other.display();
+            format!("{MARK} {other}{more} has the same revision: take the file of this firmware")
+        }
+    };
+    lines.add("esi", &quoted(&path.display().to_string()), &comment);
     if let Some(difference) = mailbox {
         let comment = format!("{MARK} {difference}; or \"eeprom\"");
         lines.add("mailbox", &quoted("esi"), &comment);
