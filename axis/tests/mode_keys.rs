@@ -234,12 +234,14 @@ fn power_does_not_return_after_a_stop() {
     assert_eq!(rig.drive.state, State::Fault);
 }
 
+type Stops<'a> = &'a dyn Fn(&mut Axis);
+
 /// The end of a stop during homing is an axis without power, whose homing has ended: the way back to the
 /// previous mode would give power again.
 #[test]
 fn power_does_not_return_after_a_stop_of_homing() {
-    let command = |command| move |axis: &mut Axis| drop(axis.command(command));
-    let stops: [(&str, &dyn Fn(&mut Axis)); 7] = [
+    let command = |command| move |axis: &mut Axis| _ = axis.command(command);
+    let stops: [(&str, Stops<'_>); 7] = [
         ("disable", &command(Command::Disable)),
         ("quick stop", &command(Command::QuickStop)),
         ("disable voltage", &command(Command::DisableVoltage)),
@@ -263,6 +265,7 @@ fn power_does_not_return_after_a_stop_of_homing() {
             }
             stop(&mut rig.axis);
             let mut off = 0;
+            let mut first_off = None;
             for cycle in 0..3000 {
                 if repeated {
                     stop(&mut rig.axis);
@@ -270,6 +273,7 @@ fn power_does_not_return_after_a_stop_of_homing() {
                 let status = rig.cycle();
                 let enables = rig.out.controlword & 0x0F == 0x0F;
                 off += u32::from(!status.state.has_power());
+                first_off = first_off.or((off > 0).then_some(cycle));
                 assert!(
                     !(enables && off > 0),
                     "{name} after {cycles}: power at {cycle}"
@@ -277,12 +281,69 @@ fn power_does_not_return_after_a_stop_of_homing() {
             }
             let status = rig.axis.status();
             let (stop, homing) = (status.stop, status.homing);
+            // A ramp rests for 100 ms, and needs no time-out.
+            if name != "quick stop" {
+                assert!(
+                    first_off.is_some_and(|cycle| cycle < 400),
+                    "{name} after {cycles}: {first_off:?}"
+                );
+            }
             // The drive stays in Quick stop active.
             let stays = name == "quick stop"
                 && stop.is_some_and(|stop| stop.phase == StopPhase::Standstill);
             assert!(stop.is_none() || stays, "{name} after {cycles}: {stop:?}");
             assert_ne!(homing, HomingStatus::Running, "{name} after {cycles}");
         }
+    }
+}
+
+/// Before the drive is commanded to lose its power, a loss is not that of the switch.
+#[test]
+fn power_that_is_lost_before_its_removal_does_not_return() {
+    for homes in [false, true] {
+        for cycles in 0..99 {
+            let mut rig = unpowered(config());
+            let command = match homes {
+                true => Command::Home { timeout_s: 5.0 },
+                false => Command::SetMode(Mode::Csv),
+            };
+            rig.axis.command(command).unwrap();
+            rig.run(cycles);
+            assert_eq!(rig.out.controlword & 0x0F, 0x0F);
+            rig.drive.state = State::SwitchOnDisabled;
+            let status = rig.run(3000);
+            assert!(
+                matches!(status.trip, Some(Trip::PowerLost { .. })),
+                "{cycles}"
+            );
+            assert!(!status.state.has_power(), "{cycles}");
+            assert_ne!(status.homing, HomingStatus::Running);
+        }
+    }
+}
+
+/// A drive that keeps its power keeps its mode.
+#[test]
+fn drive_that_keeps_its_power_fails_the_switch() {
+    for homes in [false, true] {
+        let mut rig = unpowered(config());
+        rig.drive.ignores_shutdown = true;
+        let command = match homes {
+            true => Command::Home { timeout_s: 5.0 },
+            false => Command::SetMode(Mode::Csv),
+        };
+        rig.axis.command(command).unwrap();
+        let status = rig.until(|s| s.switching.is_none(), 400);
+        let refused = if homes { Mode::Hm } else { Mode::Csv };
+        assert_eq!(
+            (status.mode, status.switch_failed),
+            (Mode::Csp, Some(refused))
+        );
+        let status = rig.run(10);
+        let failed = HomingStatus::Failed(HomingError::ModeRefused);
+        assert_eq!(status.homing == failed, homes, "{:?}", status.homing);
+        rig.drive.ignores_shutdown = false;
+        assert!(!rig.run(3000).state.has_power());
     }
 }
 

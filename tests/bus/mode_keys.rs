@@ -1,6 +1,6 @@
 //! Drives that show their mode in Operation enabled only, or change it without power only.
 
-use ecaxis_test_support::{assert_contains, machine, run_badly, run_well, virtual_time};
+use ecaxis_test_support::{assert_contains, faults, machine, run_badly, run_well, virtual_time};
 
 /// Returns one drive with quirks and keys of its axis.
 fn text(quirks: &str, keys: &str, steps: &str) -> String {
@@ -53,5 +53,46 @@ fn drive_that_changes_its_mode_without_power_runs_with_its_key() {
         let axis = &summary.axes[0];
         assert!((axis.final_position - 2.0).abs() < 0.01, "{quirk}");
         assert_eq!(axis.mode, "csp");
+    }
+}
+
+const KEY: &str = "mode_change = \"no-power\"";
+
+#[test]
+fn step_mode_waits_for_the_brake_that_opens_again() {
+    for release in ["30ms", "300ms"] {
+        let keys = format!("{KEY}\nbrake = {{ release = \"{release}\", engage = \"40ms\" }}");
+        let steps = "[[step]]\nmode = { x = \"csv\" }\n[[step]]\nvelocity = { x = 1.0 }\n\
+            [[step]]\nvelocity = { x = 0.0 }\n[[step]]\nmode = { x = \"csp\" }\n\
+            [[step]]\nhome = [\"x\"]\n[[step]]\nmove = { x = 2.0 }\n";
+        let text = text("mode_without_power = true", &keys, steps);
+        let summary = run_well(machine(&text), virtual_time());
+        assert!((summary.axes[0].final_position - 2.0).abs() < 0.01);
+    }
+}
+
+/// Safe torque off while the axis waits for the planned loss of power is not that loss.
+#[test]
+fn safe_torque_off_before_the_switch_stops_the_machine() {
+    for at in [120, 160, 200, 230, 300] {
+        let sto =
+            format!("[[fault]]\nkind = \"sto\"\nat = \"{at}ms\"\nfor = \"200ms\"\ndevice = 0\n");
+        let text = text("mode_without_power = true", KEY, SWITCH);
+        let (error, _) = run_badly(machine(&text), faults(&sto));
+        assert_contains(&error, &["`x`"]);
+    }
+}
+
+#[test]
+fn drive_that_keeps_its_power_fails_the_step() {
+    let steps = [
+        "[[step]]\nhome = [\"x\"]\n",
+        "[[step]]\nmode = { x = \"csv\" }\n",
+    ];
+    for step in steps {
+        let quirks = "mode_without_power = true, shutdown_ignored = true";
+        let (error, _) = run_badly(machine(&text(quirks, KEY, step)), virtual_time());
+        println!("{error}");
+        assert_contains(&error, &["`x`"]);
     }
 }

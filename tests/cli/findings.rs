@@ -25,8 +25,16 @@ fn esi(name: &str) -> String {
 }
 
 /// ESI file, its text and the replacement, further keys, exit code, what `check` says.
+type Finding = (
+    &'static str,
+    [&'static str; 2],
+    &'static str,
+    i32,
+    &'static [&'static str],
+);
+
 #[rustfmt::skip] // one row per finding
-const FINDINGS: [(&str, [&str; 2], &str, i32, &[&str]); 7] = [
+const FINDINGS: [Finding; 7] = [
     ("SV1.xml", ["DefaultSize=\"128\" StartAddress=\"#x1000\"", "DefaultSize=\"0\" StartAddress=\"#x1000\""], "", 2,
         &["the mailbox of ", "(SyncManager 0) has 0 bytes", "`mailbox = \"eeprom\"`"]),
     ("SV1.xml", ["", ""], "sdo = [{ index = 0x6072, value = 0 }]\n", 2,

@@ -781,3 +781,53 @@ fn random_requests_stay_within_the_limits() {
         assert!(moved, "seed {seed}: nothing has been tried");
     }
 }
+
+/// A stop of all axes ends a switch of the mode without power, too: power does not return.
+#[test]
+fn stop_of_all_axes_ends_a_switch_without_power() {
+    let keys = "\nmode_change = \"no-power\"";
+    let text = versatile().replace(
+        "\n[device.sim]\n",
+        &format!("{keys}\n[device.sim]\nquirks = {{ mode_without_power = true }}\n"),
+    );
+    for begin in [
+        Request::Home { axis: X },
+        Request::SetMode {
+            axis: X,
+            mode: Mode::Csv,
+        },
+    ] {
+        let mut phase = 0;
+        let mut begin = Some(begin);
+        let mut stopped = 0.0;
+        let (outcome, seen) = by_hand(
+            machine(&text),
+            virtual_time(),
+            once_enabled(move |view, since| {
+                let axis = &view.snapshot.axes[X];
+                let turn = match phase {
+                    0 => {
+                        phase = 1;
+                        request(begin.take().expect("once"))
+                    }
+                    1 if !axis.powered => {
+                        (phase, stopped) = (2, since);
+                        request(Request::StopAll)
+                    }
+                    2 if since > stopped + 4.0 => return None,
+                    _ => here(),
+                };
+                assert!(since < 20.0, "phase {phase}");
+                Some(turn)
+            }),
+        );
+        outcome.result.expect("leaving is not a failure");
+        let off = seen
+            .iter()
+            .position(|s| s.axes[0].ready)
+            .expect("ready first");
+        let mut after = seen[off..].iter().skip_while(|s| s.axes[0].powered);
+        assert!(after.next().is_some(), "the switch removes the power");
+        assert!(after.all(|s| !s.axes[0].powered), "it does not return");
+    }
+}

@@ -32,6 +32,11 @@ impl HomingRun {
         self.sequence.is_some()
     }
 
+    /// Returns true if the search is over and nothing remains but the switch back.
+    pub(super) fn leaves(&self) -> bool {
+        self.sequence.is_some_and(|sequence| sequence.leaves())
+    }
+
     /// Ends a search with an error. The first one remains.
     pub(super) fn abort(&mut self, error: HomingError) {
         if let Some(sequence) = &mut self.sequence {

@@ -20,6 +20,8 @@ pub(super) struct ModeCycle {
     pub(super) to: Mode,
     /// Time in seconds since the power was removed.
     unpowered_s: f64,
+    /// Time in seconds for which the drive was commanded to lose its power, and kept it.
+    kept_s: f64,
 }
 
 impl Axis {
@@ -35,6 +37,7 @@ impl Axis {
             from: self.mode,
             to,
             unpowered_s: 0.0,
+            kept_s: 0.0,
         });
     }
 
@@ -50,6 +53,13 @@ impl Axis {
         if self.mode_cycle.take().is_some() && self.goal == PowerGoal::On && !self.has_control() {
             self.goal = PowerGoal::Off;
         }
+    }
+
+    /// True before the drive is commanded to lose its power for a switch: a loss of power is not the
+    /// planned one.
+    pub(super) fn precedes_mode_cycle(&self) -> bool {
+        let waits = matches!(self.goal, PowerGoal::Stopping(stop) if !stop.removes_power());
+        self.mode_cycle.is_some() && waits
     }
 
     fn fail_mode_cycle(&mut self, to: Mode) {
@@ -72,7 +82,16 @@ impl Axis {
         }
         let unpowered = matches!(self.state, State::SwitchOnDisabled | State::ReadyToSwitchOn);
         match self.goal {
-            PowerGoal::Stopping(_) => return,
+            PowerGoal::Stopping(stop) => {
+                if stop.removes_power() {
+                    cycle.kept_s += dt_s;
+                }
+                self.mode_cycle = Some(cycle);
+                if cycle.kept_s > self.config.mode_time_s {
+                    self.fail_mode_cycle(cycle.to);
+                }
+                return;
+            }
             PowerGoal::Off if unpowered => {
                 self.mode = cycle.to;
                 let shown = self.config.mode_display_enabled || self.mode_confirmed();

@@ -395,7 +395,9 @@ impl Axis {
                 self.loop_state.torque == 0.0 && self.loop_state.limited_torque() == 0.0
             }
             Plan::DriveProfile => {
-                let homes = self.home.running() && self.mode_cycle.is_none();
+                // A drive that changes its mode without power only rests before the switch back.
+                let leaves = self.config.mode_change_unpowered && self.home.leaves();
+                let homes = self.home.running() && self.mode_cycle.is_none() && !leaves;
                 !homes && self.at_standstill()
             }
             _ => self.motion.velocity == 0.0 && self.play_rests(),

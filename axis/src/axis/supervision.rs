@@ -134,7 +134,7 @@ impl Axis {
             return;
         }
         if self.state != State::OperationEnabled {
-            if self.goal == PowerGoal::On {
+            if self.goal == PowerGoal::On || self.precedes_mode_cycle() {
                 self.trip(Trip::PowerLost { state: self.state });
             }
             return;

@@ -160,6 +160,12 @@ impl Sequence {
         )
     }
 
+    /// Returns true if nothing remains but the switch back.
+    #[must_use]
+    pub const fn leaves(&self) -> bool {
+        matches!(self.phase, Phase::Leave { .. })
+    }
+
     /// Halts the axis and switches back. Has no effect after the end of the search.
     pub fn abort(&mut self, error: HomingError) {
         self.phase = match self.phase {

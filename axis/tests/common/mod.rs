@@ -50,6 +50,8 @@ pub struct Drive {
     mode_waits: u32,
     /// The mode changes without power only.
     pub mode_unpowered: bool,
+    /// Shutdown has no effect in Operation enabled.
+    pub ignores_shutdown: bool,
     /// Cycles in Operation enabled until the mode is shown. `None`: it is always shown.
     pub shown_after: Option<u32>,
     enabled_cycles: u32,
@@ -98,6 +100,7 @@ impl Drive {
             mode_delay: Some(0),
             mode_waits: 0,
             mode_unpowered: false,
+            ignores_shutdown: false,
             shown_after: None,
             enabled_cycles: 0,
             load: 0.0,
@@ -266,7 +269,9 @@ impl Drive {
             State::SwitchedOn if w & 7 == 6 => State::ReadyToSwitchOn,
             State::SwitchedOn if w & 2 == 0 || w & 6 == 2 => State::SwitchOnDisabled,
             State::OperationEnabled if w == 7 => State::SwitchedOn,
-            State::OperationEnabled if w & 7 == 6 => State::ReadyToSwitchOn,
+            State::OperationEnabled if w & 7 == 6 && !self.ignores_shutdown => {
+                State::ReadyToSwitchOn
+            }
             State::OperationEnabled if w & 2 == 0 => State::SwitchOnDisabled,
             State::OperationEnabled if w & 6 == 2 => State::QuickStopActive,
             State::QuickStopActive if w & 2 == 0 => State::SwitchOnDisabled,

@@ -223,7 +223,9 @@ impl Monitor {
             );
         }
 
-        if (lost || released) && !self.is_cause(cycle, &was) {
+        // The power of a mode switch is removed, not lost.
+        let early = lost && self.switches && !self.ended && word(&sent) == 0x0F;
+        if early || (lost || released) && !self.is_cause(cycle, &was) {
             let (shown, cause) = (self.shown, status.power_loss_cause);
             return violation(
                 CAUSE,

@@ -381,10 +381,14 @@ impl Supervisor {
         }
     }
 
-    /// Returns the error of the first device with inputs that do not answer a read.
+    /// Returns the error of the first device in SafeOp with inputs that do not answer a read. In a lower
+    /// state, no SyncManager of process data does.
     async fn unfilled_inputs(&self) -> Option<Error> {
         let devices = self.machine.devices.iter().zip(&self.bus.devices);
         for (config, device) in devices.filter(|(_, device)| device.present) {
+            if !self.serves_inputs(device.at.station).await {
+                continue;
+            }
             let inputs = config.selection.layout.inputs.iter();
             for sm in inputs.filter(|sm| !config.device.op_only(sm).sync_manager) {
                 let mut area = vec![0; sm.len.into()];
@@ -400,6 +404,15 @@ impl Supervisor {
             }
         }
         None
+    }
+
+    async fn serves_inputs(&self, station: u16) -> bool {
+        let read = al::read_status(&self.wire, station).await;
+        let state = read
+            .ok()
+            .flatten()
+            .map(|(status, _)| AlState::from_status(status));
+        matches!(state, Some(AlState::SafeOp | AlState::Op))
     }
 
     /// True if the process data of all groups is fresh, except those with an absent device.

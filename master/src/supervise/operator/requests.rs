@@ -80,9 +80,11 @@ impl RequestContext<'_> {
         Some(self.snapshot.axes.get(axis)?.mode)
     }
 
-    fn enabled(&self, axis: AxisIndex) -> bool {
+    /// Returns `true` if a stop has something to end: power, or a switch of the mode without power,
+    /// after which power returns.
+    fn is_commanded(&self, axis: AxisIndex) -> bool {
         let status = self.snapshot.axes.get(axis);
-        status.is_some_and(|status| status.enabled)
+        status.is_some_and(|status| status.enabled || status.switching.is_some())
     }
 
     /// Returns `true` while the set-point moves. At constant velocity the set-point has arrived but
@@ -138,7 +140,7 @@ impl RequestController {
                 hand.stop(axis, scene.now, out);
             } else {
                 hand.doing = Activity::Nothing;
-                if moved && scene.enabled(axis) {
+                if moved && scene.is_commanded(axis) {
                     out.push((axis, Command::Stop));
                 }
             }
@@ -279,7 +281,7 @@ impl RequestController {
         match request {
             Request::StopAll => {
                 for (axis, hand) in self.hands.enumerate_mut() {
-                    if scene.enabled(axis) {
+                    if scene.is_commanded(axis) {
                         hand.stop(axis, scene.now, out);
                     }
                 }

@@ -1,5 +1,7 @@
 //! Steps that move axes to their own targets or change their modes.
 
+use std::sync::Arc;
+
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Command, Mode};
 use ecaxis_ecat::index::{AxisIndex, IndexVec};
@@ -72,10 +74,16 @@ impl Turn<'_, '_> {
         let commands = targets.iter();
         self.command(commands.map(|&(axis, mode)| (axis, Command::SetMode(mode))))
             .await;
+        let machine = Arc::clone(&self.machine);
         let there = |s: &Snapshot, axis: AxisIndex| {
             let wanted = targets.iter().find(|(a, _)| *a == axis);
             let status = &s.axes[axis];
-            Some(status.mode) == wanted.map(|(_, mode)| *mode) && status.switching.is_none()
+            // With the power, the brake opens again.
+            let unpowered = machine.axes[axis].config.mode_change_unpowered;
+            let opens = unpowered && status.powered && !status.ready;
+            Some(status.mode) == wanted.map(|(_, mode)| *mode)
+                && status.switching.is_none()
+                && !opens
         };
         self.until(step, start, there, &axes).await
     }
