@@ -203,6 +203,8 @@ impl Axis {
         }
         if !self.has_control() {
             self.check_coasting()?;
+        }
+        if self.goal != PowerGoal::On {
             self.power_loss_cause = None;
         }
         self.goal = PowerGoal::On;

@@ -200,8 +200,11 @@ impl Axis {
             return Err(CommandError::NoPosition { mode: to });
         }
         // The deceleration is unknown in these modes.
-        let rest = matches!(to, Mode::Pp | Mode::Hm) || self.config.mode_change_unpowered;
-        if rest && !(self.setpoint_at_rest() && self.at_standstill()) {
+        let unpowered = self.config.mode_change_unpowered;
+        let rest = matches!(to, Mode::Pp | Mode::Hm) || unpowered;
+        let rests = self.setpoint_at_rest() && self.at_standstill();
+        // A set-point that turns back rests for a cycle, and goes on until the power is removed.
+        if rest && !(rests && (!unpowered || self.setpoint_arrived())) {
             return Err(CommandError::StillMoving {
                 velocity: self.actual.velocity(),
             });
