@@ -22,7 +22,7 @@ class Pdo:
     sm: int | None
     # (index, sub, bits, name)
     entries: list
-    # The samples of a cycle without an OpMode (`OSFac`).
+    # The samples of a cycle (ETG.2000, `OSFac`), unless an OpMode says otherwise. An EEPROM describes one.
     samples: int = 1
 
     @property
@@ -63,17 +63,8 @@ class Device:
     def identity(self):
         return (self.vendor, self.product, self.revision)
 
-    def of_sm(self, number):
-        return [pdo for pdo in self.rx + self.tx if pdo.sm == number]
-
     def sm_bits(self, number):
-        return sum(pdo.bits for pdo in self.of_sm(number))
-
-    def mapped_bits(self, pdos):
-        """The bits that a MainDevice maps without an OpMode. With CoE it reads objects, which have the samples of a cycle
-        (ETG.2000, `OSFac`); an EEPROM has one, because ETG.2010 has no field for their number."""
-        with_coe = self.protocols & PROTOCOLS["CoE"]
-        return sum(pdo.bits * (pdo.samples if with_coe else 1) for pdo in pdos)
+        return sum(pdo.bits for pdo in self.rx + self.tx if pdo.sm == number)
 
     def sm_length(self, number):
         """The size in the file; without it, the size of the default PDOs."""
