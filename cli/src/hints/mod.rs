@@ -320,7 +320,7 @@ fn not_homed(error: HomingError) -> &'static str {
             "the drive did not keep the home offset, or counts it with the other sign (0x607C; maxon 0x30B0): compare it with `homing.position`"
         }
         HomingError::ModeRefused => {
-            "check 0x6502 (supported drive modes): this drive may not support homing; for a drive that changes its mode only without power set `mode_change = \"no-power\"`"
+            "check 0x6502 (supported drive modes): this drive may not support homing; a slow drive needs a longer `mode_time`, one that changes its mode only without power needs `mode_change = \"no-power\"`"
         }
         HomingError::PowerLost => "check the drive's fault (0x603F) and its supply",
         HomingError::Aborted | HomingError::Held => "home the axis again before any absolute move",
@@ -392,6 +392,10 @@ fn second_end(end: &SecondEnd) -> String {
     }
 }
 
+/// How a list such as 0x1C12 is written.
+const ORDER_OF_A_LIST: &str =
+    "write in this order: subindex 0 = 0, the entries, subindex 0 = their number";
+
 /// The advice for a device that does not let its PDO assignment be changed.
 const KEPT_ASSIGNMENT: &str = "the device keeps its PDO assignment: `ecaxis sdo read` shows its PDOs (0x1C12, 0x1C13); use the ESI file of its firmware, or choose these PDOs with `mode` or `assignment`";
 
@@ -456,9 +460,7 @@ fn sdo(error: &SdoError, origin: &str) -> String {
             abort::OUT_OF_RANGE..=abort::MAX_BELOW_MIN => {
                 "the value is outside what the drive allows: its firmware does not match the ESI file"
             }
-            abort::SUBINDEX_0_NOT_ZERO if own => {
-                "write in this order: subindex 0 = 0, the entries, subindex 0 = their number"
-            }
+            abort::SUBINDEX_0_NOT_ZERO if own => ORDER_OF_A_LIST,
             abort::SUBINDEX_0_NOT_ZERO => {
                 "the drive has not emptied this list (subindex 0 = 0): switch it off and on"
             }
@@ -544,8 +546,7 @@ pub(crate) fn al_status(code: u16) -> &'static str {
 }
 
 /// The advice for a drive that does not change its mode in Operation enabled.
-const MODE_CHANGE: &str =
-    "for a drive that changes its mode only without power set `mode_change = \"no-power\"`";
+const MODE_CHANGE: &str = "a slow drive needs a longer `mode_time`; one that changes its mode only without power needs `mode_change = \"no-power\"`";
 
 fn not_enabled(state: State, code: Option<u16>, waiting: Option<EnableBlocker>) -> String {
     match waiting {

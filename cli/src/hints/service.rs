@@ -12,7 +12,7 @@ use ecaxis_master::eoe::TapStep;
 use ecaxis_master::mailbox::{CoeCause, EoeError, InfoError, SdoError};
 use ecaxis_master::report::{Cause, Error};
 
-use super::{Failure, failure, sdo};
+use super::{Failure, ORDER_OF_A_LIST, failure, sdo};
 
 pub(super) const FRAMES: &str = "frames are lost or a device restarts: check cables and supply";
 
@@ -107,9 +107,7 @@ pub(super) fn parameter(error: &SdoError) -> String {
         Some(abort::WRITE_ONLY | abort::READ_ONLY) => {
             "`ecaxis sdo list` shows what can be read and written"
         }
-        Some(abort::SUBINDEX_0_NOT_ZERO) => {
-            "write in this order: subindex 0 = 0, the entries, subindex 0 = their number"
-        }
+        Some(abort::SUBINDEX_0_NOT_ZERO) => ORDER_OF_A_LIST,
         Some(abort::INCOMPATIBLE_PARAMETERS | abort::INTERNAL_INCOMPATIBILITY) => {
             "the value contradicts another setting of the device: write that one first"
         }
