@@ -198,7 +198,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     failure.map_or(written, Err)
 }
 
-/// Runs the machine like [`session::run_attached`], again and again as long as devices are absent.
+/// Runs the machine like [`session::run_attached`], once its devices are present: as long as some are
+/// absent, the bring-up is tried again.
 fn run_when_present(
     machine: &Machine,
     options: &Options,
@@ -227,7 +228,10 @@ fn run_when_present(
             &mut observer,
             attachments,
         );
-        let Some(error) = outcome.result.as_ref().err().filter(|e| e.is_absence()) else {
+        // A machine that has run does not start again: its program would begin anew.
+        let has_run = outcome.summary.is_some();
+        let absence = outcome.result.as_ref().err().filter(|e| e.is_absence());
+        let Some(error) = absence.filter(|_| !has_run) else {
             return outcome;
         };
         let failure = hints::failure(error, &machine.bus.nic);
