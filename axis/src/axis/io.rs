@@ -24,8 +24,9 @@ pub struct Inputs {
     /// False if no answer arrived in time. The values are then old, and no decision uses them. The
     /// set-point continues for two consecutive cycles of this kind and then waits.
     pub fresh: bool,
-    /// True if the inputs are not fresh but a late answer to an earlier frame arrived, or a frame came
-    /// back without the answer of one of its devices, perhaps another one. The targets arrive, so the set-point decelerates instead of waiting.
+    /// True if the inputs are not fresh but a late answer to an earlier frame arrived, or a frame
+    /// came back without the answer of one of its devices, perhaps another one. The targets arrive,
+    /// so the set-point decelerates instead of waiting.
     pub late: bool,
 }
 

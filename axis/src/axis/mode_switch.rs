@@ -163,9 +163,9 @@ impl Axis {
         }
     }
 
-    /// True if the previous mode must be requested: too many consecutive frames were lost a few cycles
-    /// ago, and the drive may move in that mode. After homing the drive stands, and bit 4 could start another
-    /// homing.
+    /// True if the previous mode must be requested: too many consecutive frames were lost a few
+    /// cycles ago, and the drive may move in that mode. After homing the drive stands, and bit 4
+    /// could start another homing.
     fn is_held_back(&self, switch: &Switch) -> bool {
         (self.setpoint_frozen() || switch.pause > 0)
             && !switch.reached

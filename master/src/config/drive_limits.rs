@@ -257,35 +257,33 @@ impl AxisSetup {
 
     /// Checks maxon's current limit. The rated torque is that of the nominal current.
     fn max_current(&self, nominal: i64, raw: i64) -> Option<LimitConflict> {
-        let torque = &self.torque;
-        let is_known = torque.unit == super::TorqueUnit::Percent || torque.rated.is_some();
         let most = raw as f64 / nominal as f64 * 100.0;
-        let limit = self.config.limits.torque;
-        let (index, sub) = CURRENT_LIMIT;
-        (is_known && exceeds(limit, most)).then(|| LimitConflict {
-            index,
-            sub,
-            text: format!(
-                "= {raw} mA, {nominal} mA nominal, allows {} {unit}, `limits.torque` is {} {unit}",
-                rounded(torque.shown(most)),
-                rounded(torque.shown(limit)),
-                unit = torque.unit,
-            ),
-            certain: true,
-        })
+        let drive = format!("= {raw} mA, {nominal} mA nominal,");
+        self.torque_limit(CURRENT_LIMIT, most, &drive)
     }
 
     /// Checks a torque limit in thousandths of the rated torque.
     fn max_torque(&self, index: u16, raw: i64) -> Option<LimitConflict> {
+        let drive = format!("= {raw} ‰ of rated torque");
+        self.torque_limit((index, 0), raw as f64 / 10.0, &drive)
+    }
+
+    /// Compares `limits.torque` with a limit of the drive in percent of the rated torque. `drive`:
+    /// the limit in the unit of the object.
+    fn torque_limit(
+        &self,
+        (index, sub): (u16, u8),
+        most: f64,
+        drive: &str,
+    ) -> Option<LimitConflict> {
         let torque = &self.torque;
         let is_known = torque.unit == super::TorqueUnit::Percent || torque.rated.is_some();
-        let most = raw as f64 / 10.0;
         let limit = self.config.limits.torque;
         (is_known && exceeds(limit, most)).then(|| LimitConflict {
             index,
-            sub: 0,
+            sub,
             text: format!(
-                "= {raw} ‰ of rated torque allows {} {unit}, `limits.torque` is {} {unit}",
+                "{drive} allows {} {unit}, `limits.torque` is {} {unit}",
                 rounded(torque.shown(most)),
                 rounded(torque.shown(limit)),
                 unit = torque.unit,

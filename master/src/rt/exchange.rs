@@ -88,12 +88,12 @@ pub struct Exchange {
     inputs: Vec<u8>,
     /// Copies of inputs to outputs, each with the device of the inputs.
     copies: Vec<(DeviceIndex, BitCopy)>,
-    /// Copies of outputs to outputs.
     /// The outputs at the start of the run.
     initial_outputs: Vec<u8>,
     /// The devices whose outputs have their initial values, as `output_locks` lists them.
     locked: IndexVec<DeviceIndex, bool>,
     output_locks: Vec<(DeviceIndex, BitCopy)>,
+    /// Copies of outputs to outputs.
     repeats: Vec<BitCopy>,
 }
 
