@@ -84,11 +84,11 @@ impl ServerOperator {
         let stopped = matches!(
             news,
             RequestEvent::Done {
-                what: Activity::Stopping,
+                what: Activity::Stopping | Activity::Disabling,
                 ..
             }
         );
-        // A stop takes over the number of the motion that it ends.
+        // A stop takes over the number of the motion or of the enabling that it ends.
         let interrupted = stopped && command.is_some_and(|command| !command.stops);
         let text = news.to_string();
         let (kind, error) = match news {

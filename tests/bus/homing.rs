@@ -362,3 +362,22 @@ fn a_file_without_pdo_keys_homes_probes_and_switches_modes() {
     let summary = run_well(machine, virtual_time());
     assert_eq!(summary.program_runs, 1);
 }
+
+/// After a move, the loop overshoots, stands for tens of ms, and creeps back at about the standstill
+/// velocity. The next search for home waits for it.
+#[test]
+fn homing_after_a_move_waits_for_the_end_of_the_overshoot() {
+    for target in 1..=24 {
+        let to = f64::from(target) * 0.1 + 0.5;
+        let text = format!(
+            "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"\nposition = 0\n\
+             mode = \"csp\"\npdo.rx = [\"0x6040\", \"0x6060\", \"0x607A\", \"0x60FF\"]\n\
+             pdo.tx = [\"0x6041\", \"0x6061\", \"0x6064\", \"0x606C\"]\n[device.axis]\nencoder = 2000\n\
+             limits = {{ velocity = 20.0, acceleration = 500.0, following_error = 0.9 }}\n\
+             homing = {{ method = 17, search = 5.0, zero = 1.0, timeout = \"5s\" }}\n\
+             [device.sim]\ntrack = {{ start = 0.5, negative_limit = 0.0 }}\n\
+             [[step]]\nhome = [\"x\"]\n[[step]]\nmove = {{ x = {to:.1} }}\n[[step]]\nhome = [\"x\"]\n"
+        );
+        run_well(machine(&text), virtual_time());
+    }
+}

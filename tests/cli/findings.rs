@@ -34,13 +34,21 @@ type Finding = (
 );
 
 #[rustfmt::skip] // one row per finding
-const FINDINGS: [Finding; 7] = [
+const FINDINGS: [Finding; 11] = [
     ("SV1.xml", ["DefaultSize=\"128\" StartAddress=\"#x1000\"", "DefaultSize=\"0\" StartAddress=\"#x1000\""], "", 2,
-        &["the mailbox of ", "(SyncManager 0) has 0 bytes", "`mailbox = \"eeprom\"`"]),
+        &["the mailbox of ", "(SyncManager 0) has no size", "`mailbox = \"eeprom\"`"]),
+    ("SV1.xml", ["DefaultSize=\"128\" StartAddress=\"#x1000\"", "DefaultSize=\"12\" StartAddress=\"#x1000\""], "", 2,
+        &["(SyncManager 0) has 12 bytes, an SDO needs 16"]),
+    ("SV1.xml", ["DefaultSize=\"128\" StartAddress=\"#x1000\"", "DefaultSize=\"2000\" StartAddress=\"#x1000\""], "", 2,
+        &["(SyncManager 0) has 2000 bytes, a frame carries 1486"]),
+    ("SV1.xml", ["DefaultSize=\"128\" StartAddress=\"#x1000\"", "DefaultSize=\"300\" StartAddress=\"#x1000\""], "", 2,
+        &["overlap: SyncManager 0 ends at 0x112C, SyncManager 1 begins at 0x1100"]),
+    ("SV1.xml", ["<RxPdo Fixed=\"1\" Mandatory=\"1\" Sm=\"2\">", "<RxPdo Fixed=\"1\" Mandatory=\"1\" Sm=\"9\">"], "", 0,
+        &["RxPdo 0x1600 is assigned to SyncManager 9, which the device does not have: SyncManager 2 carries it"]),
     ("SV1.xml", ["", ""], "sdo = [{ index = 0x6072, value = 0 }]\n", 2,
         &["leaves the drive without torque: it cannot move", "such as 1000"]),
     ("SV1.xml", ["<DefaultValue>2000</DefaultValue>", "<DefaultValue>0</DefaultValue>"], "", 0,
-        &["0x6072", "leaves the drive without torque", "the ESI says so"]),
+        &["0x6072", "leaves the drive without torque: it cannot move; write the largest"]),
     ("SV1.xml", ["Factor=\"1\">0</CycleTimeSync0>", "Factor=\"0\">300000</CycleTimeSync0>"], "", 0,
         &["fixes the cycle of SYNC0 at 300 µs", "must be a multiple of it"]),
     ("SV1.xml", ["<ShiftTimeSync0>0<", "<ShiftTimeSync0>1500000<"], "", 0,

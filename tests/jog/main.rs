@@ -782,6 +782,29 @@ fn random_requests_stay_within_the_limits() {
     }
 }
 
+/// A stop while the axis is being enabled: it gets no power, and the request ends as replaced.
+#[test]
+fn a_stop_ends_the_enabling_of_an_axis() {
+    for stop in [Request::StopAll, Request::Stop { axis: X }] {
+        let mut turn = 0;
+        let (outcome, seen) = by_hand(machine(&versatile()), virtual_time(), move |view, now| {
+            turn += 1;
+            match turn {
+                1 => request(Request::Enable { axis: X }),
+                2 => {
+                    assert_eq!(view.hands[X].doing, Activity::Enabling);
+                    request(stop)
+                }
+                _ if now < 3.0 => here(),
+                _ => operator::gone(),
+            }
+        });
+        outcome.result.expect("leaving is not a failure");
+        let powered = seen.iter().find(|s| s.axes[0].powered);
+        assert!(powered.is_none(), "{stop:?}: power at {powered:?}");
+    }
+}
+
 /// A stop of all axes ends a switch of the mode without power, too: power does not return.
 #[test]
 fn stop_of_all_axes_ends_a_switch_without_power() {

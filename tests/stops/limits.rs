@@ -279,6 +279,34 @@ fn a_drive_that_ignores_a_lost_connection_causes_a_warning() {
     }
 }
 
+/// `limits.torque` is not in the file. The ESI writes 0 at start-up.
+#[test]
+fn a_drive_without_torque_causes_a_warning() {
+    let bench = Bench::new();
+    bench.change("esi/EPOS4.xml", |text| {
+        let from = "CompleteAccess=\"0\" SegmentedSdo=\"1\"/>";
+        let command = "<InitCmd><Transition>PS</Transition><Index>#x6072</Index>\
+            <SubIndex>0</SubIndex><Data>0000</Data></InitCmd>";
+        assert!(text.contains(from));
+        let to = format!("{}>{command}</CoE>", from.trim_end_matches("/>"));
+        text.replacen(from, &to, 1)
+    });
+    let limits =
+        "position = [-20.0, 20.0], velocity = 10.0, acceleration = 200.0, following_error = 0.2";
+    for (device, expected) in [
+        ("", true),
+        ("sdo = [{ index = 0x6072, value = 900 }]", false),
+    ] {
+        let (_, heard) = run(bench.machine(&epos4(device, limits)), virtual_time());
+        let warnings = heard.warnings();
+        let text = "0x6072:00 (Max torque) = 0 leaves the drive without torque";
+        let warned = warnings
+            .iter()
+            .any(|w| w.contains("`x`") && w.contains(text));
+        assert_eq!(warned, expected, "{warnings:?}");
+    }
+}
+
 #[test]
 fn a_drive_limit_below_the_file_limit_causes_a_warning() {
     let bench = Bench::new();

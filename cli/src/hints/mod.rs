@@ -102,6 +102,12 @@ pub(crate) fn failure(error: &Error, nic: &Nic) -> Failure {
         Cause::Modules { .. } => {
             "plug the modules in the order of `modules`, or correct `modules`: the list is complete, with \"-\" for an empty slot; `ecaxis compare` shows all differences".to_owned()
         }
+        // Not an object of modules or PDOs.
+        Cause::NotReady { cause, .. }
+            if matches!(**cause, Cause::StartUp { index: 0x2000..=0xefff, .. }) =>
+        {
+            "switch the device off and on, and end other programs at its mailbox; if it has modules, check their supply and slots (`ecaxis compare`)".to_owned()
+        }
         Cause::NotReady { .. } => {
             "check the supply of the device and of its modules, and the modules in its slots; `ecaxis compare` compares them with the file".to_owned()
         }
@@ -468,7 +474,7 @@ fn sdo(error: &SdoError, origin: &str) -> String {
                 "the object cannot be written: remove it from `sdo`"
             }
             abort::UNSUPPORTED_ACCESS..=abort::READ_ONLY => {
-                "the object is read-only in the drive: its firmware does not match the ESI file"
+                "the drive does not permit this access to the object: its firmware does not match the ESI file"
             }
             abort::TYPE_MISMATCH..=abort::DATA_TOO_SHORT if own => {
                 "the object has another length in the drive: set its `type` in `sdo`"

@@ -211,6 +211,7 @@ fn run_when_present(
     const TURN: Duration = Duration::from_millis(50);
     let mut delay = RetryDelay::default();
     let (mut reported, mut printed) = (None, Vec::new());
+    let mut confirmed = false;
     loop {
         let attachments = Attachments {
             control: Arc::clone(control),
@@ -230,12 +231,20 @@ fn run_when_present(
         );
         // A machine that has run does not start again: its program would begin anew.
         let has_run = outcome.summary.is_some();
-        let absence = outcome.result.as_ref().err().filter(|e| e.is_absence());
-        let Some(error) = absence.filter(|_| !has_run) else {
+        let Some(error) = outcome.result.as_ref().err().filter(|_| !has_run) else {
             return outcome;
         };
+        // A device that loses its power during bring-up fails in any step. The next attempt shows
+        // whether it is absent.
+        let of_device = error.is_in_bring_up() && error.device().is_some();
+        if !error.is_absence() && (confirmed || !of_device) {
+            return outcome;
+        }
+        confirmed = !error.is_absence();
         let failure = hints::failure(error, &machine.bus.nic);
-        if reported.as_ref() != Some(&failure.message) {
+        if confirmed {
+            note(&format!("{}; bring-up begins once more", failure.message));
+        } else if reported.as_ref() != Some(&failure.message) {
             note(&format!("waiting (Ctrl-C ends it): {}", failure.message));
             for hint in &failure.hints {
                 note(&format!("  = help: {hint}"));

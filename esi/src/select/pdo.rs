@@ -124,6 +124,7 @@ impl PdoSelector<'_> {
         };
         for pdo in &mut chosen {
             let sm = self.sm_of(pdo)?;
+            notes.extend(self.absent_sm(pdo, sm));
             notes.extend(self.other_direction(pdo, sm));
             if pdo.excluded_sm.contains(&sm) {
                 return Err(SelectError::ExcludedSyncManager {
@@ -454,6 +455,17 @@ impl PdoSelector<'_> {
             Direction::Rx => "pdo.rx",
             Direction::Tx => "pdo.tx",
         }
+    }
+
+    /// Reports a SyncManager that the device does not have.
+    fn absent_sm(&self, pdo: &Pdo, taken: u8) -> Option<String> {
+        let named = pdo.sm.filter(|sm| *sm != taken)?;
+        Some(format!(
+            "warning: {} 0x{:04x} is assigned to SyncManager {named}, which the device does not \
+             have: SyncManager {taken} carries it; correct `Sm` in the ESI file",
+            direction_name(self.direction),
+            pdo.index
+        ))
     }
 
     /// Reports a SyncManager that does not carry process data of this direction.

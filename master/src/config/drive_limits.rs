@@ -61,9 +61,7 @@ impl AxisSetup {
         if self.config.limits.following_error.is_some() {
             objects.push((FOLLOWING_WINDOW, 0));
         }
-        if self.torque.limit_said {
-            objects.extend(MAX_TORQUES.map(|index| (index, 0)));
-        }
+        objects.extend(MAX_TORQUES.map(|index| (index, 0)));
         if maxon {
             objects.push(MAX_GEAR_SPEED);
         }
@@ -74,7 +72,7 @@ impl AxisSetup {
     }
 
     /// Returns the limits that this axis exceeds. `drive` returns the bytes of a limit object.
-    /// Zero means no limit.
+    /// Zero means no limit, but no torque in a limit of torques.
     pub(crate) fn exceeded(
         &self,
         drive: impl Fn(u16, u8) -> Option<Vec<u8>>,
@@ -107,7 +105,10 @@ impl AxisSetup {
             found.extend(self.following(window));
         }
         for index in MAX_TORQUES {
-            found.extend(set(index).and_then(|n| self.max_torque(index, n)));
+            // Zero is not the limit in the cycle if the outputs have another value.
+            let is_output = selection.layout.rx_field(index, 0).is_some();
+            let limit = value(index, 0).filter(|n| *n != 0 || !is_output);
+            found.extend(limit.and_then(|n| self.max_torque(index, n)));
         }
         if let (Some(nominal), Some(most)) = (set_in(NOMINAL_CURRENT), set_in(CURRENT_LIMIT)) {
             found.extend(self.max_current(nominal, most));
@@ -264,6 +265,19 @@ impl AxisSetup {
 
     /// Checks a torque limit in thousandths of the rated torque.
     fn max_torque(&self, index: u16, raw: i64) -> Option<LimitConflict> {
+        if raw == 0 {
+            return Some(LimitConflict {
+                index,
+                sub: 0,
+                text: "= 0 leaves the drive without torque: it cannot move; write the largest \
+                       torque in 0.1 % of the rated torque, such as 1000"
+                    .to_owned(),
+                certain: true,
+            });
+        }
+        if !self.torque.limit_said {
+            return None;
+        }
         let drive = format!("= {raw} ‰ of rated torque");
         self.torque_limit((index, 0), raw as f64 / 10.0, &drive)
     }
@@ -382,24 +396,5 @@ pub(super) fn check(
         }
     }
     notes.extend(whole_range(axis, drive));
-    for index in MAX_TORQUES {
-        let is_zero = |bytes: &Vec<u8>| number(bytes, false) == 0;
-        // The outputs have a value of their own.
-        let is_output = selection.layout.rx_field(index, 0).is_some();
-        if is_output || !drive(index, 0).as_ref().is_some_and(is_zero) {
-            continue;
-        }
-        let object = NamedObject { index, sub: 0 };
-        let message = format!("{object} = 0 leaves the drive without torque: it cannot move");
-        match sdos.iter().rev().find(|s| s.address() == (index, 0)) {
-            Some(own) => {
-                let hint = "write the largest torque in 0.1 % of the rated torque, such as 1000";
-                p.add_hint(own.value.span(), message, hint);
-            }
-            None => notes.push(format!(
-                "{message}; the ESI says so: if the drive does not hold another value, write it with `sdo`"
-            )),
-        }
-    }
     notes
 }

@@ -43,8 +43,9 @@ pub(super) use turn::Turn;
 
 /// The timeout in ns for an axis to follow after its set-point has arrived.
 const SETTLE_TIMEOUT: Nanos = 5_000_000_000;
-/// The time in ns at standstill velocity after which an axis is at rest.
-const STANDSTILL_TIME: Nanos = 20_000_000;
+/// The time in ns at standstill velocity after which an axis is at rest. A loop that overshoots stands
+/// for tens of ms before it creeps back.
+const STANDSTILL_TIME: Nanos = 100_000_000;
 
 /// The quantity that a step's target sets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -3,6 +3,7 @@
 use ecaxis_esi as esi;
 
 use super::{KeyExt, MailboxSource, Problems, RawDevice, show};
+use crate::link::MAX_DATA;
 
 /// The shortest mailbox for one SDO: mailbox header, CoE header, SDO header and data.
 const MIN_MAILBOX: u16 = 16;
@@ -18,19 +19,45 @@ pub(super) fn mailbox(
     if device.mailbox.is_none() || source == MailboxSource::Eeprom {
         return;
     }
-    let mut managers = (0..).zip(&device.sync_managers);
-    let short = managers.find(|(_, sm): &(u8, _)| {
-        matches!(sm.usage, MBoxOut | MBoxIn) && sm.default_size < MIN_MAILBOX
+    let managers = (0..).zip(&device.sync_managers);
+    let boxes: Vec<(u8, &esi::SyncManager)> = managers
+        .filter(|(_, sm)| matches!(sm.usage, MBoxOut | MBoxIn))
+        .collect();
+    let name = &device.name;
+    let wrong_size = boxes.iter().find_map(|(number, sm)| match sm.default_size {
+        0 => Some(format!(
+            "the mailbox of {name} (SyncManager {number}) has no size (`DefaultSize`)"
+        )),
+        size if size < MIN_MAILBOX => Some(format!(
+            "the mailbox of {name} (SyncManager {number}) has {size} bytes, an SDO needs {MIN_MAILBOX}"
+        )),
+        size if size > MAX_DATA => Some(format!(
+            "the mailbox of {name} (SyncManager {number}) has {size} bytes, a frame carries {MAX_DATA}"
+        )),
+        _ => None,
     });
-    if let Some((number, sm)) = short {
-        let message = format!(
-            "the mailbox of {} (SyncManager {number}) has {} bytes, an SDO needs {MIN_MAILBOX}",
-            device.name, sm.default_size
-        );
+    let end = |sm: &esi::SyncManager| u32::from(sm.start_address) + u32::from(sm.default_size);
+    let overlap = || {
+        let mut in_order = boxes.clone();
+        in_order.sort_by_key(|(_, sm)| sm.start_address);
+        in_order
+            .array_windows()
+            .find_map(|[(first, a), (second, b)]| {
+                (end(a) > u32::from(b.start_address)).then(|| {
+                    format!(
+                        "the mailboxes of {name} overlap: SyncManager {first} ends at 0x{:04X}, \
+                     SyncManager {second} begins at 0x{:04X}",
+                        end(a),
+                        b.start_address
+                    )
+                })
+            })
+    };
+    if let Some(message) = wrong_size.or_else(overlap) {
         let hint = match raw.sii.place() {
-            Some(_) => "use an image of the device with the sizes of its mailboxes",
+            Some(_) => "use an image of the device with its mailboxes",
             None => {
-                "`mailbox = \"eeprom\"` uses the mailboxes of the device; or correct `DefaultSize` in the ESI file"
+                "`mailbox = \"eeprom\"` uses the mailboxes of the device; or correct the SyncManagers in the ESI file"
             }
         };
         let at = raw.esi.place().or(raw.sii.place());

@@ -235,8 +235,7 @@ impl RequestController {
                     hand.stop(axis, scene.now, out);
                 }
                 Activity::Enabling if presence != Presence::Here => {
-                    hand.begin(Activity::Disabling, scene.now);
-                    out.push((axis, Command::Disable));
+                    hand.stop(axis, scene.now, out);
                 }
                 Activity::Stopping | Activity::Disabling => {}
                 doing if presence != Presence::Here && (doing.moves() || moving) => {
@@ -281,7 +280,7 @@ impl RequestController {
         match request {
             Request::StopAll => {
                 for (axis, hand) in self.hands.enumerate_mut() {
-                    if scene.is_commanded(axis) {
+                    if scene.is_commanded(axis) || hand.doing == Activity::Enabling {
                         hand.stop(axis, scene.now, out);
                     }
                 }
@@ -300,7 +299,9 @@ impl RequestController {
                 self.begin(axis, Activity::Disabling, Command::Disable, scene, out);
             }
             Request::Stop { axis } => {
-                self.begin(axis, Activity::Stopping, Command::Stop, scene, out);
+                let hand = self.hands.get(axis).copied().unwrap_or_default();
+                let (doing, command) = hand.end_of_activity();
+                self.begin(axis, doing, command, scene, out);
             }
             Request::SetMode { axis, mode } => {
                 let doing = Activity::Switching { to: mode };
@@ -549,9 +550,18 @@ impl AxisActivity {
         }
     }
 
+    /// Returns what stops the axis. One that is being enabled gets no power.
+    fn end_of_activity(&self) -> (Activity, Command) {
+        match self.doing {
+            Activity::Enabling => (Activity::Disabling, Command::Disable),
+            _ => (Activity::Stopping, Command::Stop),
+        }
+    }
+
     fn stop(&mut self, axis: AxisIndex, now: Nanos, out: &mut Commands) {
-        self.begin(Activity::Stopping, now);
-        out.push((axis, Command::Stop));
+        let (doing, command) = self.end_of_activity();
+        self.begin(doing, now);
+        out.push((axis, command));
     }
 
     /// Returns the result of the current activity once it has ended.
