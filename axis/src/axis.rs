@@ -156,6 +156,9 @@ pub struct Axis {
     power_loss_cause: Option<PowerLossCause>,
     fault: Option<DriveFault>,
     trip: Option<Trip>,
+    /// True if the trip has occurred in this cycle. No status shows it yet, so a reset is for an
+    /// earlier one.
+    trip_is_new: bool,
 }
 
 /// Whether the drive has power by our command, and follows set-points.
@@ -236,6 +239,7 @@ impl Axis {
             torque_feedforward: 0.0,
             fault: None,
             trip: None,
+            trip_is_new: false,
             compensation,
             correction: Correction::default(),
             second: second_encoder::SecondPosition::default(),
@@ -371,6 +375,7 @@ impl Axis {
         self.update_settling_times(dt_s);
         let outputs = self.outputs();
         self.torque_feedforward = 0.0;
+        self.trip_is_new = false;
         outputs
     }
 

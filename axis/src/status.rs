@@ -399,6 +399,12 @@ pub enum Trip {
         /// The limit.
         limit: f64,
     },
+    /// A half of a gantry moves alone.
+    #[error("this half of the gantry moves at {velocity:.4} while the other half has no power")]
+    HalfMoves {
+        /// The velocity.
+        velocity: f64,
+    },
     /// The emergency stop was commanded.
     #[error("emergency stop")]
     EmergencyStop,

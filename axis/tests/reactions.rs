@@ -154,6 +154,19 @@ fn emergency_stop_takes_the_configured_method() {
     }
 }
 
+/// A reset is for what a status has shown: it does not hide a cause of the same cycle.
+#[test]
+fn reset_does_not_clear_a_trip_of_the_same_cycle() {
+    let mut rig = enabled(supervised(Mode::Csp, Supervision::default()));
+    rig.axis.command(Command::EmergencyStop).unwrap();
+    rig.axis.command(Command::ResetFault).unwrap();
+    rig.cycle();
+    assert_eq!(rig.axis.status().trip, Some(Trip::EmergencyStop));
+    rig.axis.command(Command::ResetFault).unwrap();
+    rig.cycle();
+    assert_eq!(rig.axis.status().trip, None);
+}
+
 #[test]
 fn over_acceleration_trips() {
     let supervision = Supervision {

@@ -99,6 +99,19 @@ const SET_POINT_ROUNDING: f64 = 1.0 + 1e-6;
 const STOP_RESERVE: f64 = 0.005;
 
 impl Axis {
+    /// Returns the error with which [`Axis::command`] would reject `Enable` or `Home` now. Other
+    /// commands are not checked. RT: O(1).
+    ///
+    /// # Errors
+    /// As [`Axis::command`].
+    pub fn check(&self, command: Command) -> Result<(), CommandError> {
+        match command {
+            Command::Enable => self.check_enable(),
+            Command::Home { timeout_s } => self.check_home(timeout_s),
+            _ => Ok(()),
+        }
+    }
+
     pub(super) fn take(&mut self, command: Command) -> Result<(), CommandError> {
         match command {
             Command::Enable => self.enable(),
@@ -174,6 +187,15 @@ impl Axis {
     }
 
     pub(super) fn enable(&mut self) -> Result<(), CommandError> {
+        self.check_enable()?;
+        if self.goal != PowerGoal::On {
+            self.power_loss_cause = None;
+        }
+        self.goal = PowerGoal::On;
+        Ok(())
+    }
+
+    fn check_enable(&self) -> Result<(), CommandError> {
         if let Some(trip) = self.trip {
             return Err(CommandError::Tripped(trip));
         }
@@ -201,14 +223,10 @@ impl Axis {
             }
             PowerGoal::Off | PowerGoal::On => {}
         }
-        if !self.has_control() {
-            self.check_coasting()?;
+        match self.has_control() {
+            true => Ok(()),
+            false => self.check_coasting(),
         }
-        if self.goal != PowerGoal::On {
-            self.power_loss_cause = None;
-        }
-        self.goal = PowerGoal::On;
-        Ok(())
     }
 
     /// Rejects the power of an axis that moves: its drive would brake it with a step of the target.
@@ -223,7 +241,9 @@ impl Axis {
     }
 
     fn reset_fault(&mut self) {
-        self.trip = None;
+        if !self.trip_is_new {
+            self.trip = None;
+        }
         self.reset_failed = false;
         self.auto_reset = Resets::default();
         if self.state.is_fault() {

@@ -88,7 +88,7 @@ impl Axis {
         self.restart_second_encoder();
     }
 
-    pub(super) fn home(&mut self, timeout_s: f64) -> Result<(), CommandError> {
+    pub(super) fn check_home(&self, timeout_s: f64) -> Result<(), CommandError> {
         if !timeout_s.is_finite() {
             return Err(CommandError::NotFinite {
                 what: "time limit",
@@ -101,7 +101,11 @@ impl Axis {
                 value: timeout_s,
             });
         }
-        self.check_switch(Mode::Hm)?;
+        self.check_switch(Mode::Hm)
+    }
+
+    pub(super) fn home(&mut self, timeout_s: f64) -> Result<(), CommandError> {
+        self.check_home(timeout_s)?;
         self.switch_failed = None;
         self.forget_target();
         self.home_second_encoder();

@@ -60,10 +60,16 @@ impl Axis {
         self.undelivered_cycles = self.undelivered_cycles.max(other.undelivered_cycles);
     }
 
+    /// Records a trip. The first cause remains.
+    pub(super) fn note_trip(&mut self, trip: Trip) {
+        self.trip_is_new |= self.trip.is_none();
+        self.trip.get_or_insert(trip);
+    }
+
     /// Trips the axis for a cause found outside it, and stops it by `method`. The first cause
     /// remains. RT: O(1).
     pub fn trip_by(&mut self, trip: Trip, method: StopMethod) {
-        self.trip.get_or_insert(trip);
+        self.note_trip(trip);
         self.stop_with(PowerLossCause::Trip, method, false);
     }
 }

@@ -286,7 +286,7 @@ impl Axis {
         let expected = stop.method == StopMethod::Ramp
             && self.config.control(self.mode) == ControlledQuantity::Torque;
         if !expected && self.stale_cycles == 0 && !self.at_standstill() {
-            self.trip.get_or_insert(Trip::NotStopped {
+            self.note_trip(Trip::NotStopped {
                 velocity: self.actual.velocity(),
                 time_s: stop.deceleration.elapsed_s,
                 method: stop.method,

@@ -621,6 +621,9 @@ fn trip(trip: &Trip) -> &'static str {
         Trip::EncoderDifference { .. } => {
             "look for a slipping coupling, a wrong `counts_per_unit` or backlash; home the axis again"
         }
+        Trip::HalfMoves { .. } => {
+            "a load that falls needs a brake; check why the other half has no power: its STO and enable inputs, its supply"
+        }
         Trip::Skew { .. } | Trip::HomingSkew { .. } => {
             "look for what holds one half of the gantry; decouple the halves to move them alone"
         }

@@ -101,10 +101,16 @@ impl RtAxis {
         self.generator.end();
     }
 
-    pub(super) fn command(&mut self, command: Command) -> Result<(), CommandError> {
+    /// Returns the error with which [`Self::command`] would reject `Enable` or `Home` now.
+    pub(super) fn check(&self, command: Command) -> Result<(), CommandError> {
         if self.generator.runs() && matches!(command, Command::SetMode(_) | Command::Home { .. }) {
             return Err(CommandError::Following);
         }
+        self.axis.check(command)
+    }
+
+    pub(super) fn command(&mut self, command: Command) -> Result<(), CommandError> {
+        self.check(command)?;
         self.ordered |= command == Command::Enable;
         self.axis.command(command)?;
         match command {

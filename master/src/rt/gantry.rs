@@ -86,6 +86,8 @@ pub struct Gantry {
     square: f64,
     /// The lower override of both halves.
     rate: Rate,
+    /// The halves may be squared: no stop has followed the command that couples them.
+    squares: bool,
 }
 
 /// The part of the limits with which a gantry is squared.
@@ -108,6 +110,7 @@ impl Gantry {
             },
             square: 0.0,
             rate: Rate::WHOLE,
+            squares: false,
         }
     }
 
@@ -138,7 +141,10 @@ impl Gantry {
         }
         match (self.coupling, coupled) {
             (Coupling::Coupled, true) => {}
-            (_, true) => self.coupling = Coupling::Pending,
+            (_, true) => {
+                self.coupling = Coupling::Pending;
+                self.squares = true;
+            }
             (_, false) => self.coupling = Coupling::Decoupled,
         }
         Ok(())
@@ -176,6 +182,10 @@ impl Gantry {
             Command::SetMode(Mode::Csp) => own.command(command),
             Command::SetMode(_) => Err(CommandError::Coupled),
             Command::Enable => {
+                second.check(command)?;
+                first.command(command)?;
+                second.command(command)?;
+                self.squares = true;
                 // Continues a squaring that was stopped.
                 if let Coupling::Squaring(plan) = &self.coupling
                     && plan.request().goal == Goal::Velocity(0.0)
@@ -183,12 +193,7 @@ impl Gantry {
                 {
                     self.coupling = Coupling::Pending;
                 }
-                first.command(command)?;
-                let result = second.command(command);
-                if result.is_err() {
-                    let _ = first.command(Command::Disable);
-                }
-                result
+                Ok(())
             }
             Command::ResetFault
             | Command::Disable
@@ -199,19 +204,16 @@ impl Gantry {
                 result.and(second.command(command))
             }
             Command::Stop | Command::HoldHoming => {
-                if let Coupling::Squaring(plan) = &mut self.coupling {
-                    stop_squaring(plan, self.offset, first.axis.config().limits.motion());
-                }
+                self.squares &= command != Command::Stop;
                 let result = first.command(command);
                 result.and(second.command(command))
             }
             Command::Home { .. } => {
                 self.check_motion(axis)?;
+                second.check(command)?;
                 first.command(command)?;
-                if let Err(reason) = second.command(command) {
-                    let _ = first.command(Command::Stop);
-                    return Err(reason);
-                }
+                second.command(command)?;
+                self.squares = true;
                 let halves = [&*first, &*second].map(|half| HomingHalf {
                     position: half.axis.status().position,
                     age: 0,
@@ -274,8 +276,8 @@ impl Gantry {
         }
         stop_alike([first, second], &status);
         if matches!(self.coupling, Coupling::Squaring(_) | Coupling::Coupled) {
-            self.lead([first, second], &status, dt_s);
             self.watch_skew([first, second], &status, dt_s);
+            self.lead([first, second], &status, dt_s);
         }
     }
 
@@ -299,7 +301,10 @@ impl Gantry {
         let plan = JerkLimited::new(order, self.offset, dt_s).ok();
         match plan.filter(|_| offset.abs() <= limit) {
             Some(plan) => {
-                self.coupling = Coupling::Squaring(plan);
+                self.coupling = match offset {
+                    0.0 => Coupling::Coupled,
+                    _ => Coupling::Squaring(plan),
+                };
                 Ok(())
             }
             None => Err(Trip::Skew {
@@ -307,6 +312,27 @@ impl Gantry {
                 at_rest: offset,
                 limit,
             }),
+        }
+    }
+
+    /// Ends a squaring where its offset comes to rest.
+    fn stop_squaring(&mut self, limits: MotionLimits, dt_s: f64) {
+        let Coupling::Squaring(plan) = &mut self.coupling else {
+            return;
+        };
+        let order = MoveRequest::within(Goal::Velocity(0.0), limits);
+        if plan.request().goal == order.goal {
+            return;
+        }
+        // A stop gains no speed.
+        let stop = if self.offset.acceleration * self.offset.velocity > 0.0 {
+            self.offset.acceleration = 0.0;
+            JerkLimited::new(order, self.offset, dt_s)
+        } else {
+            plan.redirect(order, self.offset, dt_s)
+        };
+        if let Ok(stop) = stop {
+            *plan = stop;
         }
     }
 
@@ -324,11 +350,14 @@ impl Gantry {
                 velocity: b.velocity - a.velocity,
                 acceleration: 0.0,
             };
-        } else if let Coupling::Squaring(plan) = &mut self.coupling {
-            if a.stop.is_some() || b.stop.is_some() {
-                stop_squaring(plan, self.offset, first.axis.config().limits.motion());
+        } else if matches!(self.coupling, Coupling::Squaring(_)) {
+            let stops = |half: &RtAxis| half.axis.status().stop.is_some();
+            if !self.squares || stops(first) || stops(second) {
+                self.stop_squaring(first.axis.config().limits.motion(), dt_s);
             }
-            self.offset = plan.advance(self.offset, self.rate, dt_s);
+            if let Coupling::Squaring(plan) = &mut self.coupling {
+                self.offset = plan.advance(self.offset, self.rate, dt_s);
+            }
             if self.offset.stands_at(0.0) {
                 self.coupling = Coupling::Coupled;
             }
@@ -483,17 +512,14 @@ fn stop_alike([first, second]: [&mut RtAxis; 2], [a, b]: &[AxisStatus; 2]) {
         if let Some(stop) = other.stop {
             half.stop_by(stop.method);
         } else if !other.powered && !own.at_rest {
+            let explained = own.stop.is_some() || other.trip.is_some() || other.fault.is_some();
+            if !explained {
+                let velocity = own.velocity;
+                half.axis
+                    .trip_by(Trip::HalfMoves { velocity }, StopMethod::QuickStop);
+            }
             half.stop_by(StopMethod::QuickStop);
         }
-    }
-}
-
-fn stop_squaring(plan: &mut JerkLimited, offset: Motion, limits: MotionLimits) {
-    let order = MoveRequest::within(Goal::Velocity(0.0), limits);
-    if plan.request().goal != order.goal
-        && let Ok(stop) = plan.redirect(order, offset, 0.0)
-    {
-        *plan = stop;
     }
 }
 

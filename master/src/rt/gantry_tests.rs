@@ -61,6 +61,7 @@ struct Pair {
     coupling: Coupling,
     offset: Motion,
     square: f64,
+    squares: bool,
     different: u8,
     held: bool,
     /// Cycles of the hold without a lost frame, and the last set-points of coupled halves.
@@ -146,6 +147,7 @@ impl Pair {
             coupling: Coupling::Pending,
             offset: Motion::at(0.0),
             square: 0.0,
+            squares: false,
             different: 0,
             held: false,
             held_cycles: 0,
@@ -184,6 +186,7 @@ impl Pair {
             coupling: self.coupling,
             offset: self.offset,
             square: self.square,
+            squares: self.squares,
             ..Gantry::new(config)
         };
         let [first, second] = self.axes.clone();
@@ -215,6 +218,7 @@ impl Pair {
         }
         self.out[1] = second.axis.act();
         (self.coupling, self.offset, self.square) = (gantry.coupling, gantry.offset, gantry.square);
+        self.squares = gantry.squares;
         self.axes = [first.axis, second.axis];
         self.check(command, &inputs)
     }
@@ -374,9 +378,62 @@ impl System for Pair {
         std::mem::discriminant(&self.coupling).hash(&mut hasher);
         let rests = self.held_cycles > RAMP_CYCLES;
         (self.different, self.apart.is_some(), self.causes).hash(&mut hasher);
-        (self.held, rests).hash(&mut hasher);
+        (self.held, rests, self.squares).hash(&mut hasher);
         hasher.finish()
     }
+}
+
+/// Homed, out of square, held, without power.
+fn racked() -> Pair {
+    let racked = Pair::new(1.0, true).after(&[Action::Wait(5)]);
+    racked.after(&[Action::Hold(true), Action::Wait(60)])
+}
+
+#[test]
+fn a_stop_keeps_the_squaring_from_beginning_until_it_is_commanded_again() {
+    let apart = |pair: &Pair| pair.out[1].target_position - pair.out[0].target_position;
+    let enabling = [
+        Action::Command(Command::Enable),
+        Action::Command(Command::Stop),
+    ];
+    let stopped = racked()
+        .after(&enabling)
+        .after(&[Action::Hold(false), Action::Wait(100)]);
+    assert!(stopped.axes.iter().all(|axis| axis.status().enabled));
+    let counts = COUNTS_PER_UNIT.round() as i32;
+    assert_eq!(apart(&stopped), counts);
+    let square = stopped.after(&[Action::Command(Command::Enable), Action::Wait(400)]);
+    assert_eq!(apart(&square), 0);
+}
+
+#[test]
+fn a_half_that_moves_without_the_other_trips() {
+    let falls = Change::Moves(drive::Moves::Falls);
+    let pair = racked().after(&[
+        Action::Command(Command::Enable),
+        Action::Change(0, Change::Word(drive::Word::Zero)),
+        Action::Wait(3),
+        Action::Change(1, falls),
+        Action::Wait(1),
+    ]);
+    let trip = pair.axes[1].status().trip;
+    assert!(matches!(trip, Some(Trip::HalfMoves { .. })), "{trip:?}");
+}
+
+#[test]
+fn home_that_one_half_rejects_has_no_effect_on_the_other() {
+    let lost = Change::Frames(drive::Frames::Lost);
+    let ready = Pair::new(0.25, false).after(&[Action::Wait(5)]);
+    let ready = ready.after(&[Action::Command(Command::Enable), Action::Wait(12)]);
+    let moved = ready.after(&[
+        Action::Command(MOVE),
+        Action::Wait(8),
+        Action::Change(1, lost),
+        Action::Wait(3),
+    ]);
+    let before = moved.axes[0].status().commanded_target;
+    let after = moved.after(&[Action::Command(Command::Home { timeout_s: 1.0 })]);
+    assert_eq!(after.axes[0].status().commanded_target, before);
 }
 
 #[test]
@@ -384,16 +441,12 @@ fn explored_halves_keep_the_rules() {
     let enable = [Action::Command(Command::Enable), Action::Wait(12)];
     let home = Action::Command(Command::Home { timeout_s: 1.0 });
     let idle = Pair::new(0.25, false).after(&[Action::Wait(5)]);
-    let racked = Pair::new(1.0, true).after(&[Action::Wait(5)]);
     let ready = idle.clone().after(&enable);
     let moving = ready
         .clone()
         .after(&[Action::Command(MOVE), Action::Wait(8)]);
     let roots = [
-        (
-            "held out of square",
-            racked.after(&[Action::Hold(true), Action::Wait(60)]),
-        ),
+        ("held out of square", racked()),
         ("without power", idle),
         ("coupled", ready.clone()),
         ("in motion", moving.clone()),
