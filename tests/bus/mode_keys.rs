@@ -74,7 +74,7 @@ fn step_mode_waits_for_the_brake_that_opens_again() {
 /// Safe torque off while the axis waits for the planned loss of power is not that loss.
 #[test]
 fn safe_torque_off_before_the_switch_stops_the_machine() {
-    for at in [120, 160, 200, 230, 300] {
+    for at in [120, 160, 200, 230, 260] {
         let sto =
             format!("[[fault]]\nkind = \"sto\"\nat = \"{at}ms\"\nfor = \"200ms\"\ndevice = 0\n");
         let text = text("mode_without_power = true", KEY, SWITCH);
