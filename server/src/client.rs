@@ -24,7 +24,7 @@ use crate::diagnostics::diagnostics_as_json;
 use crate::error::{ErrorCode, OpError};
 use crate::external::{STREAM_POINTS, StreamPoint, command_area};
 use crate::hub::{BusState, Hub, Outcome, Transfer, Work};
-use crate::lease::ClientId;
+use crate::lease::{Claim, ClientId};
 use crate::state;
 
 mod coe;
@@ -64,8 +64,9 @@ pub struct Client {
     /// The client may not even read.
     blind: AtomicBool,
     waiting: Semaphore,
-    /// Answers of commands come with the outcome by default.
-    waits: bool,
+    /// Several programs are this client (HTTP): each names its lease, and answers of commands come
+    /// with the outcome by default.
+    shared: bool,
     /// The client can receive file descriptors.
     takes_memory: bool,
     /// Process and user at the other end.
@@ -103,10 +104,10 @@ impl Drop for Change {
 }
 
 impl Client {
-    /// Creates a client. `refusal` says why it may not command; `waits`: its commands wait for the
-    /// outcome by default.
+    /// Creates a client. `refusal` says why it may not command; `shared`: several programs are this
+    /// client.
     #[must_use]
-    pub fn new(hub: Arc<Hub>, name: &str, refusal: Option<OpError>, waits: bool) -> Self {
+    pub fn new(hub: Arc<Hub>, name: &str, refusal: Option<OpError>, shared: bool) -> Self {
         let id = hub.new_client();
         Self {
             id,
@@ -114,7 +115,7 @@ impl Client {
             refusal: Mutex::new(refusal),
             blind: AtomicBool::new(false),
             waiting: Semaphore::new(WAITING),
-            waits,
+            shared,
             takes_memory: false,
             peer: Value::Null,
             jogged: AtomicU64::new(0),
@@ -185,13 +186,20 @@ impl Client {
 
     /// Carries out a request. Ends when its answer is known.
     pub async fn answer(&self, request: Request) -> Answer {
-        self.hub.renew(self.id);
+        let claim = Claim {
+            client: (!self.shared).then_some(self.id),
+            secret: request.lease,
+        };
         let mut area = None;
         let result = match request.op {
             Err(error) => Err(error),
             Ok(op) => {
+                // Who only reads does not move anything: its program may have lost the machine.
+                if op.access() != Access::Read {
+                    self.hub.renew(&claim);
+                }
                 let change = self.change(&op);
-                let result = self.carry_out(op, request.wait, &mut area).await;
+                let result = self.carry_out(op, &claim, request.wait, &mut area).await;
                 if let Some(change) = change {
                     change.end(&result);
                 }
@@ -251,6 +259,7 @@ impl Client {
     async fn carry_out(
         &self,
         op: Op,
+        claim: &Claim,
         wait: Option<bool>,
         area: &mut Option<Arc<SharedMemory>>,
     ) -> Result<Map<String, Value>, OpError> {
@@ -262,7 +271,7 @@ impl Client {
             return Err(refusal);
         }
         if access == Access::Lease {
-            self.hub.check_owner(self.id)?;
+            self.hub.check_owner(claim)?;
         }
         let hub = &self.hub;
         match op {
@@ -301,7 +310,8 @@ impl Client {
                 complete,
             } => {
                 let bytes = self.sdo_bytes(&device, &index, sub, data, value)?;
-                self.sdo_write(&device, &index, sub, complete, &bytes).await
+                self.sdo_write(claim, &device, &index, sub, complete, &bytes)
+                    .await
             }
             // The entry of the change log is all that this operation does.
             Op::Note { text } if text.chars().count() > NOTE_LENGTH => {
@@ -323,15 +333,18 @@ impl Client {
                     let message = format!("`ttl_ms` is {ttl}: it must be 100 to 60000");
                     return Err(OpError::new(ErrorCode::BadRequest, message));
                 }
-                hub.take(self.id, self.name(), Duration::from_millis(ttl), force)?;
-                Ok(object(json!({"client": self.id, "ttl_ms": ttl})))
+                let lasts = Duration::from_millis(ttl);
+                let (secret, client) = hub.take(claim, self.name(), lasts, force)?;
+                Ok(object(
+                    json!({"client": client, "ttl_ms": ttl, "lease": secret}),
+                ))
             }
             Op::Renew {} => {
-                hub.check_owner(self.id)?;
+                hub.check_owner(claim)?;
                 Ok(Map::new())
             }
             Op::Release {} => {
-                hub.release(self.id)?;
+                hub.release(claim)?;
                 Ok(Map::new())
             }
             Op::Stop {} => {
@@ -358,14 +371,13 @@ impl Client {
                     OpError::new(ErrorCode::Failed, message)
                 })?;
                 let memory = Arc::new(memory);
-                let keys = self
-                    .submit(true, vec![Work::Attach(Arc::clone(&memory))], true)
-                    .await?;
+                let parts = vec![Work::Attach(Arc::clone(&memory))];
+                let keys = self.submit(Some(claim), parts, true).await?;
                 *area = Some(memory);
                 Ok(keys)
             }
             // The requests of all HTTP clients with a token are one client, which never leaves.
-            Op::LineShaft { .. } if self.waits => {
+            Op::LineShaft { .. } if self.shared => {
                 let message = "a line shaft needs a connection that stays";
                 Err(OpError::new(ErrorCode::BadRequest, message)
                     .help("use the WebSocket or the Unix socket"))
@@ -389,12 +401,9 @@ impl Client {
                     Op::StreamOpen { .. } | Op::StreamPush { .. } | Op::StreamClose { .. }
                 );
                 let parts = self.parts(op)?;
-                self.submit(
-                    access == Access::Lease,
-                    parts,
-                    streams || wait.unwrap_or(self.waits),
-                )
-                .await
+                let owner = (access == Access::Lease).then_some(claim);
+                let waits = streams || wait.unwrap_or(self.shared);
+                self.submit(owner, parts, waits).await
             }
         }
     }
@@ -402,7 +411,7 @@ impl Client {
     /// Hands a command to the machine, and waits for its outcome if `wait` is set.
     async fn submit(
         &self,
-        needs_lease: bool,
+        owner: Option<&Claim>,
         parts: Vec<Work>,
         wait: bool,
     ) -> Result<Map<String, Value>, OpError> {
@@ -414,7 +423,6 @@ impl Client {
         if parts.is_empty() {
             return Ok(Map::new());
         }
-        let owner = needs_lease.then_some(self.id);
         let (request, outcome) = self.hub.submit(owner, parts, wait)?;
         let mut answer = Map::new();
         if wait {

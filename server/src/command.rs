@@ -6,6 +6,7 @@ use serde_json::{Map, Value, json};
 
 use crate::error::{ErrorCode, OpError};
 use crate::hub::BusState;
+use crate::strict;
 
 /// A request of a client: one JSON object.
 #[derive(Debug)]
@@ -14,6 +15,8 @@ pub struct Request {
     pub id: Option<Value>,
     /// `true`: the answer comes with the outcome.
     pub wait: Option<bool>,
+    /// The secret of the lease. Over HTTP, commands that need the lease need it.
+    pub lease: Option<String>,
     pub op: Result<Op, OpError>,
 }
 
@@ -379,8 +382,7 @@ impl Request {
     /// Reads a request from a text of a client.
     #[must_use]
     pub fn parse(text: &[u8]) -> Self {
-        let value: Result<Value, _> = serde_json::from_slice(text);
-        match value {
+        match strict::from_slice(text) {
             Ok(Value::Object(map)) => Self::from_object(map),
             Ok(_) => Self::invalid("a request is a JSON object"),
             Err(error) => Self::invalid(format!("not JSON: {error}")),
@@ -392,6 +394,7 @@ impl Request {
         Self {
             id: None,
             wait: None,
+            lease: None,
             op: Err(error.help("write one object per line, such as {\"op\": \"state\"}")),
         }
     }
@@ -402,14 +405,22 @@ impl Request {
         let id = map.remove("id");
         let wait = map.remove("wait");
         let flag = wait.as_ref().and_then(Value::as_bool);
-        let op = match (wait, flag) {
-            (Some(_), None) => Err(OpError::new(
-                ErrorCode::BadRequest,
-                "`wait` is true or false",
-            )),
-            _ => read_op(map),
+        let secret = map.remove("lease");
+        let lease = secret.as_ref().and_then(Value::as_str).map(str::to_owned);
+        let wrong = |message| Err(OpError::new(ErrorCode::BadRequest, message));
+        let op = if wait.is_some() && flag.is_none() {
+            wrong("`wait` is true or false")
+        } else if secret.is_some() && lease.is_none() {
+            wrong("`lease` is a text: that of the answer to `take`")
+        } else {
+            read_op(map)
         };
-        Self { id, wait: flag, op }
+        Self {
+            id,
+            wait: flag,
+            lease,
+            op,
+        }
     }
 }
 
@@ -456,6 +467,7 @@ fn operation(variant: &Value) -> Option<(String, String, Value)> {
         properties.remove("op");
         properties.insert("wait".to_owned(), json!({"type": "boolean"}));
         properties.insert("id".to_owned(), json!({}));
+        properties.insert("lease".to_owned(), json!({"type": "string"}));
     }
     if let Some(required) = object.get_mut("required").and_then(Value::as_array_mut) {
         required.retain(|key| key != "op");

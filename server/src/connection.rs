@@ -22,12 +22,12 @@ use crate::state;
 const OUTGOING: usize = 256;
 /// The requests whose answers may wait: for an outcome, or for a slow reader.
 const WAITING: usize = 256;
-/// With more messages waiting, the client gets no state and no samples. A batch has up to 8 MB.
+/// With more messages waiting, the client gets no state and no samples.
 const BACKLOG: usize = 4;
 /// The rows of one batch.
 const BATCH: u64 = 4096;
-/// The values of one batch.
-const BATCH_VALUES: u64 = 1 << 20;
+/// The values of one batch: 256 KB.
+const BATCH_VALUES: u64 = 1 << 15;
 
 /// A message to the client.
 #[derive(Debug)]
@@ -126,7 +126,7 @@ impl Batch {
 /// Returns the words of signals; all without names.
 ///
 /// # Errors
-/// Fails if a name is unknown.
+/// Fails if a name is unknown or occurs twice.
 pub fn signal_words(samples: &Samples, names: Option<&[String]>) -> Result<Vec<usize>, OpError> {
     let layout = samples.layout();
     let Some(names) = names else {
@@ -142,6 +142,12 @@ pub fn signal_words(samples: &Samples, names: Option<&[String]>) -> Result<Vec<u
                     .help("`machine` lists them under `samples`")
             })
     };
+    let mut seen = HashSet::new();
+    if let Some(twice) = names.iter().find(|name| !seen.insert(*name)) {
+        // Not of a signal: any text may be a name.
+        let message = format!("the signal {twice:?} is named twice");
+        return Err(OpError::new(ErrorCode::BadRequest, message));
+    }
     names.iter().map(word).collect()
 }
 
@@ -212,12 +218,23 @@ impl Connection {
     /// Answers that a message was too long.
     pub async fn refuse(&self, error: OpError) {
         let op = Err(error);
-        let (id, wait) = (None, None);
-        self.take_request(Request { id, wait, op }).await;
+        let (id, wait, lease) = (None, None, None);
+        self.take_request(Request {
+            id,
+            wait,
+            lease,
+            op,
+        })
+        .await;
     }
 
     async fn take_request(&self, request: Request) {
-        let Request { id, wait, op } = request;
+        let Request {
+            id,
+            wait,
+            lease,
+            op,
+        } = request;
         let op = match op {
             Ok(Op::Token { token }) => self.check_token(&token).map(|()| Op::Hello { name: None }),
             Ok(Op::Subscribe {
@@ -234,7 +251,12 @@ impl Connection {
             }
             other => other,
         };
-        let request = Request { id, wait, op };
+        let request = Request {
+            id,
+            wait,
+            lease,
+            op,
+        };
         let waits = request.wait == Some(true)
             || matches!(
                 request.op,

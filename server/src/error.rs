@@ -114,6 +114,14 @@ impl From<LeaseError> for OpError {
         match error {
             LeaseError::NoLease => Self::new(ErrorCode::NoLease, "the motion has no owner")
                 .help("take the lease with `take`"),
+            LeaseError::Expired { silent, ttl } => {
+                let (silent, ttl) = (silent.as_secs_f64(), ttl.as_secs_f64());
+                let message = format!(
+                    "the lease has expired: it was renewed {silent:.1} s ago, and lasts {ttl} s"
+                );
+                Self::new(ErrorCode::NoLease, message)
+                    .help("take it again with `take`, and renew it in time with `renew`")
+            }
             LeaseError::NotOwner(owner) => Self {
                 owner: Some(owner.clone()),
                 ..Self::new(

@@ -1,21 +1,26 @@
 //! HTTP and WebSocket: the page, the operations, samples, history and metrics.
 
-use std::io::Read as _;
+use std::fs::{File, Metadata};
+use std::io::{self, Read as _, Write as _};
 use std::net::{IpAddr, SocketAddr};
+use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use axum::Router;
 use axum::body::{Body, Bytes};
 use axum::extract::{DefaultBodyLimit, Path, Query, Request as HttpRequest, State};
-use axum::http::{HeaderMap, HeaderValue, StatusCode, Uri, header};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, Uri, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
+use rustix::fs::OFlags;
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 use tokio::net::TcpListener;
 
+use crate::admission;
+use crate::bulk::{Bulk, Pieces};
 use crate::client::{Answer, Client};
 use crate::command::Request;
 use crate::connection::{Batch, same, signal_words};
@@ -26,12 +31,12 @@ use crate::hub::Hub;
 use crate::openapi;
 use crate::page;
 use crate::socket::LINE;
-use crate::websocket;
+use crate::{strict, websocket};
 
 /// The most buckets of one history.
 const BUCKETS: usize = 20_000;
-/// The most values of one answer.
-const VALUES: u64 = 1 << 22;
+/// The most values of one answer: 8 MB.
+const VALUES: usize = 1 << 20;
 /// The bytes of a recording that are read at once.
 const PIECE: usize = 256 * 1024;
 
@@ -52,6 +57,7 @@ pub struct HttpOptions {
 pub struct Http {
     pub hub: Arc<Hub>,
     pub(crate) viewers: Viewers,
+    bulk: Bulk,
     pub(crate) options: HttpOptions,
     pub(crate) token: Arc<str>,
     /// The client of all requests with the token, and of those without.
@@ -73,7 +79,7 @@ impl HttpServer {
     ///
     /// # Errors
     /// Fails if the system refuses the address.
-    pub async fn bind(hub: &Arc<Hub>, mut options: HttpOptions) -> std::io::Result<Self> {
+    pub async fn bind(hub: &Arc<Hub>, mut options: HttpOptions) -> io::Result<Self> {
         let listener = TcpListener::bind(options.address).await?;
         options.address = listener.local_addr()?;
         let no_token = OpError::new(ErrorCode::NoToken, "this needs the token")
@@ -86,6 +92,7 @@ impl HttpServer {
             token: options.token.clone().into(),
             hub: Arc::clone(hub),
             viewers: Viewers::new(),
+            bulk: Bulk::default(),
             options,
         };
         http.without_token.set_blind(!http.is_loopback());
@@ -103,11 +110,8 @@ impl HttpServer {
     }
 
     /// Serves until the task ends.
-    ///
-    /// # Errors
-    /// Fails if the system refuses to accept clients.
-    pub async fn serve(self) -> std::io::Result<()> {
-        axum::serve(self.listener, router(self.http)).await
+    pub async fn serve(self) {
+        admission::serve(self.listener, router(self.http)).await;
     }
 }
 
@@ -199,30 +203,52 @@ impl Http {
 
     /// Fails if a page of another server asks, or under a foreign name. A viewer of another server
     /// with the token may connect, because it only reads.
-    fn check_origin(&self, headers: &HeaderMap, address: &Uri) -> Result<(), OpError> {
-        let text = |name| headers.get(name).map(|value: &HeaderValue| value.to_str());
-        let host = match text(header::HOST) {
-            Some(Ok(host)) if self.is_own_host(host) => host,
+    ///
+    /// A link to the page may stand anywhere.
+    fn check_origin(&self, method: &Method, headers: &HeaderMap, to: &Uri) -> Result<(), OpError> {
+        let wrong = |message| OpError::new(ErrorCode::WrongOrigin, message);
+        let host = match once(headers, &header::HOST) {
+            Ok(Some(host)) if self.is_own_host(host) => host,
             _ => {
-                let error = OpError::new(ErrorCode::WrongOrigin, "the `Host` is not this server");
+                let error = wrong("the `Host` is not this server");
                 return Err(error.help("name it with --allow-host"));
             }
         };
-        let own = match text(header::ORIGIN) {
-            None => true,
-            Some(Ok(origin)) => origin.strip_prefix("http://") == Some(host),
-            Some(Err(_)) => false,
+        let own = match once(headers, &header::ORIGIN) {
+            Ok(None) => true,
+            Ok(Some(origin)) => origin.strip_prefix("http://") == Some(host),
+            Err(_) => false,
         };
-        let viewer = foxglove::is_asked_for(headers, address) && self.has_token_in(address);
-        (own || viewer)
-            .then_some(())
-            .ok_or_else(|| OpError::new(ErrorCode::WrongOrigin, "the page is of another server"))
+        // Browsers say from where a request comes, also if it has no `Origin`.
+        let site = once(headers, &HeaderName::from_static("sec-fetch-site"));
+        let same_site = matches!(site, Ok(None | Some("same-origin" | "none")));
+        let is = |name, value| once(headers, &HeaderName::from_static(name)) == Ok(Some(value));
+        let link = method == Method::GET
+            && to.path() == "/"
+            && is("sec-fetch-mode", "navigate")
+            && is("sec-fetch-dest", "document");
+        let viewer = foxglove::is_asked_for(headers, to) && self.has_token_in(to);
+        match own && (same_site || link) || viewer {
+            true => Ok(()),
+            false => Err(wrong("the page is of another server")),
+        }
+    }
+}
+
+/// Returns the value of a header that may occur once.
+fn once<'h>(headers: &'h HeaderMap, name: &HeaderName) -> Result<Option<&'h str>, ()> {
+    let mut values = headers.get_all(name).iter();
+    let value = values.next().map(HeaderValue::to_str);
+    match values.next() {
+        Some(_) => Err(()),
+        None => value.transpose().map_err(|_| ()),
     }
 }
 
 /// Refuses foreign pages, and adds the headers that every answer has.
 async fn guard(State(http): Shared, request: HttpRequest, next: Next) -> Response {
-    let mut response = match http.check_origin(request.headers(), request.uri()) {
+    let own = http.check_origin(request.method(), request.headers(), request.uri());
+    let mut response = match own {
         Ok(()) => next.run(request).await,
         Err(error) => refusal(&error),
     };
@@ -242,7 +268,12 @@ async fn guard(State(http): Shared, request: HttpRequest, next: Next) -> Respons
 }
 
 pub(crate) fn refusal(error: &OpError) -> Response {
-    respond(error.answer(), error.code.status())
+    let mut response = respond(error.answer(), error.code.status());
+    if response.status() == StatusCode::TOO_MANY_REQUESTS {
+        let second = HeaderValue::from_static("1");
+        response.headers_mut().insert(header::RETRY_AFTER, second);
+    }
+    response
 }
 
 fn respond(body: Map<String, Value>, status: u16) -> Response {
@@ -258,7 +289,7 @@ async fn operation(
 ) -> Response {
     let parsed = match body.is_empty() {
         true => Ok(Value::Object(Map::new())),
-        false => serde_json::from_slice(&body),
+        false => strict::from_slice(&body),
     };
     let mut map = match parsed {
         Ok(Value::Object(map)) => map,
@@ -338,9 +369,20 @@ impl Range {
     }
 }
 
-fn binary(bytes: Vec<u8>) -> Response {
-    let kind = [(header::CONTENT_TYPE, "application/octet-stream")];
-    (kind, bytes).into_response()
+/// Answers with the bytes that `make` returns, made apart from the threads that serve clients.
+async fn binary(http: &Arc<Http>, make: impl FnOnce(&Hub) -> Vec<u8> + Send + 'static) -> Response {
+    let hub = Arc::clone(&http.hub);
+    let body = http.bulk.body(move |mut out| {
+        out.write_all(&make(&hub))?;
+        Ok(out)
+    });
+    match body.await {
+        Ok(body) => {
+            let kind = [(header::CONTENT_TYPE, "application/octet-stream")];
+            (kind, body).into_response()
+        }
+        Err(error) => refusal(&error),
+    }
 }
 
 async fn samples(State(http): Shared, headers: HeaderMap, Query(range): Query<Range>) -> Response {
@@ -348,12 +390,15 @@ async fn samples(State(http): Shared, headers: HeaderMap, Query(range): Query<Ra
         Ok(words) => words,
         Err(error) => return refusal(&error),
     };
-    let samples = &http.hub.samples;
-    let most = (VALUES / words.len().max(1) as u64).max(1);
+    let most = (VALUES / words.len().max(1)).max(1) as u64;
     let count = range.count.unwrap_or(1000).min(most);
-    let newest = samples.written().saturating_sub(count);
-    let mut next = range.first.unwrap_or(newest);
-    binary(Batch::read(samples, &words, &mut next, count).frame())
+    binary(&http, move |hub| {
+        let samples = &hub.samples;
+        let newest = samples.written().saturating_sub(count);
+        let mut next = range.first.unwrap_or(newest);
+        Batch::read(samples, &words, &mut next, count).frame()
+    })
+    .await
 }
 
 async fn history(State(http): Shared, headers: HeaderMap, Query(range): Query<Range>) -> Response {
@@ -361,33 +406,40 @@ async fn history(State(http): Shared, headers: HeaderMap, Query(range): Query<Ra
         Ok(words) => words,
         Err(error) => return refusal(&error),
     };
-    let buckets = range.buckets.unwrap_or(1000).clamp(1, BUCKETS);
+    // A bucket has two values of each signal.
+    let most = (VALUES / 2 / words.len().max(1)).clamp(1, BUCKETS);
+    let buckets = range.buckets.unwrap_or(1000).clamp(1, most);
     let times = [
         range.from_ns.unwrap_or(0),
         range.to_ns.unwrap_or(u64::MAX - 1),
     ];
-    let hub = Arc::clone(&http.hub);
-    // An hour of many signals takes a while; other clients do not wait for it.
-    let work = move || hub.sampler.history(&hub.samples, &words, times, buckets);
-    match tokio::task::spawn_blocking(work).await {
-        Ok(history) => binary(history.frame()),
-        Err(error) => refusal(&OpError::new(ErrorCode::Failed, error.to_string())),
-    }
+    binary(&http, move |hub| {
+        let history = hub.sampler.history(&hub.samples, &words, times, buckets);
+        history.frame()
+    })
+    .await
 }
 
 async fn histogram(State(http): Shared, headers: HeaderMap) -> Response {
-    match http.client(&headers).check_read() {
-        Ok(()) => axum::Json(http.hub.sampler.histogram_object()).into_response(),
+    if let Err(error) = http.client(&headers).check_read() {
+        return refusal(&error);
+    }
+    let hub = Arc::clone(&http.hub);
+    match http.bulk.run(move || hub.sampler.histogram_object()).await {
+        Ok(object) => axum::Json(object).into_response(),
         Err(error) => refusal(&error),
     }
 }
 
 async fn metrics(State(http): Shared, headers: HeaderMap) -> Response {
-    match http.client(&headers).check_read() {
-        Ok(()) => {
+    if let Err(error) = http.client(&headers).check_read() {
+        return refusal(&error);
+    }
+    let hub = Arc::clone(&http.hub);
+    match http.bulk.run(move || crate::metrics::text(&hub)).await {
+        Ok(text) => {
             let kind = "text/plain; version=0.0.4; charset=utf-8";
-            let kind = [(header::CONTENT_TYPE, kind)];
-            (kind, crate::metrics::text(&http.hub)).into_response()
+            ([(header::CONTENT_TYPE, kind)], text).into_response()
         }
         Err(error) => refusal(&error),
     }
@@ -402,8 +454,8 @@ fn download(name: &str, kind: &'static str, body: Body) -> Response {
     (headers, body).into_response()
 }
 
-/// Makes a file of the words of rows between two times.
-type Export = fn(&Hub, &[usize], [u64; 2]) -> Result<Vec<u8>, OpError>;
+/// Writes a file of the words of rows between two times.
+type Export = fn(Pieces, &Hub, &[usize], [u64; 2]) -> io::Result<Pieces>;
 
 async fn export_csv(
     State(http): Shared,
@@ -411,11 +463,11 @@ async fn export_csv(
     Query(range): Query<Range>,
 ) -> Response {
     let kind = "text/csv; charset=utf-8";
-    export(&http, &headers, &range, "csv", kind, |hub, words, times| {
-        let rows = export::Rows::read(&hub.samples, words, times)?;
-        Ok(export::csv(&rows).into_bytes())
-    })
-    .await
+    let make: Export = |mut out, hub, words, times| {
+        export::csv(&mut out, &hub.samples, words, times)?;
+        Ok(out)
+    };
+    export(&http, &headers, &range, "csv", kind, make).await
 }
 
 async fn export_mcap(
@@ -424,15 +476,9 @@ async fn export_mcap(
     Query(range): Query<Range>,
 ) -> Response {
     let kind = "application/octet-stream";
-    export(
-        &http,
-        &headers,
-        &range,
-        "mcap",
-        kind,
-        |hub, words, times| export::mcap(&hub.samples, &hub.topics, words, times),
-    )
-    .await
+    let make: Export =
+        |out, hub, words, times| export::mcap(out, &hub.samples, &hub.topics, words, times);
+    export(&http, &headers, &range, "mcap", kind, make).await
 }
 
 async fn export(
@@ -452,11 +498,19 @@ async fn export(
     let name = hub.machine.path.file_stem().unwrap_or_default();
     let plain = |c: &char| c.is_ascii_alphanumeric() || *c == '-' || *c == '_';
     let name: String = name.to_string_lossy().chars().filter(plain).collect();
-    match tokio::task::spawn_blocking(move || make(&hub, &words, times)).await {
-        Ok(Ok(bytes)) => download(&format!("{name}.{extension}"), kind, Body::from(bytes)),
-        Ok(Err(error)) => refusal(&error),
-        Err(error) => refusal(&OpError::new(ErrorCode::Failed, error.to_string())),
+    match http
+        .bulk
+        .body(move |out| make(out, &hub, &words, times))
+        .await
+    {
+        Ok(body) => download(&format!("{name}.{extension}"), kind, body),
+        Err(error) => refusal(&error),
     }
+}
+
+/// Returns whether a file is a recording: not a link, nor a second name of a file elsewhere.
+fn is_recording(about: &Metadata) -> bool {
+    about.is_file() && about.nlink() == 1
 }
 
 async fn recordings(State(http): Shared, headers: HeaderMap) -> Response {
@@ -474,7 +528,7 @@ async fn recordings(State(http): Shared, headers: HeaderMap) -> Response {
                 let name = entry.file_name().into_string().ok()?;
                 let modified = about.modified().ok()?;
                 let modified = modified.duration_since(std::time::UNIX_EPOCH).ok()?;
-                about.is_file().then(|| {
+                is_recording(&about).then(|| {
                     json!({"name": name, "bytes": about.len(), "modified_s": modified.as_secs()})
                 })
             })
@@ -497,8 +551,12 @@ async fn recording(State(http): Shared, headers: HeaderMap, Path(name): Path<Str
     };
     let path = folder.join(&name);
     let open = move || {
-        let about = std::fs::symlink_metadata(&path).ok()?;
-        about.is_file().then(|| std::fs::File::open(&path).ok())?
+        // The file that is read is the one that was judged.
+        let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
+        let mut options = File::options();
+        let options = options.read(true).custom_flags(flags.bits().cast_signed());
+        let file = options.open(&path).ok()?;
+        file.metadata().ok().filter(is_recording).map(|_| file)
     };
     let opened = tokio::task::spawn_blocking(open).await;
     match opened.ok().flatten() {
@@ -512,7 +570,7 @@ async fn recording(State(http): Shared, headers: HeaderMap, Path(name): Path<Str
 }
 
 /// Returns the content of a file in pieces: a recording may be larger than the memory.
-fn pieces(file: std::fs::File) -> impl futures_util::Stream<Item = std::io::Result<Vec<u8>>> {
+fn pieces(file: File) -> impl futures_util::Stream<Item = io::Result<Vec<u8>>> {
     futures_util::stream::try_unfold(file, |mut file| async move {
         let read = move || {
             let mut piece = vec![0; PIECE];
@@ -522,6 +580,6 @@ fn pieces(file: std::fs::File) -> impl futures_util::Stream<Item = std::io::Resu
         };
         tokio::task::spawn_blocking(read)
             .await
-            .map_err(std::io::Error::other)?
+            .map_err(io::Error::other)?
     })
 }

@@ -30,8 +30,9 @@ use tokio::sync::{broadcast, oneshot, watch};
 
 use crate::error::{ErrorCode, OpError};
 use crate::external::{AreaCounters, StreamPoint};
-use crate::lease::{ClientId, Lease, Owner};
+use crate::lease::{Claim, ClientId, Lease, Owner};
 use crate::sampler::Sampler;
+use crate::serve::new_token;
 
 pub use line_shafts::stream_text;
 pub use work::{Outcome, QueuedWork, Transfer, Work};
@@ -269,53 +270,65 @@ impl Hub {
     /// Ends whatever a client owned.
     pub fn disconnect(&self, client: ClientId) {
         self.setpoints.disconnect(client);
+        let claim = Claim {
+            client: Some(client),
+            secret: None,
+        };
         let mut inner = self.lock();
-        if let Some(owner) = inner.lease.release(client) {
+        if let Some(owner) = inner.lease.release(&claim) {
             self.end_lease(&mut inner, &owner, None, "disconnected");
         }
     }
 
-    /// Renews the lease if the client holds it.
-    pub fn renew(&self, client: ClientId) {
-        self.lock().lease.renew(client, Instant::now());
+    /// Renews the lease if the sender holds it.
+    pub fn renew(&self, claim: &Claim) {
+        self.lock().lease.renew(claim, Instant::now());
     }
 
-    /// Gives the lease to a client.
+    /// Gives the lease to a client. Returns its secret, and the client's number as its owner.
     ///
     /// # Errors
     /// Fails if another client holds it and `force` is not set.
     pub fn take(
         &self,
-        client: ClientId,
+        claim: &Claim,
         name: String,
         ttl: Duration,
         force: bool,
-    ) -> Result<(), OpError> {
+    ) -> Result<(String, ClientId), OpError> {
+        let client = claim.client.unwrap_or_else(|| self.new_client());
         let owner = Owner { client, name };
+        let secret = new_token().map_err(|error| {
+            let message = format!("the system gives no random numbers: {error}");
+            OpError::new(ErrorCode::Failed, message)
+        })?;
         let ttl = (!self.options.virtual_time).then_some(ttl);
         let mut inner = self.lock();
         // The machine may be down, so that nothing else ends the lease of a silent owner.
         if let Some(owner) = inner.lease.expire(Instant::now()) {
             self.end_lease(&mut inner, &owner, None, "expired");
         }
-        let previous = inner
+        let now = Instant::now();
+        let (secret, previous) = inner
             .lease
-            .take(owner.clone(), ttl, force, Instant::now())?;
+            .take(claim, owner.clone(), secret, ttl, force, now)?;
+        let holder = inner.lease.holder(now).map(|(holder, _)| holder.clone());
+        let owner = holder.unwrap_or(owner);
         match previous {
             Some(previous) => self.end_lease(&mut inner, &previous, Some(&owner), "taken over"),
             None => self.report_lease(&mut inner, None, Some(&owner), "taken"),
         }
-        Ok(())
+        Ok((secret, owner.client))
     }
 
-    /// Ends the lease of a client.
+    /// Ends the lease of the sender.
     ///
     /// # Errors
-    /// Fails if the client does not hold it.
-    pub fn release(&self, client: ClientId) -> Result<(), OpError> {
+    /// Fails if the sender does not hold it.
+    pub fn release(&self, claim: &Claim) -> Result<(), OpError> {
         let mut inner = self.lock();
-        inner.lease.check(client)?;
-        if let Some(owner) = inner.lease.release(client) {
+        inner.lease.check(claim, Instant::now())?;
+        if let Some(owner) = inner.lease.release(claim) {
             self.end_lease(&mut inner, &owner, None, "released");
         }
         Ok(())
@@ -356,12 +369,12 @@ impl Hub {
         self.push_event(inner, body);
     }
 
-    /// Checks that the client holds the lease.
+    /// Checks that the sender holds the lease.
     ///
     /// # Errors
     /// Says who holds it.
-    pub fn check_owner(&self, client: ClientId) -> Result<(), OpError> {
-        Ok(self.lock().lease.check(client)?)
+    pub fn check_owner(&self, claim: &Claim) -> Result<(), OpError> {
+        Ok(self.lock().lease.check(claim, Instant::now())?)
     }
 
     // Commands.
@@ -373,14 +386,14 @@ impl Hub {
     /// Fails if the bus is not in Op or the queue is full.
     pub fn submit(
         &self,
-        client: Option<ClientId>,
+        owner: Option<&Claim>,
         parts: Vec<Work>,
         waits: bool,
     ) -> Result<(u64, oneshot::Receiver<Outcome>), OpError> {
         let mut inner = self.lock();
         // Again, under the lock: the lease may have ended since.
-        if let Some(client) = client {
-            inner.lease.check(client)?;
+        if let Some(owner) = owner {
+            inner.lease.check(owner, Instant::now())?;
         }
         if self.bus_state() != BusState::Op {
             let bus = self.bus.borrow();
@@ -409,7 +422,7 @@ impl Hub {
             failure: None,
             reply: Some(reply),
             waits,
-            owned: client.is_some(),
+            owned: owner.is_some(),
         };
         inner.pending.insert(ticket, pending);
         let parts = parts.into_iter().map(|work| QueuedWork { ticket, work });

@@ -5,6 +5,7 @@
 //! - [`operator`]: carries commands to the machine and outcomes back;
 //! - [`external`]: set-points of clients in the cycle;
 //! - [`lease`]: who owns the motion;
+//! - `admission`, [`bulk`]: what clients may take: connections, large answers;
 //! - [`command`], [`error`]: the protocol;
 //! - [`sampler`]: history and distribution of times;
 //! - [`recorder`]: every cycle to an MCAP file;
@@ -13,6 +14,8 @@
 
 #![deny(unsafe_code)]
 
+mod admission;
+pub mod bulk;
 pub mod client;
 pub mod command;
 pub mod connection;
@@ -34,4 +37,5 @@ pub mod sampler;
 pub mod serve;
 pub mod socket;
 pub mod state;
+mod strict;
 pub mod websocket;

@@ -16,8 +16,10 @@ use ecaxis_master::samples::{SampleLayout, Samples};
 use ecaxis_master::session::Options;
 use ecaxis_master::supervise::operator::for_manual_mode;
 use ecaxis_master::sys::rights;
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use sd_notify::NotifyState;
 use serde_json::{Map, Value};
+use tokio::runtime::Runtime;
 
 use crate::http::{HttpOptions, HttpServer};
 use crate::hub::{BusState, Describe, Hub, HubOptions};
@@ -27,8 +29,10 @@ use crate::socket::Socket;
 
 /// The period at which samples are taken over, and at which the end is noticed.
 const PERIOD: Duration = Duration::from_millis(5);
-/// The threads that serve clients.
+/// The threads that serve clients of the socket, and those of HTTP.
 const WORKERS: usize = 2;
+/// The nice value of the threads that serve HTTP: commands over the socket go first.
+const HTTP_NICE: i32 = 5;
 /// The entries of the change log that may wait for the disk.
 const CHANGES: usize = 1024;
 /// The size in bytes of a new token.
@@ -168,14 +172,15 @@ pub fn serve(
         changes: options.change_log.clone().map(log_changes).transpose()?,
     };
     let hub = Arc::new(Hub::new(machine, outputs, samples, hub_options));
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(WORKERS)
-        .thread_name("ecaxis-clients")
-        .on_thread_start(rights::drop_capabilities)
-        .enable_all()
-        .build()
-        .map_err(ServeError::Thread)?;
-    let (socket, http) = runtime.block_on(bind(&hub, &options))?;
+    raise_file_limit();
+    let commands = runtime("ecaxis-commands", rights::drop_capabilities)?;
+    let clients = runtime("ecaxis-clients", || {
+        rights::drop_capabilities();
+        // Without the right, nothing changes.
+        let _ = rustix::process::setpriority_process(None, HTTP_NICE);
+    })?;
+    let socket = commands.block_on(bind_socket(&options))?;
+    let http = clients.block_on(bind_http(&hub, &options))?;
     ready(&Listening {
         socket: options.socket.map(|(path, _)| path),
         url: http.as_ref().map(HttpServer::url),
@@ -202,19 +207,12 @@ pub fn serve(
         thread.spawn(work).map_err(ServeError::Thread)?
     };
     if let Some(http) = http {
-        runtime.spawn(async move {
-            if let Err(error) = http.serve().await {
-                tracing::error!(%error, "the HTTP server has ended");
-            }
-        });
+        clients.spawn(http.serve());
     }
-    let clients = Arc::clone(&hub);
-    runtime.spawn(async move {
-        match socket {
-            Some(socket) => socket.serve(&clients).await,
-            None => std::future::pending().await,
-        }
-    });
+    if let Some(socket) = socket {
+        let hub = Arc::clone(&hub);
+        commands.spawn(async move { socket.serve(&hub).await });
+    }
     let mut service = Service::start();
     while !stop.is_cancelled() && !keeper.is_finished() {
         thread::sleep(PERIOD);
@@ -228,33 +226,57 @@ pub fn serve(
     let _ = sampler.join();
     // After the last cycle.
     let recorded = recorder.map_or(Ok(()), Recorder::finish);
-    runtime.shutdown_timeout(Duration::from_secs(1));
+    clients.shutdown_timeout(Duration::from_secs(1));
+    commands.shutdown_timeout(Duration::from_secs(1));
     match kept {
         Ok(()) => Ok(recorded?),
         Err(panic) => std::panic::resume_unwind(panic),
     }
 }
 
-async fn bind(
+fn runtime(name: &str, start: impl Fn() + Send + Sync + 'static) -> Result<Runtime, ServeError> {
+    tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(WORKERS)
+        .thread_name(name)
+        .on_thread_start(start)
+        .enable_all()
+        .build()
+        .map_err(ServeError::Thread)
+}
+
+/// Permits as many open files as the system does: none shall be missing for a stop or for the bus.
+fn raise_file_limit() {
+    let limit = getrlimit(Resource::Nofile);
+    let raised = Rlimit {
+        current: limit.maximum,
+        ..limit
+    };
+    if let Err(error) = setrlimit(Resource::Nofile, raised) {
+        tracing::debug!(%error, "the limit of open files stays");
+    }
+}
+
+async fn bind_socket(options: &ServerOptions) -> Result<Option<Socket>, ServeError> {
+    let Some((path, mode)) = &options.socket else {
+        return Ok(None);
+    };
+    let bound = Socket::bind(path, *mode).map_err(|source| {
+        let path = path.clone();
+        ServeError::Socket { path, source }
+    });
+    bound.map(Some)
+}
+
+async fn bind_http(
     hub: &Arc<Hub>,
     options: &ServerOptions,
-) -> Result<(Option<Socket>, Option<HttpServer>), ServeError> {
-    let socket = match &options.socket {
-        None => None,
-        Some((path, mode)) => Some(Socket::bind(path, *mode).map_err(|source| {
-            let path = path.clone();
-            ServeError::Socket { path, source }
-        })?),
+) -> Result<Option<HttpServer>, ServeError> {
+    let Some(http) = &options.http else {
+        return Ok(None);
     };
-    let http = match &options.http {
-        None => None,
-        Some(http) => {
-            let bound = HttpServer::bind(hub, http.clone()).await;
-            Some(bound.map_err(|source| {
-                let address = http.address;
-                ServeError::Http { address, source }
-            })?)
-        }
-    };
-    Ok((socket, http))
+    let bound = HttpServer::bind(hub, http.clone()).await;
+    let address = http.address;
+    bound
+        .map(Some)
+        .map_err(|source| ServeError::Http { address, source })
 }

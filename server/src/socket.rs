@@ -12,7 +12,7 @@ use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg}
 use serde_json::{Map, Value, json};
 use tokio::io::Interest;
 use tokio::net::{UnixListener, UnixStream};
-use tokio::sync::mpsc;
+use tokio::sync::{Semaphore, mpsc};
 
 use crate::client::{Answer, Client};
 use crate::connection::{Connection, Outgoing};
@@ -21,6 +21,9 @@ use crate::hub::Hub;
 
 /// The longest line of a client.
 pub const LINE: usize = 64 * 1024;
+
+/// The clients at the same time.
+const CLIENTS: usize = 256;
 
 /// The time for the answers to a client that sends no more.
 const LAST_ANSWERS: Duration = Duration::from_secs(5);
@@ -63,10 +66,23 @@ impl Socket {
 
     /// Accepts clients until the task ends.
     pub async fn serve(&self, hub: &Arc<Hub>) {
+        let places = Arc::new(Semaphore::new(CLIENTS));
         loop {
             match self.listener.accept().await {
                 Ok((stream, _)) => {
-                    tokio::spawn(serve_client(stream, Arc::clone(hub)));
+                    let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
+                        let message = format!("{CLIENTS} clients are connected");
+                        let error = OpError::new(ErrorCode::Busy, message);
+                        let refusal = line(&error.help("close one of them").answer());
+                        let flags = SendFlags::DONTWAIT | SendFlags::NOSIGNAL;
+                        let _ = rustix::net::send(&stream, &refusal, flags);
+                        continue;
+                    };
+                    let hub = Arc::clone(hub);
+                    tokio::spawn(async move {
+                        serve_client(stream, hub).await;
+                        drop(place);
+                    });
                 }
                 Err(error) => {
                     // Too many open files: wait until clients have left.
@@ -158,7 +174,14 @@ async fn write(stream: Arc<UnixStream>, mut outgoing: mpsc::Receiver<Outgoing>, 
             Outgoing::Answer(Answer { body, .. }) | Outgoing::Object(body) => {
                 send(&stream, &line(&body)).await
             }
-            Outgoing::Samples(batch) => send(&stream, &line(&batch.object())).await,
+            // As text, thousands of numbers: no command waits for it.
+            Outgoing::Samples(batch) => {
+                let text = tokio::task::spawn_blocking(move || line(&batch.object()));
+                match text.await {
+                    Ok(text) => send(&stream, &text).await,
+                    Err(_) => return,
+                }
+            }
         };
         if sent.is_err() {
             return;

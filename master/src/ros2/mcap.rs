@@ -5,6 +5,7 @@ use std::io::{Seek, Write};
 use std::sync::Arc;
 
 use ::mcap::records::{MessageHeader, Metadata};
+use ::mcap::write::NoSeek;
 use ::mcap::{WriteOptions, Writer};
 
 use super::topics::{Diagnostic, Source, Topics, encode_diagnostics};
@@ -35,9 +36,18 @@ impl<W: Write + Seek> McapFile<W> {
         topics: Arc<Topics>,
         wanted: impl Fn(Source) -> bool,
     ) -> Result<Self, McapError> {
-        let options = WriteOptions::new().profile("ros2").compression(None);
+        Self::create(file, WriteOptions::new(), topics, wanted)
+    }
+
+    fn create(
+        file: W,
+        options: WriteOptions,
+        topics: Arc<Topics>,
+        wanted: impl Fn(Source) -> bool,
+    ) -> Result<Self, McapError> {
         let library = concat!("ecaxis ", env!("CARGO_PKG_VERSION"));
-        let mut writer = options.library(library).create(file)?;
+        let options = options.profile("ros2").compression(None).library(library);
+        let mut writer = options.create(file)?;
         let mut channels = Vec::new();
         for topic in topics.list().iter().filter(|topic| wanted(topic.source)) {
             let schema = &topic.schema;
@@ -138,6 +148,21 @@ impl<W: Write + Seek> McapFile<W> {
         let mut file = self.writer.into_inner();
         file.flush()?;
         Ok(file)
+    }
+}
+
+impl<W: Write> McapFile<NoSeek<W>> {
+    /// Begins a file that is written from its begin to its end, such as the answer to a request.
+    ///
+    /// # Errors
+    /// Fails if the file cannot be written.
+    pub fn stream(
+        to: W,
+        topics: Arc<Topics>,
+        wanted: impl Fn(Source) -> bool,
+    ) -> Result<Self, McapError> {
+        let options = WriteOptions::new().disable_seeking(true);
+        Self::create(NoSeek::new(to), options, topics, wanted)
     }
 }
 

@@ -32,16 +32,16 @@ impl Client {
             }
             Ok(answer)
         };
-        self.transfer(false, transfer).await
+        self.transfer(None, transfer).await
     }
 
     async fn transfer(
         &self,
-        needs_lease: bool,
+        owner: Option<&Claim>,
         transfer: impl Future<Output = Outcome> + Send + 'static,
     ) -> Outcome {
         let work = Work::Transfer(Transfer(Box::pin(transfer)));
-        let mut answer = self.submit(needs_lease, vec![work], true).await?;
+        let mut answer = self.submit(owner, vec![work], true).await?;
         answer.remove("request");
         Ok(answer)
     }
@@ -82,6 +82,7 @@ impl Client {
 
     pub(super) async fn sdo_write(
         &self,
+        claim: &Claim,
         device: &str,
         index: &Index,
         sub: u8,
@@ -100,7 +101,7 @@ impl Client {
             let written = mailbox.download(number, sub, &bytes).await;
             written.map(|()| Map::new()).map_err(refused)
         };
-        self.transfer(true, transfer).await
+        self.transfer(Some(claim), transfer).await
     }
 }
 

@@ -40,18 +40,19 @@ pub(super) fn mailbox(
     let overlap = || {
         let mut in_order = boxes.clone();
         in_order.sort_by_key(|(_, sm)| sm.start_address);
-        in_order
-            .array_windows()
-            .find_map(|[(first, a), (second, b)]| {
-                (end(a) > u32::from(b.start_address)).then(|| {
-                    format!(
-                        "the mailboxes of {name} overlap: SyncManager {first} ends at 0x{:04X}, \
+        in_order.windows(2).find_map(|pair| {
+            let [(first, a), (second, b)] = pair else {
+                return None;
+            };
+            (end(a) > u32::from(b.start_address)).then(|| {
+                format!(
+                    "the mailboxes of {name} overlap: SyncManager {first} ends at 0x{:04X}, \
                      SyncManager {second} begins at 0x{:04X}",
-                        end(a),
-                        b.start_address
-                    )
-                })
+                    end(a),
+                    b.start_address
+                )
             })
+        })
     };
     if let Some(message) = wrong_size.or_else(overlap) {
         let hint = match raw.sii.place() {
