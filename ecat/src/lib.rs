@@ -15,5 +15,6 @@ pub mod object;
 mod object_names;
 pub mod registers;
 pub mod sii;
+pub mod text;
 pub mod value;
 pub mod vendor;

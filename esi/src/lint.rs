@@ -18,6 +18,8 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
+use ecaxis_ecat::text::is_hidden;
+
 use crate::address;
 use crate::model::{Device, EsiFile, InitCmd, Module, Pdo, Position, Slots, SmUse};
 use crate::select::{SelectError, SelectOptions, offered_modes, select};
@@ -139,7 +141,19 @@ impl FindingBuilder {
     }
 }
 
+/// Reports characters with which a name acts on a terminal, or looks like another name.
+fn name(found: &mut FindingBuilder, position: Position, path: &str, name: &str) {
+    if let Some(c) = name.chars().find(|c| is_hidden(*c)) {
+        let code = u32::from(c);
+        let message = format!(
+            "the name contains the control character U+{code:04X}: it is shown as \u{fffd}"
+        );
+        found.warn(position, path, message);
+    }
+}
+
 fn device(found: &mut FindingBuilder, path: &str, device: &Device) {
+    name(found, device.position, path, &device.name);
     pdos(found, path, device, &device.rx_pdos, "RxPdo");
     pdos(found, path, device, &device.tx_pdos, "TxPdo");
     if let Some(coe) = device.mailbox.as_ref().and_then(|m| m.coe.as_ref()) {
@@ -189,6 +203,7 @@ fn device(found: &mut FindingBuilder, path: &str, device: &Device) {
 }
 
 fn module(found: &mut FindingBuilder, path: &str, file: &EsiFile, module: &Module) {
+    name(found, module.position, path, &module.name);
     let first = file
         .modules
         .iter()

@@ -9,6 +9,7 @@ use ecaxis_axis::setpoint::{Interpolation, Knot, MotionLimits, StreamConfig};
 use ecaxis_axis::{MAX_RATE, Mode};
 use ecaxis_ecat::data_type::{DataType, Kind};
 use ecaxis_ecat::index::{AxisIndex, GroupIndex};
+use ecaxis_ecat::text::is_hidden;
 use ecaxis_esi::address;
 use ecaxis_master::clock;
 use ecaxis_master::mailbox::worker::MailboxError;
@@ -176,7 +177,7 @@ impl Client {
     fn rename(&self, name: &str) {
         let name: String = name
             .chars()
-            .filter(|c| !c.is_control())
+            .filter(|c| !is_hidden(*c))
             .take(NAME_LENGTH)
             .collect();
         if !name.trim().is_empty() {

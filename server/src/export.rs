@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 use std::sync::Arc;
 
+use ecaxis_ecat::text::csv_cell;
 use ecaxis_master::clock::Nanos;
 use ecaxis_master::ros2::mcap::McapFile;
 use ecaxis_master::ros2::topics::Topics;
@@ -51,7 +52,7 @@ pub fn csv(
             true => signal.name.clone(),
             false => format!("{} [{}]", signal.name, signal.unit),
         };
-        write!(out, ",\"{}\"", name.replace('"', "\"\""))?;
+        write!(out, ",{}", csv_cell(&name))?;
     }
     write!(out, "\r\n")?;
     parts(samples, words, times, |part, row| {

@@ -48,7 +48,7 @@ pub(crate) fn print_page(document: &Document) -> Result<(), Failure> {
 
 /// Prints text with colours for states and findings, on a terminal.
 pub(crate) fn shown(text: &str) -> Result<(), Failure> {
-    let text = output::without_controls(text);
+    let text = ecaxis_ecat::text::printable(text);
     match style::on_stdout() {
         true => result(&style::decorated(&text)),
         false => result(&text),
@@ -93,7 +93,7 @@ pub(crate) fn note(text: &str) {
 /// Prints a line of a failure on stderr.
 pub(crate) fn print_always(text: &str) {
     output::log_message(text);
-    let text = output::without_controls(text);
+    let text = ecaxis_ecat::text::printable(text);
     let text = output::wrapped(&text, output::stderr_width());
     let _ = output::print_line(|mut err| style::complaint(&mut err, &text));
 }

@@ -3,7 +3,6 @@
 //! At most one status line is shown on stderr. All permanent lines are written through this module,
 //! which clears the status line first. Without a terminal, no line is wrapped or cleared.
 
-use std::borrow::Cow;
 use std::fs::File;
 use std::io::{self, IsTerminal, Write};
 use std::path::Path;
@@ -205,16 +204,6 @@ fn columns(terminal: impl std::os::fd::AsFd) -> Option<usize> {
     Some(usize::from(size.ws_col)).filter(|columns| *columns > 0)
 }
 
-/// Replaces control characters, which a file or a device may have put into a name. They would act on
-/// the terminal.
-pub(crate) fn without_controls(text: &str) -> Cow<'_, str> {
-    let acts = |c: char| c.is_control() && !matches!(c, '\n' | '\t');
-    match text.contains(acts) {
-        true => Cow::Owned(text.replace(acts, "\u{fffd}")),
-        false => Cow::Borrowed(text),
-    }
-}
-
 /// Wraps prose to `width`. Continuation lines are indented by two, or to the text after `= help: `.
 /// Source excerpts and words longer than a line stay unchanged.
 pub(crate) fn wrapped(text: &str, width: Option<usize>) -> String {
@@ -271,17 +260,6 @@ fn points(body: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn names_with_control_characters_do_not_act_on_the_terminal() {
-        for (text, expected) in [
-            ("two\nlines\tand \u{fc}", "two\nlines\tand \u{fc}"),
-            ("<\u{1b}]0;t\u{7}>", "<\u{fffd}]0;t\u{fffd}>"),
-            ("\u{9b}31mred\r", "\u{fffd}31mred\u{fffd}"),
-        ] {
-            assert_eq!(without_controls(text), expected);
-        }
-    }
 
     #[test]
     fn wrapped_breaks_prose_between_words() {

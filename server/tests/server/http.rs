@@ -4,6 +4,8 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
+use ecaxis_master::session::Options;
+use ecaxis_server::http::HttpOptions;
 use serde_json::{Value, json};
 
 use crate::harness::{Server, TOKEN, demo};
@@ -52,10 +54,27 @@ pub fn request(
         .unwrap();
     let head = String::from_utf8(bytes[..end].to_vec()).unwrap();
     let status = head.split(' ').nth(1).unwrap().parse().unwrap();
-    Reply {
-        status,
-        head: head.to_lowercase(),
-        body: bytes[end + 4..].to_vec(),
+    let head = head.to_lowercase();
+    let mut body = bytes[end + 4..].to_vec();
+    if head.contains("transfer-encoding: chunked") {
+        body = without_chunks(&body);
+    }
+    Reply { status, head, body }
+}
+
+/// RFC 9112, 7.1. Panics if the body is not whole.
+fn without_chunks(mut chunks: &[u8]) -> Vec<u8> {
+    let mut body = Vec::new();
+    loop {
+        let end = chunks.windows(2).position(|two| two == b"\r\n").unwrap();
+        let size = std::str::from_utf8(&chunks[..end]).unwrap();
+        let size = usize::from_str_radix(size, 16).unwrap();
+        let begin = end + 2;
+        if size == 0 {
+            return body;
+        }
+        body.extend(&chunks[begin..begin + size]);
+        chunks = &chunks[begin + size + 2..];
     }
 }
 
@@ -84,7 +103,10 @@ fn commands_need_the_token_and_control() {
         let (stop, _) = post("/api/stop", &with_token(&bearer), "");
         if control {
             assert_eq!((status, stop), (200, 200), "{answer}");
-            let (status, answer) = post("/api/enable", &with_token(&bearer), r#"{"axis": "x"}"#);
+            let without = post("/api/enable", &with_token(&bearer), r#"{"axis": "x"}"#);
+            assert_eq!(without.1["error"]["code"], json!("not_owner"));
+            let enable = json!({"axis": "x", "lease": answer["lease"]}).to_string();
+            let (status, answer) = post("/api/enable", &with_token(&bearer), &enable);
             assert_eq!(status, 200, "{answer}");
             let state = request(&server, "GET", "/api/state", &[], "").json();
             assert_eq!(state["axes"][0]["enabled"], json!(true));
@@ -98,6 +120,139 @@ fn commands_need_the_token_and_control() {
         assert_eq!(status, 400);
         let (status, _) = post("/api/area", &with_token(&bearer), "");
         assert!([400, 403].contains(&status));
+    }
+}
+
+/// The lease belongs to the program that has its secret. One that only reads does not keep it.
+#[test]
+fn a_lease_over_http_ends_with_its_owner() {
+    let server = Server::with_http(demo(), true);
+    server.client();
+    let bearer = format!("Bearer {TOKEN}");
+    let post = |op: &str, body: Value| {
+        let path = format!("/api/{op}");
+        request(
+            &server,
+            "POST",
+            &path,
+            &with_token(&bearer),
+            &body.to_string(),
+        )
+        .json()
+    };
+    let lease = post("take", json!({"name": "cell", "ttl_ms": 1000}))["lease"].clone();
+    assert_eq!(post("take", json!({}))["error"]["code"], json!("not_owner"));
+    for secret in [json!({}), json!({"lease": "0".repeat(32)})] {
+        let error = post("renew", secret)["error"].clone();
+        assert_eq!(error["code"], json!("not_owner"));
+    }
+    assert_eq!(post("renew", json!({"lease": lease}))["ok"], json!(true));
+    let start = Instant::now();
+    let expired = loop {
+        let state = request(&server, "GET", "/api/state", &with_token(&bearer), "").json();
+        if state["lease"]["owner"] == json!(null) {
+            break post("renew", json!({"lease": lease}))["error"].clone();
+        }
+        assert!(start.elapsed() < Duration::from_secs(20), "{state}");
+    };
+    assert_eq!(expired["code"], json!("no_lease"));
+    let message = expired["message"].as_str().unwrap();
+    assert!(
+        message.contains("has expired") && message.ends_with("lasts 1 s"),
+        "{message}"
+    );
+    let next = post("take", json!({"name": "next"}));
+    assert_eq!(next["ok"], json!(true));
+    assert_ne!(next["lease"], lease);
+}
+
+#[test]
+fn keys_headers_and_signals_that_occur_twice_are_refused() {
+    let server = Server::with_http(demo(), true);
+    server.client();
+    let bearer = format!("Bearer {TOKEN}");
+    let twice = r#"{"ttl_ms": 1000, "ttl_ms": 2000}"#;
+    let reply = request(&server, "POST", "/api/take", &with_token(&bearer), twice);
+    assert_eq!(reply.status, 400);
+    let text = reply.json()["error"]["message"].to_string();
+    assert!(text.contains("occurs twice"), "{text}");
+    let hosts = [("Host", "localhost"), ("Host", "localhost")];
+    assert_ne!(
+        request(&server, "GET", "/api/state", &hosts, "").status,
+        200
+    );
+    let path = "/api/samples?signals=x.position,x.position";
+    assert_eq!(request(&server, "GET", path, &[], "").status, 400);
+}
+
+/// A client that sends half a request, again and again.
+#[test]
+fn half_requests_leave_room_for_a_stop() {
+    let server = Server::with_http(demo(), true);
+    let mut client = server.owner("cell");
+    let url = server.url.clone().unwrap();
+    let address = url
+        .strip_prefix("http://")
+        .unwrap()
+        .split('/')
+        .next()
+        .unwrap();
+    let half: Vec<TcpStream> = (0..400)
+        .filter_map(|_| {
+            let mut stream = TcpStream::connect(address).ok()?;
+            let _ = stream.write_all(b"GET /api/state HTTP/1.1\r\nHost: local");
+            Some(stream)
+        })
+        .collect();
+    let mut refused = half.last().unwrap();
+    let mut answer = Vec::new();
+    // The end may be a reset: the server has not read the request.
+    let _ = refused.read_to_end(&mut answer);
+    let text = String::from_utf8_lossy(&answer);
+    assert!(
+        text.is_empty() || text.starts_with("HTTP/1.1 503"),
+        "{text}"
+    );
+    client.ok("stop", json!({}));
+    server.client().ok("stop", json!({}));
+    drop(half);
+    let start = Instant::now();
+    let served = || {
+        let mut stream = TcpStream::connect(address).ok()?;
+        let text =
+            format!("GET /api/state HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
+        stream.write_all(text.as_bytes()).ok()?;
+        let mut bytes = Vec::new();
+        stream.read_to_end(&mut bytes).ok()?;
+        bytes.starts_with(b"HTTP/1.1 200").then_some(())
+    };
+    while served().is_none() {
+        assert!(start.elapsed() < Duration::from_secs(20), "no new client");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+#[test]
+fn a_link_to_the_page_may_stand_anywhere() {
+    let server = Server::with_http(demo(), true);
+    server.client();
+    let get = |path: &str, [site, mode, to]: [&str; 3]| {
+        let headers = [
+            ("Sec-Fetch-Site", site),
+            ("Sec-Fetch-Mode", mode),
+            ("Sec-Fetch-Dest", to),
+        ];
+        request(&server, "GET", path, &headers, "").status
+    };
+    for site in ["cross-site", "same-site"] {
+        assert_eq!(get("/", [site, "navigate", "document"]), 200);
+        assert_eq!(get("/", [site, "navigate", "iframe"]), 403);
+        assert_eq!(get("/", [site, "no-cors", "script"]), 403);
+        assert_eq!(get("/api/state", [site, "navigate", "document"]), 403);
+        assert_eq!(get("/api/samples", [site, "no-cors", "image"]), 403);
+    }
+    for site in ["same-origin", "none"] {
+        assert_eq!(get("/api/state", [site, "cors", "empty"]), 200);
     }
 }
 
@@ -190,4 +345,34 @@ fn a_client_that_may_not_command_cannot_fill_the_change_log() {
         .map(|entry| entry["outcome"].clone())
         .collect();
     assert_eq!(outcomes, [json!("ok")]);
+}
+
+/// A recording is a plain file of its folder, whatever its name is.
+#[test]
+fn links_are_no_recordings() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let recordings = path("recordings");
+    std::fs::create_dir(&recordings).unwrap();
+    std::fs::write(path("secret"), "secret").unwrap();
+    std::fs::write(recordings.join("run.pcapng"), "frames").unwrap();
+    std::os::unix::fs::symlink(path("secret"), recordings.join("soft")).unwrap();
+    std::fs::hard_link(path("secret"), recordings.join("hard")).unwrap();
+    std::fs::create_dir(recordings.join("folder")).unwrap();
+    let http = HttpOptions {
+        address: "127.0.0.1:0".parse().unwrap(),
+        control: false,
+        token: TOKEN.to_owned(),
+        hosts: Vec::new(),
+        recordings: Some(recordings),
+    };
+    let server = Server::start(demo(), Options::default(), Some(http));
+    let list = request(&server, "GET", "/api/recordings", &[], "").json();
+    let names: Vec<_> = list["recordings"].as_array().unwrap().iter().collect();
+    assert_eq!(names.len(), 1, "{list}");
+    let get = |name: &str| request(&server, "GET", &format!("/api/recordings/{name}"), &[], "");
+    assert_eq!(get("run.pcapng").body, b"frames");
+    for name in ["soft", "hard", "folder", "none"] {
+        assert_eq!(get(name).status, 404, "{name}");
+    }
 }
