@@ -47,6 +47,8 @@ pub struct HttpOptions {
     /// Clients with the token may command.
     pub control: bool,
     pub token: String,
+    /// The token is known to its users: it is not printed.
+    pub known_token: bool,
     /// Further names that the `Host` header may contain.
     pub hosts: Vec<String>,
     pub recordings: Option<PathBuf>,
@@ -102,11 +104,14 @@ impl HttpServer {
         })
     }
 
-    /// Returns the address with the token.
+    /// Returns the address, with the token unless it is known.
     #[must_use]
     pub fn url(&self) -> String {
         let Http { options, .. } = &*self.http;
-        format!("http://{}/#token={}", options.address, options.token)
+        match options.known_token {
+            true => format!("http://{}/", options.address),
+            false => format!("http://{}/#token={}", options.address, options.token),
+        }
     }
 
     /// Serves until the task ends.

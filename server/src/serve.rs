@@ -56,7 +56,7 @@ pub struct ServerOptions {
 #[derive(Debug, Clone)]
 pub struct Listening {
     pub socket: Option<PathBuf>,
-    /// With the token.
+    /// With the token, unless it is known.
     pub url: Option<String>,
 }
 

@@ -18,4 +18,5 @@ mod output;
 mod rights;
 mod signatures;
 mod terminal;
+mod tokens;
 mod tune;

@@ -2,6 +2,7 @@
 
 use std::io::Write as _;
 use std::net::SocketAddr;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -157,6 +158,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
                 // Ignored: without a reader of the address, the server still serves.
                 let mut out = std::io::stdout().lock();
                 let _ = writeln!(out, "{url}").and_then(|()| out.flush());
+                if let Some(file) = &args.token_file {
+                    let file = file.display();
+                    note(&format!("to command, add #token= and the token of {file}"));
+                }
             }
         },
     );
@@ -197,6 +202,7 @@ fn http(args: &Args, address: SocketAddr) -> Result<HttpOptions, Failure> {
         address,
         control: args.control,
         token,
+        known_token: args.token_file.is_some(),
         hosts: args.allow_host.clone(),
         recordings: args.recordings.clone(),
     })
@@ -208,6 +214,13 @@ fn token(path: &Path) -> Result<String, Failure> {
         Failure::new(hints::WRONG, format!("{}: {why}", path.display()))
             .hint("write one line with 16 or more letters and digits")
     };
+    let about = std::fs::metadata(path).map_err(|e| wrong(e.to_string()))?;
+    // The group may read it: that of a service.
+    if about.permissions().mode() & 0o027 != 0 {
+        let message = format!("{}: other users may read or write it", path.display());
+        let hint = format!("chmod 600 {}", path.display());
+        return Err(Failure::new(hints::WRONG, message).hint(hint));
+    }
     let text = ecaxis_master::file::read_text(path, MAX_BYTES).map_err(|e| wrong(e.to_string()))?;
     let token = text.trim();
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_.~".contains(c);

@@ -205,6 +205,7 @@ fn viewers_off_loopback_need_the_token() {
         address: "0.0.0.0:0".parse().unwrap(),
         control: false,
         token: TOKEN.to_owned(),
+        known_token: false,
         hosts: Vec::new(),
         recordings: None,
     };

@@ -72,6 +72,7 @@ impl Server {
             address: "127.0.0.1:0".parse().unwrap(),
             control,
             token: TOKEN.to_owned(),
+            known_token: false,
             hosts: Vec::new(),
             recordings: None,
         };

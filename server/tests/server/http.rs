@@ -363,6 +363,7 @@ fn links_are_no_recordings() {
         address: "127.0.0.1:0".parse().unwrap(),
         control: false,
         token: TOKEN.to_owned(),
+        known_token: false,
         hosts: Vec::new(),
         recordings: Some(recordings),
     };

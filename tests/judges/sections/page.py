@@ -107,6 +107,9 @@ class Server:
     def __init__(self, program, folder, *options, port=0, config=CONFIG):
         self.folder, self.path = Path(folder), Path(folder) / "control.sock"
         self.path.unlink(missing_ok=True)
+        # A token from a file is not printed.
+        file = options[options.index("--token-file") + 1] if "--token-file" in options else None
+        self.token = f"#token={Path(file).read_text().strip()}" if file else ""
         self.output = self.folder / "output"
         command = [str(program), "serve", str(config), "--sim", "--socket", str(self.path), "--http", f"127.0.0.1:{port}", *options]
         self.stack = contextlib.ExitStack()
@@ -123,8 +126,8 @@ class Server:
     def printed(self):
         if self.child.poll() is not None:
             raise RuntimeError(f"{' '.join(self.child.args)}: {self.output.read_text()}")
-        found = re.search(r"http://127\.0\.0\.1:\d+/#\S+", self.output.read_text())
-        return found and found[0]
+        found = re.search(r"http://127\.0\.0\.1:\d+/(#\S+)?\n", self.output.read_text())
+        return found and found[0].strip() + self.token
 
     def __enter__(self):
         return self
@@ -231,6 +234,7 @@ def page(bench):
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ecaxis-page-")))
         token = folder / "token"
         token.write_text("a-token-of-the-judges-0123456789\n")
+        token.chmod(0o600)
         with Server(bench.program, folder, "--control", "--token-file", str(token)) as server:
             shows(bench, browser, server)
             jogs(report, browser, server)
