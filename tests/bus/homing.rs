@@ -8,7 +8,9 @@ use ecaxis_master::config::Machine;
 use ecaxis_master::session::Options;
 use ecaxis_test_support::recordings::process_images;
 use ecaxis_test_support::script::{Act, Trace, home, move_to, perform, perform_well};
-use ecaxis_test_support::{load, machine, root, run_badly, run_well, virtual_time};
+use ecaxis_test_support::{
+    assert_contains, load, machine, root, run_badly, run_well, virtual_time,
+};
 
 /// The position of home.
 const HOME: f64 = 3.0;
@@ -361,6 +363,18 @@ fn a_file_without_pdo_keys_homes_probes_and_switches_modes() {
     );
     let summary = run_well(machine, virtual_time());
     assert_eq!(summary.program_runs, 1);
+}
+
+/// Against an end stop, a velocity profile of the drive never reaches its target. The step does not
+/// wait for ever.
+#[test]
+fn a_velocity_profile_at_an_end_stop_ends_its_step() {
+    let text = "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"\nposition = 0\n\
+        mode = \"pv\"\n[device.axis]\nencoder = 2000\nlimits = { velocity = 20.0, acceleration = 200.0 }\n\
+        [device.sim]\ntrack = { ends = [-5.0, 5.0] }\n\
+        [[step]]\nvelocity = { x = 5.0 }\n[[step]]\ndwell = \"3s\"\n[[step]]\nvelocity = { x = 8.0 }\n";
+    let (error, _) = run_badly(machine(text), virtual_time());
+    assert_contains(&error, &["`x`", "step 3", "8"]);
 }
 
 /// After a move, the loop overshoots, stands for tens of ms, and creeps back at about the standstill

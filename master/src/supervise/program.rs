@@ -67,6 +67,31 @@ impl Settling {
     }
 }
 
+/// The time for which an axis in a profile of its drive has not moved.
+#[derive(Debug, Default)]
+pub(super) struct Stall(Option<(AxisIndex, f64, Nanos)>);
+
+impl Stall {
+    /// Returns `true` after the settle timeout without motion. A change by `noise` is motion.
+    pub(super) fn time_limit_reached(
+        &mut self,
+        axis: AxisIndex,
+        position: f64,
+        noise: f64,
+    ) -> bool {
+        let now = clock::now();
+        match self.0 {
+            Some((of, at, since)) if of == axis && (position - at).abs() <= noise => {
+                now.saturating_sub(since) > SETTLE_TIMEOUT
+            }
+            _ => {
+                self.0 = Some((axis, position, now));
+                false
+            }
+        }
+    }
+}
+
 impl From<&Step> for StepRef {
     fn from(step: &Step) -> Self {
         Self {

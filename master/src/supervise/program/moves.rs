@@ -6,11 +6,14 @@ use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Command, Mode};
 use ecaxis_ecat::index::{AxisIndex, IndexVec};
 
-use super::{Settling, TargetKind, Turn};
+use super::{Settling, Stall, TargetKind, Turn};
 use crate::clock::Nanos;
 use crate::config::Step;
 use crate::report::{Cause, Error};
 use crate::rt::channel::Snapshot;
+
+/// The counts by which the position of an axis at rest may change.
+const NOISE: f64 = 10.0;
 
 impl Turn<'_, '_> {
     /// Starts all moves in the same cycle; each arrives on its own. `part`: fraction of the
@@ -105,6 +108,7 @@ impl Turn<'_, '_> {
         )
         .await;
         let mut settling = Settling::default();
+        let mut stall = Stall::default();
         let mut superimposed = false;
         self.wait_until(step, start, |this, snapshot| {
             let status = |axis: AxisIndex| &snapshot.axes[axis];
@@ -125,6 +129,17 @@ impl Turn<'_, '_> {
             let Some(&(axis, target)) = late else {
                 return Ok(true);
             };
+            // A profile of the drive may never end: the axis is blocked, or bit 10 does not come.
+            let profile = matches!(status(axis).mode, Mode::Pp | Mode::Pv);
+            if profile && !follows(axis) && !this.is_held(snapshot, axis) {
+                let scale = this.setup(axis).map(|setup| setup.config.scale);
+                let noise = scale.map_or(0.0, |scale| scale.units_of_counts(NOISE).abs());
+                if stall.time_limit_reached(axis, status(axis).position, noise) {
+                    return Err(this.not_reached(step, axis, aim, target, snapshot));
+                }
+            } else {
+                stall = Stall::default();
+            }
             let on_its_way = |axis: AxisIndex| {
                 follows(axis) || status(axis).moving && !status(axis).held_by_range
             };

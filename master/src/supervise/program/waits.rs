@@ -236,7 +236,7 @@ fn was_held(error: &Error) -> bool {
 
 impl Supervisor {
     /// Returns true if an axis is held.
-    fn is_held(&self, snapshot: &Snapshot, axis: AxisIndex) -> bool {
+    pub(super) fn is_held(&self, snapshot: &Snapshot, axis: AxisIndex) -> bool {
         let of = |group: GroupIndex| snapshot.groups.get(group).map(|group| group.rate);
         let machine = of(GroupIndex::MACHINE).unwrap_or_default();
         let own = match self.group_of(axis) {
