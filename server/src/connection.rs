@@ -19,7 +19,7 @@ use crate::hub::{Hub, stream_text};
 use crate::state;
 
 /// The messages that may wait for a slow reader.
-const OUTGOING: usize = 256;
+const OUTGOING: usize = 32;
 /// The requests whose answers may wait: for an outcome, or for a slow reader.
 const WAITING: usize = 256;
 /// With more messages waiting, the client gets no state and no samples.

@@ -31,6 +31,8 @@ use crate::socket::Socket;
 const PERIOD: Duration = Duration::from_millis(5);
 /// The threads that serve clients of the socket, and those of HTTP.
 const WORKERS: usize = 2;
+/// The threads that read files and make large answers, at most.
+const BLOCKING: usize = 64;
 /// The nice value of the threads that serve HTTP: commands over the socket go first.
 const HTTP_NICE: i32 = 5;
 /// The entries of the change log that may wait for the disk.
@@ -237,6 +239,7 @@ pub fn serve(
 fn runtime(name: &str, start: impl Fn() + Send + Sync + 'static) -> Result<Runtime, ServeError> {
     tokio::runtime::Builder::new_multi_thread()
         .worker_threads(WORKERS)
+        .max_blocking_threads(BLOCKING)
         .thread_name(name)
         .on_thread_start(start)
         .enable_all()
