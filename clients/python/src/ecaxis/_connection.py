@@ -9,6 +9,7 @@ import os
 import queue
 import socket
 import threading
+import time
 from typing import Any, Callable, Dict, List, Mapping, Optional
 
 from ._errors import ConnectionLost, EcaxisError, TimedOut, of_answer
@@ -67,6 +68,8 @@ class Connection:
         self._listeners: List[Callable[[Event], None]] = []
         self._lost: Optional[ConnectionLost] = None
         self._lease_ended: Optional[EcaxisError] = None
+        self._lease_s: Optional[float] = None
+        self._renewed = 0.0
         self._reader = threading.Thread(target=self._read, name="ecaxis", daemon=True)
         self._reader.start()
 
@@ -91,6 +94,9 @@ class Connection:
             if self._lost:
                 raise self._lost
             self._answers[number] = answers
+            now = time.monotonic()
+            if self._lease_s is not None and now - self._renewed > self._lease_s / 3:
+                self._renewed, line = now, _RENEWAL + line
             try:
                 self._socket.sendall(line)
             except OSError as error:
@@ -108,6 +114,12 @@ class Connection:
         if not answer["ok"]:
             raise of_answer(answer["error"])
         return answer
+
+    def owns(self, lease_s: Optional[float]) -> None:
+        """The client owns the motion for this time after each request, also after one that only reads;
+        None: no longer."""
+        with self._lock:
+            self._lease_s, self._renewed, self._lease_ended = lease_s, time.monotonic(), None
 
     def renew(self) -> None:
         """Renews the lease without a wait for the answer: while another thread holds the interpreter's

@@ -287,10 +287,12 @@ class Machine(AxesByName["Axis"]):
         ttl = int(self._lease_s * 1000)
         self.connection.request("take", name=client_name(), ttl_ms=ttl, force=force or None)
         self._owns = True
+        self.connection.owns(self._lease_s)
 
     def release(self) -> None:
         """Gives the lease back. What this program moved stops."""
         self._owns = False
+        self.connection.owns(None)
         self.connection.request("release")
 
     def command(self, op: str, what: str, **keys: Any) -> Motion:
