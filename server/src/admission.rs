@@ -24,7 +24,9 @@ use crate::socket::LINE;
 
 /// The connections at the same time.
 pub const CONNECTIONS: usize = 256;
-/// Those of one address of another computer.
+/// Those of this computer: others find a place as well.
+pub const OF_LOOPBACK: usize = 192;
+/// Those of one address of another computer; of IPv6, of one network.
 pub const OF_ADDRESS: usize = 64;
 /// The time for the head of a request, also of the next one of a connection.
 const HEAD: Duration = Duration::from_secs(15);
@@ -55,11 +57,18 @@ impl Admission {
 
     /// Returns a place for a connection; `None` if there is none.
     fn admit(self: &Arc<Self>, address: IpAddr) -> Option<Place> {
-        let address = address.to_canonical();
+        let address = match address.to_canonical() {
+            // A computer has as many addresses of its network as it likes.
+            IpAddr::V6(v6) if !v6.is_loopback() => {
+                let [a, b, c, d, ..] = v6.segments();
+                IpAddr::from([a, b, c, d, 0, 0, 0, 0])
+            }
+            address => address,
+        };
         let mut open = self.lock();
         let own = open.of_address.get(&address).copied().unwrap_or_default();
         let most = match address.is_loopback() {
-            true => CONNECTIONS,
+            true => OF_LOOPBACK,
             false => OF_ADDRESS,
         };
         if open.total >= CONNECTIONS || own >= most {
@@ -217,6 +226,7 @@ mod tests {
         while let Some(place) = admission.admit(near) {
             places.push(place);
         }
+        assert_eq!(places.len(), OF_ADDRESS + 1 + OF_LOOPBACK - 1);
         assert_eq!(places.len(), CONNECTIONS);
         assert!(admission.admit(other).is_none());
         drop(places);

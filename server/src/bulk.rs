@@ -1,7 +1,10 @@
 //! Large answers: few at once, at a low priority, in pieces. A stop never waits for them.
 
+use std::fmt;
 use std::io::{self, Write};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
 use axum::body::{Body, Bytes};
@@ -12,13 +15,15 @@ use tokio::time::timeout;
 use crate::error::{ErrorCode, OpError};
 
 /// The answers that are made at the same time.
-const RUNNING: usize = 2;
-/// Those that may wait for their turn.
-const WAITING: usize = 8;
-/// The bytes of a piece, and the pieces that may wait for the client.
+const MAKING: usize = 2;
+/// The answers that are held in memory, made or to be made.
+const HELD: usize = 16;
+/// The exports at the same time. Each waits for its client.
+const EXPORTS: usize = 2;
+/// The bytes of a piece of an export, and the pieces that may wait for the client.
 const PIECE: usize = 256 * 1024;
 const PIECES: usize = 2;
-/// The time for a client to take a piece, and the whole answer.
+/// The time for a client to take a piece, and the whole export.
 const STALL: Duration = Duration::from_secs(10);
 const WHOLE: Duration = Duration::from_secs(300);
 /// The nice value of the threads that make large answers.
@@ -27,83 +32,97 @@ const NICE: i32 = 10;
 /// The places for large answers.
 #[derive(Debug)]
 pub struct Bulk {
-    running: Arc<Semaphore>,
-    /// Running and waiting.
-    places: Arc<Semaphore>,
-}
-
-/// A place for one large answer.
-#[derive(Debug)]
-struct Place {
-    _running: OwnedSemaphorePermit,
-    _place: OwnedSemaphorePermit,
+    making: Arc<Semaphore>,
+    held: Arc<Semaphore>,
+    exports: Arc<Semaphore>,
 }
 
 impl Default for Bulk {
     fn default() -> Self {
         Self {
-            running: Arc::new(Semaphore::new(RUNNING)),
-            places: Arc::new(Semaphore::new(RUNNING + WAITING)),
+            making: Arc::new(Semaphore::new(MAKING)),
+            held: Arc::new(Semaphore::new(HELD)),
+            exports: Arc::new(Semaphore::new(EXPORTS)),
         }
     }
 }
 
+/// Bytes that keep their place until they are sent.
+struct Held {
+    bytes: Vec<u8>,
+    _place: OwnedSemaphorePermit,
+}
+
+impl AsRef<[u8]> for Held {
+    fn as_ref(&self) -> &[u8] {
+        &self.bytes
+    }
+}
+
+fn place(of: &Arc<Semaphore>) -> Result<OwnedSemaphorePermit, OpError> {
+    Arc::clone(of).try_acquire_owned().map_err(|_| {
+        OpError::new(ErrorCode::Busy, "too many large answers wait")
+            .help("wait for the answers of earlier requests")
+    })
+}
+
 impl Bulk {
-    async fn place(&self) -> Result<Place, OpError> {
-        let full = || {
-            OpError::new(ErrorCode::Busy, "too many large answers wait")
-                .help("wait for the answers of earlier requests")
-        };
-        let place = Arc::clone(&self.places).try_acquire_owned();
-        let place = place.map_err(|_| full())?;
-        let running = Arc::clone(&self.running).acquire_owned().await;
-        Ok(Place {
-            _running: running.map_err(|_| full())?,
-            _place: place,
-        })
-    }
-
-    /// Does work that takes long.
+    /// Returns the bytes that `make` makes.
     ///
     /// # Errors
-    /// Fails if too much of it waits.
-    pub async fn run<T: Send + 'static>(
+    /// Fails if too many answers are held.
+    pub async fn bytes(
         &self,
-        work: impl FnOnce() -> T + Send + 'static,
-    ) -> Result<T, OpError> {
-        let place = self.place().await?;
-        let done = tokio::task::spawn_blocking(move || {
+        make: impl FnOnce() -> Vec<u8> + Send + 'static,
+    ) -> Result<Bytes, OpError> {
+        let failed = |error: &dyn fmt::Display| OpError::new(ErrorCode::Failed, error.to_string());
+        let place = place(&self.held)?;
+        let making = Arc::clone(&self.making).acquire_owned().await;
+        let making = making.map_err(|error| failed(&error))?;
+        let made = tokio::task::spawn_blocking(move || {
             lower_priority();
-            let result = work();
-            drop(place);
-            result
+            let bytes = make();
+            drop(making);
+            Bytes::from_owner(Held {
+                bytes,
+                _place: place,
+            })
         });
-        done.await
-            .map_err(|error| OpError::new(ErrorCode::Failed, error.to_string()))
+        made.await.map_err(|error| failed(&error))
     }
 
-    /// Returns a body that `make` writes while the client takes it.
+    /// Returns a body that `make` writes while the client takes it. A body that is not whole ends with
+    /// an error.
     ///
     /// # Errors
-    /// Fails if too many large answers wait.
+    /// Fails if too many exports are made.
     pub async fn body(
         &self,
         make: impl FnOnce(Pieces) -> io::Result<Pieces> + Send + 'static,
     ) -> Result<Body, OpError> {
-        let place = self.place().await?;
+        let place = place(&self.exports)?;
         let (pieces, mut receiver) = mpsc::channel(PIECES);
+        let whole = Arc::new(AtomicBool::new(false));
+        let done = Arc::clone(&whole);
         tokio::task::spawn_blocking(move || {
             lower_priority();
-            let cut = pieces.clone();
-            let made = make(Pieces::new(pieces)).and_then(|mut out| out.flush());
-            if let Err(error) = made {
-                tracing::debug!(%error, "a large answer was not taken");
-                // The client sees that the body is not whole.
-                let _ = cut.try_send(Err(error));
+            match make(Pieces::new(pieces)).and_then(|mut out| out.flush()) {
+                Ok(()) => done.store(true, Ordering::Release),
+                Err(error) => tracing::debug!(%error, "an export was not taken"),
             }
             drop(place);
         });
-        let next = move |context: &mut std::task::Context<'_>| receiver.poll_recv(context);
+        let mut cut = false;
+        let next = move |context: &mut Context<'_>| match receiver.poll_recv(context) {
+            // The sender is dropped after the mark.
+            Poll::Ready(None) if !whole.load(Ordering::Acquire) && !cut => {
+                cut = true;
+                let error: io::Error = io::ErrorKind::UnexpectedEof.into();
+                Poll::Ready(Some(Err(error)))
+            }
+            Poll::Ready(piece) => Poll::Ready(piece.map(Ok)),
+            Poll::Pending => Poll::Pending,
+        };
         Ok(Body::from_stream(futures_util::stream::poll_fn(next)))
     }
 }
@@ -116,14 +135,14 @@ fn lower_priority() {
 /// Takes the bytes of a large answer.
 #[derive(Debug)]
 pub struct Pieces {
-    to: mpsc::Sender<io::Result<Bytes>>,
+    to: mpsc::Sender<Bytes>,
     piece: Vec<u8>,
     began: Instant,
     runtime: Handle,
 }
 
 impl Pieces {
-    fn new(to: mpsc::Sender<io::Result<Bytes>>) -> Self {
+    fn new(to: mpsc::Sender<Bytes>) -> Self {
         Self {
             to,
             piece: Vec::new(),
@@ -148,9 +167,7 @@ impl Write for Pieces {
         }
         let left = WHOLE.saturating_sub(self.began.elapsed()).min(STALL);
         let piece = Bytes::from(std::mem::take(&mut self.piece));
-        let sent = self
-            .runtime
-            .block_on(timeout(left, self.to.send(Ok(piece))));
+        let sent = self.runtime.block_on(timeout(left, self.to.send(piece)));
         match sent {
             Ok(Ok(())) => Ok(()),
             Ok(Err(_)) => Err(io::ErrorKind::BrokenPipe.into()),
@@ -189,20 +206,43 @@ mod tests {
     }
 
     #[test]
-    fn more_than_the_places_is_refused_and_a_dropped_body_gives_its_place_back() {
+    fn a_body_that_is_not_whole_ends_with_an_error() {
+        runtime().block_on(async {
+            let bulk = Bulk::default();
+            let body = bulk.body(|mut out| {
+                out.write_all(&[0; 4096])?;
+                Err(io::ErrorKind::TimedOut.into())
+            });
+            let body = body.await.expect("a place");
+            let cut = axum::body::to_bytes(body, usize::MAX).await;
+            cut.expect_err("not whole");
+        });
+    }
+
+    #[test]
+    fn more_than_the_places_is_refused_and_what_ends_gives_its_place_back() {
         runtime().block_on(async {
             let bulk = Bulk::default();
             let endless = |mut out: Pieces| loop {
                 out.write_all(&[0; 4096])?;
             };
-            let first = bulk.body(endless).await.expect("a place");
-            let second = bulk.body(endless).await.expect("a place");
-            let waiting: Vec<_> = (0..WAITING).map(|_| bulk.places.try_acquire()).collect();
-            assert!(waiting.iter().all(Result::is_ok));
-            let refused = bulk.run(|| ()).await.expect_err("no place");
+            let exports = [
+                bulk.body(endless).await.expect("a place"),
+                bulk.body(endless).await.expect("a place"),
+            ];
+            let refused = bulk.body(endless).await.expect_err("no place");
             assert_eq!(refused.code, ErrorCode::Busy);
-            drop((first, second, waiting));
-            bulk.run(|| ()).await.expect("a place again");
+            // Other answers do not wait for exports.
+            let mut held = Vec::new();
+            for _ in 0..HELD {
+                held.push(bulk.bytes(|| vec![0; 10]).await.expect("a place"));
+            }
+            bulk.bytes(Vec::new).await.expect_err("no place");
+            drop((exports, held));
+            bulk.bytes(Vec::new).await.expect("a place again");
+            while bulk.exports.available_permits() < EXPORTS {
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
         });
     }
 }

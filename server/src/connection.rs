@@ -126,7 +126,7 @@ impl Batch {
 /// Returns the words of signals; all without names.
 ///
 /// # Errors
-/// Fails if a name is unknown or occurs twice.
+/// Fails if a name is unknown.
 pub fn signal_words(samples: &Samples, names: Option<&[String]>) -> Result<Vec<usize>, OpError> {
     let layout = samples.layout();
     let Some(names) = names else {
@@ -142,12 +142,6 @@ pub fn signal_words(samples: &Samples, names: Option<&[String]>) -> Result<Vec<u
                     .help("`machine` lists them under `samples`")
             })
     };
-    let mut seen = HashSet::new();
-    if let Some(twice) = names.iter().find(|name| !seen.insert(*name)) {
-        // Not of a signal: any text may be a name.
-        let message = format!("the signal {twice:?} is named twice");
-        return Err(OpError::new(ErrorCode::BadRequest, message));
-    }
     names.iter().map(word).collect()
 }
 

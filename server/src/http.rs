@@ -1,11 +1,13 @@
 //! HTTP and WebSocket: the page, the operations, samples, history and metrics.
 
+use std::collections::HashSet;
 use std::fs::{File, Metadata};
-use std::io::{self, Read as _, Write as _};
+use std::io::{self, Read as _};
 use std::net::{IpAddr, SocketAddr};
 use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
 use axum::Router;
 use axum::body::{Body, Bytes};
@@ -35,8 +37,10 @@ use crate::{strict, websocket};
 
 /// The most buckets of one history.
 const BUCKETS: usize = 20_000;
-/// The most values of one answer: 8 MB.
-const VALUES: usize = 1 << 20;
+/// The most values of one answer: 4 MB.
+const VALUES: usize = 1 << 19;
+/// The time for the body of a request.
+const BODY: Duration = Duration::from_secs(10);
 /// The bytes of a recording that are read at once.
 const PIECE: usize = 256 * 1024;
 
@@ -290,8 +294,12 @@ async fn operation(
     State(http): Shared,
     Path(op): Path<String>,
     headers: HeaderMap,
-    body: Bytes,
+    body: Body,
 ) -> Response {
+    let body = match read_body(body).await {
+        Ok(body) => body,
+        Err(error) => return refusal(&error),
+    };
     let parsed = match body.is_empty() {
         true => Ok(Value::Object(Map::new())),
         false => strict::from_slice(&body),
@@ -313,6 +321,19 @@ async fn operation(
     };
     map.insert("op".to_owned(), Value::String(op));
     read(&http, &headers, map).await
+}
+
+/// Reads a body of at most [`LINE`] bytes. A client that does not send it keeps no place.
+async fn read_body(body: Body) -> Result<Bytes, OpError> {
+    let whole = tokio::time::timeout(BODY, axum::body::to_bytes(body, LINE)).await;
+    match whole {
+        Ok(Ok(bytes)) => Ok(bytes),
+        Ok(Err(_)) => {
+            let message = "the body is longer than 64 KiB, or not whole";
+            Err(OpError::new(ErrorCode::TooLarge, message))
+        }
+        Err(_) => Err(OpError::new(ErrorCode::Timeout, "the body did not come")),
+    }
 }
 
 /// Carries out an operation without a body.
@@ -370,21 +391,25 @@ impl Range {
 
     fn words(&self, http: &Http, headers: &HeaderMap) -> Result<Vec<usize>, OpError> {
         http.client(headers).check_read()?;
-        signal_words(&http.hub.samples, self.names().as_deref())
+        let names = self.names();
+        let mut seen = HashSet::new();
+        let mut all = names.iter().flatten();
+        if let Some(twice) = all.find(|name| !seen.insert(name.as_str())) {
+            // Not of a signal: any text may be a name.
+            let message = format!("the signal {twice:?} is named twice");
+            return Err(OpError::new(ErrorCode::BadRequest, message));
+        }
+        signal_words(&http.hub.samples, names.as_deref())
     }
 }
 
 /// Answers with the bytes that `make` returns, made apart from the threads that serve clients.
 async fn binary(http: &Arc<Http>, make: impl FnOnce(&Hub) -> Vec<u8> + Send + 'static) -> Response {
     let hub = Arc::clone(&http.hub);
-    let body = http.bulk.body(move |mut out| {
-        out.write_all(&make(&hub))?;
-        Ok(out)
-    });
-    match body.await {
-        Ok(body) => {
+    match http.bulk.bytes(move || make(&hub)).await {
+        Ok(bytes) => {
             let kind = [(header::CONTENT_TYPE, "application/octet-stream")];
-            (kind, body).into_response()
+            (kind, bytes).into_response()
         }
         Err(error) => refusal(&error),
     }
@@ -430,8 +455,9 @@ async fn histogram(State(http): Shared, headers: HeaderMap) -> Response {
         return refusal(&error);
     }
     let hub = Arc::clone(&http.hub);
-    match http.bulk.run(move || hub.sampler.histogram_object()).await {
-        Ok(object) => axum::Json(object).into_response(),
+    let make = move || serde_json::to_vec(&hub.sampler.histogram_object()).unwrap_or_default();
+    match http.bulk.bytes(make).await {
+        Ok(text) => ([(header::CONTENT_TYPE, "application/json")], text).into_response(),
         Err(error) => refusal(&error),
     }
 }
@@ -441,7 +467,8 @@ async fn metrics(State(http): Shared, headers: HeaderMap) -> Response {
         return refusal(&error);
     }
     let hub = Arc::clone(&http.hub);
-    match http.bulk.run(move || crate::metrics::text(&hub)).await {
+    let make = move || crate::metrics::text(&hub).into_bytes();
+    match http.bulk.bytes(make).await {
         Ok(text) => {
             let kind = "text/plain; version=0.0.4; charset=utf-8";
             ([(header::CONTENT_TYPE, kind)], text).into_response()

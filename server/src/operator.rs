@@ -351,7 +351,10 @@ impl ServerOperator {
             ),
         };
         self.send(0, Message::Release(axis.map(|axis| axis.0)));
-        stop.filter(|_| attached)
+        // An axis that is being enabled follows no set-points: a stop would end its enabling.
+        let hand = axis.and_then(|axis| view.hands.get(axis));
+        let enables = hand.is_some_and(|hand| hand.doing == Activity::Enabling);
+        stop.filter(|_| attached && !enables)
     }
 
     fn send(&mut self, ticket: u64, message: Message) {

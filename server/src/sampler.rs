@@ -56,12 +56,17 @@ pub struct Timing {
     pub histograms: [LatencyHistogram; CYCLE_COLUMNS.len()],
 }
 
+/// The times and what was missed: read often, by commands too.
+#[derive(Debug)]
+struct Counted {
+    timing: Timing,
+    missed: u64,
+}
+
 #[derive(Debug)]
 struct Inner {
-    timing: Timing,
     /// The first row that was not taken yet.
     next: u64,
-    missed: u64,
     /// The number of the newest bucket: its time divided by its length.
     newest: Option<u64>,
     /// For each bucket and signal the least and the greatest value.
@@ -74,7 +79,10 @@ struct Inner {
 pub struct Sampler {
     signals: usize,
     bucket_ns: Nanos,
+    /// For as long as a history takes.
     inner: Mutex<Inner>,
+    /// For a moment. Locked after `inner`, if both are.
+    counted: Mutex<Counted>,
 }
 
 impl Sampler {
@@ -84,12 +92,14 @@ impl Sampler {
         Self {
             signals,
             bucket_ns,
-            inner: Mutex::new(Inner {
+            counted: Mutex::new(Counted {
                 timing: Timing {
                     histograms: std::array::from_fn(|_| LatencyHistogram::new()),
                 },
-                next: 0,
                 missed: 0,
+            }),
+            inner: Mutex::new(Inner {
+                next: 0,
                 newest: None,
                 least: vec![f64::NAN; BUCKETS * signals],
                 greatest: vec![f64::NAN; BUCKETS * signals],
@@ -101,19 +111,22 @@ impl Sampler {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    fn counted(&self) -> MutexGuard<'_, Counted> {
+        self.counted.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// Takes all new rows.
     pub fn take_new(&self, samples: &Samples) {
         let mut inner = self.lock();
         let mut next = inner.next;
         let missed = samples.read_new(&mut next, |_, row| self.take(&mut inner, row));
         inner.next = next;
-        inner.missed += missed;
+        self.counted().missed += missed;
     }
 
     fn take(&self, inner: &mut Inner, row: &[u64]) {
         let (counts, values) = row.split_at(COUNTS.min(row.len()));
-        let histograms = &mut inner.timing.histograms;
-        for (histogram, bits) in histograms.iter_mut().zip(values) {
+        for (histogram, bits) in self.counted().timing.histograms.iter_mut().zip(values) {
             let seconds = f64::from_bits(*bits);
             if seconds.is_finite() {
                 // At most hours; the cast saturates.
@@ -155,14 +168,14 @@ impl Sampler {
     /// Returns the distribution of the times since the start of the server.
     #[must_use]
     pub fn timing(&self) -> Timing {
-        self.lock().timing.clone()
+        self.counted().timing.clone()
     }
 
     /// Returns percentiles of the times, in the order of the columns of a cycle.
     #[must_use]
     pub fn percentiles(&self) -> [Percentiles; CYCLE_COLUMNS.len()] {
-        let inner = self.lock();
-        std::array::from_fn(|column| inner.timing.histograms[column].summary())
+        let counted = self.counted();
+        std::array::from_fn(|column| counted.timing.histograms[column].summary())
     }
 
     /// Returns the recorded times with their counts as a JSON object.
@@ -188,7 +201,7 @@ impl Sampler {
     /// Returns the number of rows that came and went before they were read.
     #[must_use]
     pub fn missed(&self) -> u64 {
-        self.lock().missed
+        self.counted().missed
     }
 
     /// Returns the least and the greatest values of the signals with these words, in at most

@@ -20,6 +20,9 @@ use crate::socket::LINE;
 /// The silence after which a WebSocket client is asked for a sign of life.
 pub const PING: Duration = Duration::from_secs(10);
 
+/// The time for a client that needs a token to send it.
+const TOKEN: Duration = Duration::from_secs(10);
+
 /// Connects a client.
 pub async fn upgrade(
     State(http): Shared,
@@ -46,6 +49,13 @@ async fn serve(socket: WebSocket, client: Arc<Client>, token: Option<(Arc<str>, 
     hub.event(json!({"event": "client", "client": id, "connected": true}));
     let (connection, mut outgoing) = Connection::start(Arc::clone(&client), token);
     let (mut sink, mut stream) = socket.split();
+    // A client that may not even read names its token soon, or leaves its place.
+    let stranger = async {
+        tokio::time::sleep(TOKEN).await;
+        if client.check_read().is_ok() {
+            std::future::pending::<()>().await;
+        }
+    };
     let read = async {
         loop {
             match stream.next().await {
@@ -81,6 +91,7 @@ async fn serve(socket: WebSocket, client: Arc<Client>, token: Option<(Arc<str>, 
     tokio::select! {
         () = read => {}
         () = write => {}
+        () = stranger => {}
     }
     drop(connection);
     client.leave();

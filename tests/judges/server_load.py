@@ -152,6 +152,11 @@ def exports(server):
     return requests(server, "/api/export.csv", 50)
 
 
+def histories(server):
+    """Histories, while a client of the socket reads the state all the time."""
+    return requests(server, "/api/history?buckets=20000", 20)
+
+
 def samples(server):
     return requests(server, "/api/samples?count=60000", 50)
 
@@ -220,7 +225,7 @@ def commands(server):
         thread.join()
 
 
-ATTACKS = {"idle": idle, "exports": exports, "samples": samples, "half requests": half_requests,
+ATTACKS = {"idle": idle, "exports": exports, "samples": samples, "histories": histories, "half requests": half_requests,
            "hoarders": hoarders, "commands": commands}
 
 
@@ -243,6 +248,9 @@ def main():
     parser.add_argument("attacks", nargs="*", choices=[[], *ATTACKS], metavar="ATTACK")
     parser.add_argument("--stops", type=int, default=1000)
     arguments = parser.parse_args()
+    # For the clients of the attacks, which are of this process.
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     program = os.environ.get("ECAXIS", ROOT / "target/release/ecaxis")
     base, failures = None, 0
     with tempfile.TemporaryDirectory() as folder:

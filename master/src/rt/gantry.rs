@@ -185,14 +185,8 @@ impl Gantry {
                 second.check(command)?;
                 first.command(command)?;
                 second.command(command)?;
-                self.squares = true;
                 // Continues a squaring that was stopped.
-                if let Coupling::Squaring(plan) = &self.coupling
-                    && plan.request().goal == Goal::Velocity(0.0)
-                    && self.offset.velocity == 0.0
-                {
-                    self.coupling = Coupling::Pending;
-                }
+                self.squares = true;
                 Ok(())
             }
             Command::ResetFault
@@ -352,14 +346,18 @@ impl Gantry {
             };
         } else if matches!(self.coupling, Coupling::Squaring(_)) {
             let stops = |half: &RtAxis| half.axis.status().stop.is_some();
-            if !self.squares || stops(first) || stops(second) {
+            self.squares &= !stops(first) && !stops(second);
+            if !self.squares {
                 self.stop_squaring(first.axis.config().limits.motion(), dt_s);
             }
             if let Coupling::Squaring(plan) = &mut self.coupling {
                 self.offset = plan.advance(self.offset, self.rate, dt_s);
-            }
-            if self.offset.stands_at(0.0) {
-                self.coupling = Coupling::Coupled;
+                let ends = plan.request().goal == Goal::Velocity(0.0);
+                if self.offset.stands_at(0.0) {
+                    self.coupling = Coupling::Coupled;
+                } else if self.squares && ends && self.offset.velocity == 0.0 {
+                    self.coupling = Coupling::Pending;
+                }
             }
         } else {
             // A loss may have left a velocity.
@@ -424,7 +422,12 @@ impl Gantry {
             _ => true,
         };
         status.ready &= !busy && second.ready;
-        let squares = matches!(self.coupling, Coupling::Squaring(_));
+        let squares = match &self.coupling {
+            Coupling::Squaring(plan) => {
+                self.offset.velocity != 0.0 || plan.request().goal != Goal::Velocity(0.0)
+            }
+            _ => false,
+        };
         status.moving |= squares;
         if squares && self.rate.is_held() {
             status.waiting = Some(EnableBlocker::Held);

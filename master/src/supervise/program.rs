@@ -67,25 +67,25 @@ impl Settling {
     }
 }
 
-/// The time for which an axis in a profile of its drive has not moved.
+/// The time for which an axis in a profile of its drive has come no closer to its target.
 #[derive(Debug, Default)]
 pub(super) struct Stall(Option<(AxisIndex, f64, Nanos)>);
 
 impl Stall {
-    /// Returns `true` after the settle timeout without motion. A change by `noise` is motion.
+    /// Returns `true` after the settle timeout without progress by at least `least`.
     pub(super) fn time_limit_reached(
         &mut self,
         axis: AxisIndex,
-        position: f64,
-        noise: f64,
+        progress: f64,
+        least: f64,
     ) -> bool {
         let now = clock::now();
         match self.0 {
-            Some((of, at, since)) if of == axis && (position - at).abs() <= noise => {
+            Some((of, best, since)) if of == axis && progress < best + least => {
                 now.saturating_sub(since) > SETTLE_TIMEOUT
             }
             _ => {
-                self.0 = Some((axis, position, now));
+                self.0 = Some((axis, progress, now));
                 false
             }
         }

@@ -87,6 +87,11 @@ impl RequestContext<'_> {
         status.is_some_and(|status| status.enabled || status.switching.is_some())
     }
 
+    fn has_power(&self, axis: AxisIndex) -> bool {
+        let status = self.snapshot.axes.get(axis);
+        status.is_some_and(|status| status.enabled)
+    }
+
     /// Returns `true` while the set-point moves. At constant velocity the set-point has arrived but
     /// still moves.
     fn moving(&self, axis: AxisIndex) -> bool {
@@ -235,7 +240,8 @@ impl RequestController {
                     hand.stop(axis, scene.now, out);
                 }
                 Activity::Enabling if presence != Presence::Here => {
-                    hand.stop(axis, scene.now, out);
+                    hand.begin(Activity::Disabling, scene.now);
+                    out.push((axis, Command::Disable));
                 }
                 Activity::Stopping | Activity::Disabling => {}
                 doing if presence != Presence::Here && (doing.moves() || moving) => {
@@ -281,7 +287,9 @@ impl RequestController {
             Request::StopAll => {
                 for (axis, hand) in self.hands.enumerate_mut() {
                     if scene.is_commanded(axis) || hand.doing == Activity::Enabling {
-                        hand.stop(axis, scene.now, out);
+                        let (doing, command) = hand.end_of_activity(scene.has_power(axis));
+                        hand.begin(doing, scene.now);
+                        out.push((axis, command));
                     }
                 }
             }
@@ -300,7 +308,7 @@ impl RequestController {
             }
             Request::Stop { axis } => {
                 let hand = self.hands.get(axis).copied().unwrap_or_default();
-                let (doing, command) = hand.end_of_activity();
+                let (doing, command) = hand.end_of_activity(scene.has_power(axis));
                 self.begin(axis, doing, command, scene, out);
             }
             Request::SetMode { axis, mode } => {
@@ -550,18 +558,18 @@ impl AxisActivity {
         }
     }
 
-    /// Returns what stops the axis. One that is being enabled gets no power.
-    fn end_of_activity(&self) -> (Activity, Command) {
+    /// Returns what stops the axis. One that is being enabled gets no power. One that has it keeps
+    /// it: it may carry a load.
+    fn end_of_activity(&self, has_power: bool) -> (Activity, Command) {
         match self.doing {
-            Activity::Enabling => (Activity::Disabling, Command::Disable),
+            Activity::Enabling if !has_power => (Activity::Disabling, Command::Disable),
             _ => (Activity::Stopping, Command::Stop),
         }
     }
 
     fn stop(&mut self, axis: AxisIndex, now: Nanos, out: &mut Commands) {
-        let (doing, command) = self.end_of_activity();
-        self.begin(doing, now);
-        out.push((axis, command));
+        self.begin(Activity::Stopping, now);
+        out.push((axis, Command::Stop));
     }
 
     /// Returns the result of the current activity once it has ended.

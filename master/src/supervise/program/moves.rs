@@ -12,9 +12,6 @@ use crate::config::Step;
 use crate::report::{Cause, Error};
 use crate::rt::channel::Snapshot;
 
-/// The counts by which the position of an axis at rest may change.
-const NOISE: f64 = 10.0;
-
 impl Turn<'_, '_> {
     /// Starts all moves in the same cycle; each arrives on its own. `part`: fraction of the
     /// velocity and acceleration limits.
@@ -133,8 +130,14 @@ impl Turn<'_, '_> {
             let profile = matches!(status(axis).mode, Mode::Pp | Mode::Pv);
             if profile && !follows(axis) && !this.is_held(snapshot, axis) {
                 let scale = this.setup(axis).map(|setup| setup.config.scale);
-                let noise = scale.map_or(0.0, |scale| scale.units_of_counts(NOISE).abs());
-                if stall.time_limit_reached(axis, status(axis).position, noise) {
+                let count = scale.map_or(0.0, |scale| scale.units_of_counts(1.0).abs());
+                let position = status(axis).position;
+                let progress = match aim {
+                    TargetKind::Velocity if target == 0.0 => -status(axis).velocity.abs(),
+                    TargetKind::Velocity => position * target.signum(),
+                    _ => -(target - position).abs(),
+                };
+                if stall.time_limit_reached(axis, progress, count) {
                     return Err(this.not_reached(step, axis, aim, target, snapshot));
                 }
             } else {
