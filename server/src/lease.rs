@@ -245,7 +245,7 @@ mod tests {
         assert_eq!(lease.check(&shared, now), other);
         assert_eq!(lease.check(&with("b"), now), other);
         assert_eq!(lease.check(&with("a"), now), Ok(()));
-        let again = lease.take(&with("a"), owner(8), "c".to_owned(), TTL, false, now);
+        let again = lease.take(&with("a"), owner(7), "c".to_owned(), TTL, false, now);
         assert_eq!(again, Ok(("a".to_owned(), None)), "it keeps its secret");
         let refused = lease.take(&shared, owner(8), "c".to_owned(), TTL, false, now);
         assert_eq!(refused, Err(LeaseError::NotOwner(owner(7))));

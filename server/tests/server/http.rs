@@ -119,7 +119,7 @@ fn commands_need_the_token_and_control() {
         let (status, _) = post("/api/stop", &with_token(&bearer), "[");
         assert_eq!(status, 400);
         let (status, _) = post("/api/area", &with_token(&bearer), "");
-        assert!([400, 403].contains(&status));
+        assert!([403, 409].contains(&status));
     }
 }
 
