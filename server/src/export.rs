@@ -37,7 +37,7 @@ fn parts(
 /// exist is empty.
 ///
 /// # Errors
-/// Fails if nobody takes the text.
+/// Fails if the text is not taken.
 pub fn csv(
     out: &mut impl Write,
     samples: &Samples,
@@ -70,7 +70,7 @@ pub fn csv(
 /// Writes all kept rows between both times as MCAP, with the topics of the signals.
 ///
 /// # Errors
-/// Fails if nobody takes the bytes.
+/// Fails if the bytes are not taken.
 pub fn mcap<W: Write>(
     out: W,
     samples: &Samples,

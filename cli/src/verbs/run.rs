@@ -229,7 +229,7 @@ fn run_when_present(
             &mut observer,
             attachments,
         );
-        // A machine that has run does not start again: its program would begin anew.
+        // A machine that has run does not start again: its program would begin again.
         let has_run = outcome.summary.is_some();
         let Some(error) = outcome.result.as_ref().err().filter(|_| !has_run) else {
             return outcome;
