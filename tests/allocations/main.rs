@@ -331,7 +331,7 @@ fn programs_of_every_kind_allocate_nothing() {
             repeat: 1,
             ..load(file)
         };
-        let (counted, _, result) = metered(machine, &virtual_time(), None, 20_000);
+        let (counted, _, result) = metered(machine, &virtual_time(), None, 30_000);
         assert!(matches!(result, Some(Ok(()))), "{file}: {result:?}");
         assert_eq!(counted, 0, "allocations in {file}");
     }
