@@ -143,6 +143,7 @@ fn emergency_stop_takes_the_configured_method() {
         let mut rig = Rig::new(Axis::new(config).unwrap(), Drive::at(0));
         rig.axis.command(Command::EmergencyStop).unwrap();
         assert!(rig.axis.command(Command::Enable).is_err());
+        rig.cycle();
         rig.axis.command(Command::ResetFault).unwrap();
         rig.axis.command(Command::Enable).unwrap();
         rig.until(|s| s.state == State::SwitchedOn, 10);
