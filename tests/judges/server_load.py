@@ -252,7 +252,7 @@ def main():
     # For the clients of the attacks, which are of this process.
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
-    program = os.environ.get("ECAXIS", ROOT / "target/release/ecaxis")
+    program = pathlib.Path(os.environ.get("ECAXIS", ROOT / "target/release/ecaxis")).resolve()
     base, failures = None, 0
     with tempfile.TemporaryDirectory() as folder:
         server = Server(program, pathlib.Path(folder))
