@@ -1,6 +1,10 @@
 //! Drives that show their mode in Operation enabled only, or change it without power only.
 
-use ecaxis_test_support::{assert_contains, faults, machine, run_badly, run_well, virtual_time};
+use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_test_support::recordings::process_images;
+use ecaxis_test_support::{
+    assert_contains, faults, machine, recorded, run_badly, run_well, virtual_time,
+};
 
 /// Returns one drive with quirks and keys of its axis.
 fn text(quirks: &str, keys: &str, steps: &str) -> String {
@@ -68,6 +72,47 @@ fn step_mode_waits_for_the_brake_that_opens_again() {
         let text = text("mode_without_power = true", &keys, steps);
         let summary = run_well(machine(&text), virtual_time());
         assert!((summary.axes[0].final_position - 2.0).abs() < 0.01);
+    }
+}
+
+/// A change of the mode without power: the output is off from the command on that removes it.
+#[test]
+fn a_position_output_is_off_while_the_mode_changes_without_power() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let output = "[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 1\n\
+        [[position_output]]\noutput = \"io.Output 1\"\naxis = \"x\"\nranges = [[-10.0, 10.0]]\n";
+    let machine = machine(&text(
+        "mode_without_power = true",
+        KEY,
+        &format!("{output}{SWITCH}"),
+    ));
+    let layout = &machine.devices[DeviceIndex(0)].selection.layout;
+    let terminal = layout.rx_bytes().max(layout.tx_bytes());
+    let (options, path) = recorded(virtual_time(), folder.path());
+    run_well(machine, options);
+    let images = process_images(&path);
+    let outputs: Vec<(u16, bool)> = images
+        .iter()
+        .filter_map(|(out, _)| {
+            Some((
+                u16::from_le_bytes([out[0], out[1]]),
+                out.get(terminal)? & 1 != 0,
+            ))
+        })
+        .collect();
+    let on = |word: u16| {
+        outputs
+            .iter()
+            .filter(|(w, on)| *w & 0x0f == word && *on)
+            .count()
+    };
+    assert!(on(0x0f) > 100, "on with power: {}", on(0x0f));
+    for word in [0x00, 0x06, 0x07] {
+        assert!(
+            outputs.iter().any(|(w, _)| *w & 0x0f == word),
+            "0x{word:02x} is sent"
+        );
+        assert_eq!(on(word), 0, "on with Controlword 0x{word:02x}");
     }
 }
 

@@ -51,6 +51,8 @@ pub struct RtAxis {
     /// The present hold has stopped the search for home.
     pub(super) stopped_by_hold: bool,
     pub(super) power: PowerWatch,
+    /// The Controlword of the last outputs keeps the power.
+    pub(super) keeps_power: bool,
     /// The first half of the gantry whose second half the axis is, while they are coupled.
     pub(super) leader: Option<Leader>,
 }
@@ -80,6 +82,7 @@ impl RtAxis {
             rates: Rates::WHOLE,
             stopped_by_hold: false,
             power: PowerWatch::default(),
+            keeps_power: false,
             leader: None,
         }
     }
@@ -159,6 +162,7 @@ impl RtAxis {
     }
 
     pub(super) fn write(&mut self, image: &mut [u8], outputs: &Outputs) {
+        self.keeps_power = keeps_power(outputs.controlword);
         let control = self.words.control(outputs.controlword);
         self.reset |= control.reset;
         let bits = &self.bits;
@@ -192,7 +196,7 @@ impl RtAxis {
             }
         }
         if let Some(brake) = self.brake {
-            let open = outputs.brake_open && keeps_power(outputs.controlword);
+            let open = outputs.brake_open && self.keeps_power;
             brake.set(image, f64::from(u8::from(open)));
         }
     }

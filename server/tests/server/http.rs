@@ -9,6 +9,7 @@ use ecaxis_server::http::HttpOptions;
 use serde_json::{Value, json};
 
 use crate::harness::{Server, TOKEN, demo};
+use crate::websocket::address;
 
 pub struct Reply {
     pub status: u16,
@@ -29,14 +30,8 @@ pub fn request(
     headers: &[(&str, &str)],
     body: &str,
 ) -> Reply {
-    let url = server.url.as_ref().unwrap();
-    let address = url
-        .strip_prefix("http://")
-        .unwrap()
-        .split('/')
-        .next()
-        .unwrap();
-    let mut stream = TcpStream::connect(address).unwrap();
+    let address = address(server);
+    let mut stream = TcpStream::connect(&address).unwrap();
     let mut text = format!("{method} {path} HTTP/1.1\r\nConnection: close\r\n");
     if !headers.iter().any(|(name, _)| *name == "Host") {
         text += &format!("Host: {address}\r\n");
@@ -190,16 +185,10 @@ fn keys_headers_and_signals_that_occur_twice_are_refused() {
 fn half_requests_leave_room_for_a_stop() {
     let server = Server::with_http(demo(), true);
     let mut client = server.owner("cell");
-    let url = server.url.clone().unwrap();
-    let address = url
-        .strip_prefix("http://")
-        .unwrap()
-        .split('/')
-        .next()
-        .unwrap();
+    let address = address(&server);
     let half: Vec<TcpStream> = (0..400)
         .filter_map(|_| {
-            let mut stream = TcpStream::connect(address).ok()?;
+            let mut stream = TcpStream::connect(&address).ok()?;
             let _ = stream.write_all(b"GET /api/state HTTP/1.1\r\nHost: local");
             Some(stream)
         })
@@ -218,7 +207,7 @@ fn half_requests_leave_room_for_a_stop() {
     drop(half);
     let start = Instant::now();
     let served = || {
-        let mut stream = TcpStream::connect(address).ok()?;
+        let mut stream = TcpStream::connect(&address).ok()?;
         let text =
             format!("GET /api/state HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
         stream.write_all(text.as_bytes()).ok()?;

@@ -124,13 +124,14 @@ impl Engine {
         self.set_position_outputs();
     }
 
-    /// Writes the outputs that follow positions. They are off while the group of the axis stops.
+    /// Writes the outputs that follow positions. They are off while the group of the axis stops, and
+    /// from the command on that removes the power.
     fn set_position_outputs(&mut self) {
         for at in &self.signals.positions {
             let on = self.axes.get(at.trigger.axis).is_some_and(|slot| {
                 let group = self.groups.get(slot.group);
                 let stops = group.is_none_or(|group| group.stop().is_some());
-                !stops && at.trigger.is_on(&slot.axis.status())
+                !stops && slot.keeps_power && at.trigger.is_on(&slot.axis.status())
             });
             at.output
                 .set(self.exchange.outputs_mut(), f64::from(u8::from(on)));
