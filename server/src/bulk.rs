@@ -106,15 +106,19 @@ impl Bulk {
         let done = Arc::clone(&whole);
         tokio::task::spawn_blocking(move || {
             lower_priority();
-            match make(Pieces::new(pieces)).and_then(|mut out| out.flush()) {
-                Ok(()) => done.store(true, Ordering::Release),
-                Err(error) => tracing::debug!(%error, "an export was not taken"),
+            let made = make(Pieces::new(pieces)).and_then(|mut out| {
+                out.flush()?;
+                // The mark comes before the sender is dropped.
+                done.store(true, Ordering::Release);
+                Ok(())
+            });
+            if let Err(error) = made {
+                tracing::debug!(%error, "an export was not taken");
             }
             drop(place);
         });
         let mut cut = false;
         let next = move |context: &mut Context<'_>| match receiver.poll_recv(context) {
-            // The sender is dropped after the mark.
             Poll::Ready(None) if !whole.load(Ordering::Acquire) && !cut => {
                 cut = true;
                 let error: io::Error = io::ErrorKind::UnexpectedEof.into();
@@ -186,6 +190,24 @@ mod tests {
             .enable_all()
             .build()
             .expect("a runtime")
+    }
+
+    #[test]
+    fn a_body_that_ends_is_whole_each_time() {
+        runtime().block_on(async {
+            let bulk = Bulk::default();
+            for _ in 0..2000 {
+                while bulk.exports.available_permits() == 0 {
+                    tokio::task::yield_now().await;
+                }
+                let body = bulk.body(|mut out| {
+                    out.write_all(b"all")?;
+                    Ok(out)
+                });
+                let body = body.await.expect("a place");
+                axum::body::to_bytes(body, 10).await.expect("whole");
+            }
+        });
     }
 
     #[test]
