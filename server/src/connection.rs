@@ -17,6 +17,7 @@ use crate::command::{Op, Request, SetpointPoint, Topic};
 use crate::error::{ErrorCode, OpError};
 use crate::hub::{Hub, stream_text};
 use crate::state;
+use crate::tokens::Tokens;
 
 /// The messages that may wait for a slow reader.
 const OUTGOING: usize = 32;
@@ -180,16 +181,15 @@ pub struct Connection {
     changes: mpsc::UnboundedSender<Change>,
     outgoing: mpsc::Sender<Outgoing>,
     waiting: Arc<Semaphore>,
-    /// The token, and why commands stay forbidden with it.
-    token: Option<(Arc<str>, Option<OpError>)>,
+    tokens: Option<Arc<Tokens>>,
 }
 
 impl Connection {
-    /// Starts a connection. `token` allows reading and, without an error, commands.
+    /// Starts a connection. A client that names one of the `tokens` gets its rights.
     #[must_use]
     pub fn start(
         client: Arc<Client>,
-        token: Option<(Arc<str>, Option<OpError>)>,
+        tokens: Option<Arc<Tokens>>,
     ) -> (Self, mpsc::Receiver<Outgoing>) {
         let (outgoing, receiver) = mpsc::channel(OUTGOING);
         let (changes, changed) = mpsc::unbounded_channel();
@@ -199,7 +199,7 @@ impl Connection {
             changes,
             outgoing,
             waiting: Arc::new(Semaphore::new(WAITING)),
-            token,
+            tokens,
         };
         (connection, receiver)
     }
@@ -293,11 +293,11 @@ impl Connection {
     }
 
     fn check_token(&self, token: &str) -> Result<(), OpError> {
-        if let Some((known, refusal)) = &self.token
-            && same(known, token)
+        if let Some(tokens) = &self.tokens
+            && let Some(rights) = tokens.rights(token)
         {
             self.client.set_blind(false);
-            self.client.set_refusal(refusal.clone());
+            self.client.set_refusal(tokens.refusal(rights));
             return Ok(());
         }
         Err(OpError::new(ErrorCode::NoToken, "the token is wrong")
@@ -339,17 +339,6 @@ impl Connection {
         });
         Ok(())
     }
-}
-
-/// Compares in a time that does not depend on the place of the first difference.
-#[must_use]
-pub fn same(known: &str, given: &str) -> bool {
-    let (known, given) = (known.as_bytes(), given.as_bytes());
-    let difference = known
-        .iter()
-        .zip(given)
-        .fold(0, |difference, (a, b)| difference | (a ^ b));
-    known.len() == given.len() && difference == 0
 }
 
 /// Sends what the client has subscribed to.

@@ -90,7 +90,8 @@ pub async fn index(
         let error = OpError::new(ErrorCode::BadRequest, message);
         return refusal(&error.help("the WebSocket of the page is /api/ws"));
     }
-    if !http.is_loopback() && !http.has_token(&headers) && !http.has_token_in(&address) {
+    let named = http.tokens.rights_of(&headers).is_some() || http.tokens.are_in(&address);
+    if !http.is_loopback() && !named {
         let error = OpError::new(ErrorCode::NoToken, "this needs the token");
         return refusal(&error.help("add ?token=TOKEN to the address"));
     }

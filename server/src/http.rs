@@ -25,7 +25,7 @@ use crate::admission;
 use crate::bulk::{Bulk, Pieces};
 use crate::client::{Answer, Client};
 use crate::command::Request;
-use crate::connection::{Batch, same, signal_words};
+use crate::connection::{Batch, signal_words};
 use crate::error::{ErrorCode, OpError};
 use crate::export;
 use crate::foxglove::{self, Viewers};
@@ -33,6 +33,7 @@ use crate::hub::Hub;
 use crate::openapi;
 use crate::page;
 use crate::socket::LINE;
+use crate::tokens::{Rights, Tokens};
 use crate::{strict, websocket};
 
 /// The most buckets of one history.
@@ -51,6 +52,8 @@ pub struct HttpOptions {
     /// Clients with the token may command.
     pub control: bool,
     pub token: String,
+    /// A token that permits reading only.
+    pub watch_token: Option<String>,
     /// The token is known to its users: it is not printed.
     pub known_token: bool,
     /// Further names that the `Host` header may contain.
@@ -65,9 +68,10 @@ pub struct Http {
     pub(crate) viewers: Viewers,
     bulk: Bulk,
     pub(crate) options: HttpOptions,
-    pub(crate) token: Arc<str>,
-    /// The client of all requests with the token, and of those without.
-    with_token: Client,
+    pub(crate) tokens: Arc<Tokens>,
+    /// The clients of all requests with the right to command, with that to read, and without a token.
+    commanding: Client,
+    reading: Client,
     pub(crate) without_token: Client,
 }
 
@@ -90,12 +94,14 @@ impl HttpServer {
         options.address = listener.local_addr()?;
         let no_token = OpError::new(ErrorCode::NoToken, "this needs the token")
             .help("use the address that the server printed");
-        let control = options.control;
-        let read_only = (!control).then(read_only);
+        let (token, watch) = (options.token.clone(), options.watch_token.clone());
+        let tokens = Tokens::new(token, watch, options.control);
+        let with = |refusal| Client::new(Arc::clone(hub), "http", refusal, true);
         let http = Http {
-            with_token: Client::new(Arc::clone(hub), "http", read_only, true),
-            without_token: Client::new(Arc::clone(hub), "http", Some(no_token), true),
-            token: options.token.clone().into(),
+            commanding: with(None),
+            reading: with(tokens.refusal(Rights::Read)),
+            without_token: with(Some(no_token)),
+            tokens: Arc::new(tokens),
             hub: Arc::clone(hub),
             viewers: Viewers::new(),
             bulk: Bulk::default(),
@@ -122,14 +128,6 @@ impl HttpServer {
     pub async fn serve(self) {
         admission::serve(self.listener, router(self.http)).await;
     }
-}
-
-pub(crate) fn read_only() -> OpError {
-    OpError::new(
-        ErrorCode::ReadOnly,
-        "the server takes no commands over HTTP",
-    )
-    .help("start it with --control")
 }
 
 fn router(http: Arc<Http>) -> Router {
@@ -166,27 +164,11 @@ impl Http {
         self.options.address.ip().is_loopback()
     }
 
-    pub(crate) fn has_token(&self, headers: &HeaderMap) -> bool {
-        let given = headers.get(header::AUTHORIZATION);
-        let given = given.and_then(|value| value.to_str().ok());
-        let given = given.and_then(|value| value.strip_prefix("Bearer "));
-        given.is_some_and(|given| same(&self.token, given.trim()))
-    }
-
-    /// Returns whether the address contains the token, as `?token=TOKEN`: viewers in a browser
-    /// cannot set headers.
-    pub(crate) fn has_token_in(&self, address: &Uri) -> bool {
-        let mut keys = address.query().unwrap_or_default().split('&');
-        keys.any(|key| {
-            key.strip_prefix("token=")
-                .is_some_and(|given| same(&self.token, given))
-        })
-    }
-
     fn client(&self, headers: &HeaderMap) -> &Client {
-        match self.has_token(headers) {
-            true => &self.with_token,
-            false => &self.without_token,
+        match self.tokens.rights_of(headers) {
+            Some(Rights::Command) => &self.commanding,
+            Some(Rights::Read) => &self.reading,
+            None => &self.without_token,
         }
     }
 
@@ -236,7 +218,7 @@ impl Http {
             && to.path() == "/"
             && is("sec-fetch-mode", "navigate")
             && is("sec-fetch-dest", "document");
-        let viewer = foxglove::is_asked_for(headers, to) && self.has_token_in(to);
+        let viewer = foxglove::is_asked_for(headers, to) && self.tokens.are_in(to);
         match own && (same_site || link) || viewer {
             true => Ok(()),
             false => Err(wrong("the page is of another server")),

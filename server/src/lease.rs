@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-use crate::connection::same;
+use crate::tokens::same;
 
 /// The number of a client, unique while the server runs.
 pub type ClientId = u64;

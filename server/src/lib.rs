@@ -38,4 +38,5 @@ pub mod serve;
 pub mod socket;
 pub mod state;
 mod strict;
+pub mod tokens;
 pub mod websocket;

@@ -14,8 +14,9 @@ use serde_json::json;
 use crate::client::{Answer, Client};
 use crate::connection::{Connection, Outgoing};
 use crate::error::{ErrorCode, OpError};
-use crate::http::{Shared, read_only};
+use crate::http::Shared;
 use crate::socket::LINE;
+use crate::tokens::Tokens;
 
 /// The silence after which a WebSocket client is asked for a sign of life.
 pub const PING: Duration = Duration::from_secs(10);
@@ -29,25 +30,25 @@ pub async fn upgrade(
     headers: HeaderMap,
     upgrade: WebSocketUpgrade,
 ) -> Response {
-    let read_only = (!http.options.control).then(read_only);
-    let refusal = match http.has_token(&headers) {
-        true => read_only.clone(),
-        false => http.without_token.refusal(),
+    let rights = http.tokens.rights_of(&headers);
+    let blind = !http.is_loopback() && rights.is_none();
+    let refusal = match rights {
+        Some(rights) => http.tokens.refusal(rights),
+        None => http.without_token.refusal(),
     };
-    let blind = !http.is_loopback() && !http.has_token(&headers);
     let client = Client::new(Arc::clone(&http.hub), "websocket", refusal, false);
     client.set_blind(blind);
-    let token = Some((Arc::clone(&http.token), read_only));
+    let tokens = Some(Arc::clone(&http.tokens));
     upgrade
         .max_message_size(LINE)
         .max_frame_size(LINE)
-        .on_upgrade(move |socket| serve(socket, Arc::new(client), token))
+        .on_upgrade(move |socket| serve(socket, Arc::new(client), tokens))
 }
 
-async fn serve(socket: WebSocket, client: Arc<Client>, token: Option<(Arc<str>, Option<OpError>)>) {
+async fn serve(socket: WebSocket, client: Arc<Client>, tokens: Option<Arc<Tokens>>) {
     let (id, hub) = (client.id, Arc::clone(&client.hub));
     hub.event(json!({"event": "client", "client": id, "connected": true}));
-    let (connection, mut outgoing) = Connection::start(Arc::clone(&client), token);
+    let (connection, mut outgoing) = Connection::start(Arc::clone(&client), tokens);
     let (mut sink, mut stream) = socket.split();
     // A client that may not even read names its token soon, or leaves its place.
     let stranger = async {

@@ -67,6 +67,9 @@ pub(crate) struct Args {
     /// File with the token; without it, a new token at each start
     #[arg(long, value_name = "FILE", requires = "http")]
     token_file: Option<PathBuf>,
+    /// File with a token that permits reading only
+    #[arg(long, value_name = "FILE", requires = "token_file")]
+    watch_token_file: Option<PathBuf>,
     /// A further name by which clients reach the server
     #[arg(long, value_name = "NAME", requires = "http")]
     allow_host: Vec<String>,
@@ -107,7 +110,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if let Some(path) = &args.record {
         let inputs = Inputs::from_machine(&machine)
             .with("the fault script", &args.bus.faults)
-            .with("the file with the token", &args.token_file);
+            .with("the file with the token", &args.token_file)
+            .with("the file with the watch token", &args.watch_token_file);
         check_output("--record", path, args.force, &inputs)?;
     }
     let http = args.http.map(|address| http(args, address)).transpose()?;
@@ -198,10 +202,18 @@ fn http(args: &Args, address: SocketAddr) -> Result<HttpOptions, Failure> {
             )
         })?,
     };
+    let watch_token = args.watch_token_file.as_deref().map(self::token);
+    let watch_token = watch_token.transpose()?;
+    if watch_token.as_ref() == Some(&token) {
+        let message = "both token files contain the same token";
+        let hint = "write another secret to the file of --watch-token-file";
+        return Err(Failure::new(hints::WRONG, message).hint(hint));
+    }
     Ok(HttpOptions {
         address,
         control: args.control,
         token,
+        watch_token,
         known_token: args.token_file.is_some(),
         hosts: args.allow_host.clone(),
         recordings: args.recordings.clone(),

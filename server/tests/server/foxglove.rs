@@ -11,7 +11,7 @@ use ecaxis_test_support::ros2::{Value as Message, decode};
 use serde_json::{Value, json};
 
 use crate::fuzz::Random;
-use crate::harness::{Server, TOKEN, demo};
+use crate::harness::{Server, TOKEN, WATCH_TOKEN, demo};
 use crate::hostile::{count, damage, resident};
 use crate::http::request;
 use crate::websocket::{frame, read_frame, read_now, upgrade};
@@ -205,6 +205,7 @@ fn viewers_off_loopback_need_the_token() {
         address: "0.0.0.0:0".parse().unwrap(),
         control: false,
         token: TOKEN.to_owned(),
+        watch_token: Some(WATCH_TOKEN.to_owned()),
         known_token: false,
         hosts: Vec::new(),
         recordings: None,

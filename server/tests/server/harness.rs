@@ -18,6 +18,7 @@ use ecaxis_sim::FaultScript;
 use serde_json::{Value, json};
 
 pub const TOKEN: &str = "0123456789abcdef";
+pub const WATCH_TOKEN: &str = "fedcba9876543210";
 
 /// A server that ends with this value.
 pub struct Server {
@@ -72,6 +73,7 @@ impl Server {
             address: "127.0.0.1:0".parse().unwrap(),
             control,
             token: TOKEN.to_owned(),
+            watch_token: Some(WATCH_TOKEN.to_owned()),
             known_token: false,
             hosts: Vec::new(),
             recordings: None,

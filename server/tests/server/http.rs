@@ -8,7 +8,7 @@ use ecaxis_master::session::Options;
 use ecaxis_server::http::HttpOptions;
 use serde_json::{Value, json};
 
-use crate::harness::{Server, TOKEN, demo};
+use crate::harness::{Server, TOKEN, WATCH_TOKEN, demo};
 use crate::websocket::address;
 
 pub struct Reply {
@@ -108,6 +108,15 @@ fn commands_need_the_token_and_control() {
         } else {
             assert_eq!((status, stop), (403, 403));
             assert_eq!(answer["error"]["code"], json!("read_only"));
+        }
+        let watch = format!("Bearer {WATCH_TOKEN}");
+        for op in ["take", "stop", "enable", "token"] {
+            let path = format!("/api/{op}");
+            let (status, answer) = post(&path, &with_token(&watch), r#"{"axis": "x"}"#);
+            assert_ne!(status, 200, "{op}: {answer}");
+            if op != "token" {
+                assert_eq!(answer["error"]["code"], json!("read_only"), "{op}");
+            }
         }
         let (status, _) = post("/api/fly", &with_token(&bearer), "");
         assert_eq!(status, 404);
@@ -352,6 +361,7 @@ fn links_are_no_recordings() {
         address: "127.0.0.1:0".parse().unwrap(),
         control: false,
         token: TOKEN.to_owned(),
+        watch_token: Some(WATCH_TOKEN.to_owned()),
         known_token: false,
         hosts: Vec::new(),
         recordings: Some(recordings),
