@@ -70,10 +70,10 @@ impl Turn<'_, '_> {
         targets: &[(AxisIndex, Mode)],
     ) -> Result<(), Error> {
         let axes: Vec<_> = targets.iter().map(|&(axis, _)| axis).collect();
-        self.settle(&axes, start).await?;
         let commands = targets.iter();
-        self.command(commands.map(|&(axis, mode)| (axis, Command::SetMode(mode))))
-            .await;
+        let commands = commands.map(|&(axis, mode)| (axis, Command::SetMode(mode)));
+        self.command_at_rest(step, start, &commands.collect::<Vec<_>>())
+            .await?;
         let machine = Arc::clone(&self.machine);
         let there = |s: &Snapshot, axis: AxisIndex| {
             let wanted = targets.iter().find(|(a, _)| *a == axis);

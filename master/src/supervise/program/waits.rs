@@ -82,6 +82,42 @@ impl Turn<'_, '_> {
         }
     }
 
+    /// Gives commands that need standstill, and repeats those that are refused for a motion: the
+    /// velocity that a drive reports at rest may be higher for a cycle.
+    pub(super) async fn command_at_rest(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        commands: &[(AxisIndex, Command)],
+    ) -> Result<(), Error> {
+        let axes: Vec<_> = commands.iter().map(|&(axis, _)| axis).collect();
+        self.settle(&axes, start).await?;
+        let begun = clock::now();
+        self.command(commands.iter().copied()).await;
+        let mut sent = self.commands_sent;
+        loop {
+            let snapshot = self.poll_and_query().await?;
+            self.ensure_not_stopped(Some(step), &axes)?;
+            if self.over(start) || clock::now().saturating_sub(begun) > SETTLE_TIMEOUT {
+                return Ok(());
+            }
+            if snapshot.commands_taken < sent {
+                continue;
+            }
+            let moves = |(axis, reason): &(AxisIndex, CommandError)| {
+                axes.contains(axis) && matches!(reason, CommandError::StillMoving { .. })
+            };
+            let Some(at) = self.refused.iter().position(moves) else {
+                return Ok(());
+            };
+            let refused = self.refused.remove(at).map(|(axis, _)| axis);
+            let again = commands.iter().copied();
+            self.command(again.filter(|&(axis, _)| Some(axis) == refused))
+                .await;
+            sent = self.commands_sent;
+        }
+    }
+
     /// Waits until none of these axes is held.
     async fn await_release(&mut self, axes: &[AxisIndex], start: Nanos) -> Result<(), Error> {
         loop {
@@ -135,10 +171,10 @@ impl Turn<'_, '_> {
             homing.map_or(0, |homing| homing.timeout_ns) as f64 * 1e-9
         };
         let timeouts: Vec<f64> = axes.iter().map(timeout).collect();
-        self.settle(axes, start).await?;
         let commands = axes.iter().zip(&timeouts);
-        self.command(commands.map(|(&axis, &timeout_s)| (axis, Command::Home { timeout_s })))
-            .await;
+        let commands = commands.map(|(&axis, &timeout_s)| (axis, Command::Home { timeout_s }));
+        self.command_at_rest(step, start, &commands.collect::<Vec<_>>())
+            .await?;
         self.wait_until(step, start, |this, snapshot| {
             let (mut homed, mut held) = (true, false);
             for &axis in axes {
