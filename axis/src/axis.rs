@@ -58,7 +58,7 @@ mod supervision;
 
 pub use command::Command;
 pub use config::{AxisConfig, ConfigError, HomeReference};
-pub use io::{Inputs, Outputs};
+pub use io::{Delivery, Inputs, Outputs};
 pub use lead::Losses;
 pub use second_encoder::SecondEncoder;
 
@@ -86,6 +86,8 @@ pub const MIN_RATE: f64 = 1e-3;
 #[derive(Debug, Clone)]
 pub struct Axis {
     config: AxisConfig,
+    /// `limits.position` of the file; [`Axis::share_range`] narrows the one in `config`.
+    own_range: Option<[f64; 2]>,
     compensation: Compensation,
     correction: Correction,
     second: second_encoder::SecondPosition,
@@ -243,11 +245,18 @@ impl Axis {
             compensation,
             correction: Correction::default(),
             second: second_encoder::SecondPosition::default(),
+            own_range: config.limits.position,
             config,
         })
     }
 
-    /// Returns the configuration.
+    /// Returns `limits.position` of the file.
+    #[must_use]
+    pub const fn own_range(&self) -> Option<[f64; 2]> {
+        self.own_range
+    }
+
+    /// Returns the configuration. `limits.position` is that in force: [`Axis::share_range`].
     #[must_use]
     pub const fn config(&self) -> &AxisConfig {
         &self.config
@@ -333,10 +342,12 @@ impl Axis {
         } else {
             self.stale_cycles = self.stale_cycles.saturating_add(1);
             self.undelivered_cycles = self.undelivered_cycles.saturating_add(1);
-            if inputs.late {
-                let under_way = 1 + u32::from(self.config.answers_late);
-                self.undelivered_cycles = self.undelivered_cycles.min(under_way);
-            }
+            let under_way = match inputs.delivery {
+                Delivery::Unknown => u32::MAX,
+                Delivery::Earlier => 1 + u32::from(self.config.answers_late),
+                Delivery::Now => 0,
+            };
+            self.undelivered_cycles = self.undelivered_cycles.min(under_way);
             self.supervision.lost(self.previous_target);
         }
         self.actual.pass(dt_s);

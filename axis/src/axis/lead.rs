@@ -44,6 +44,20 @@ impl Axis {
         }
     }
 
+    /// Narrows the range of positions to `range` of an axis that follows this one, until `None`. An
+    /// axis outside may return. Call it between [`Axis::observe`] and [`Axis::act`]. RT: O(1).
+    pub fn share_range(&mut self, range: Option<[f64; 2]>) {
+        let own = self.own_range;
+        self.config.limits.position = match (own, range) {
+            (Some([low, high]), Some([from, to])) if low.max(from) <= high.min(to) => {
+                Some([low.max(from), high.min(to)])
+            }
+            // No position is right for both.
+            (Some(_), Some(_)) => Some([self.motion.position; 2]),
+            (own, range) => own.or(range),
+        };
+    }
+
     /// Returns the lost frames of this axis. RT: O(1).
     #[must_use]
     pub const fn losses(&self) -> Losses {

@@ -240,7 +240,10 @@ impl Gantry {
             self.coupling = Coupling::Pending;
         }
         match &mut self.coupling {
-            Coupling::Decoupled => return,
+            Coupling::Decoupled => {
+                first.axis.share_range(None);
+                return;
+            }
             Coupling::Pending if can_couple(a) && can_couple(b) => {
                 if let Err(trip) = self.begin(&status, first.axis.config().limits.motion(), dt_s) {
                     second.axis.trip_by(trip, StopMethod::Ramp);
@@ -273,6 +276,18 @@ impl Gantry {
             self.watch_skew([first, second], &status, dt_s);
             self.lead([first, second], &status, dt_s);
         }
+        self.share_range([first, second]);
+    }
+
+    /// Limits the plan of the first half to positions at which the second one is in its range too.
+    fn share_range(&self, [first, second]: [&mut RtAxis; 2]) {
+        let offset = self.offset.position;
+        let range = second
+            .axis
+            .own_range()
+            .map(|range| range.map(|end| end - offset));
+        let coupled = matches!(self.coupling, Coupling::Coupled);
+        first.axis.share_range(range.filter(|_| coupled));
     }
 
     /// Couples the halves where they are. Fails if they are homed and too far apart.
