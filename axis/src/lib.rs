@@ -40,8 +40,8 @@ mod touch_probe;
 pub mod units;
 
 pub use axis::{
-    Axis, AxisConfig, Command, ConfigError, HomeReference, Inputs, Losses, MAX_RATE, MIN_RATE,
-    Outputs, SecondEncoder,
+    Axis, AxisConfig, Command, ConfigError, Delivery, HomeReference, Inputs, Losses, MAX_RATE,
+    MIN_RATE, Outputs, SecondEncoder,
 };
 pub use cia402::{Controlword, HaltOption, Mode, Modes, QuickStopOption, State, Statusword};
 pub use compensation::Compensation;

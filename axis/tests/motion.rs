@@ -2,7 +2,8 @@
 
 use crate::common::{DT, Drive, LIMITS, Rig, scale};
 use ecaxis_axis::{
-    Axis, AxisConfig, Command, CommandError, Inputs, Limits, Mode, Scale, State, VelocityUnit,
+    Axis, AxisConfig, Command, CommandError, Delivery, Inputs, Limits, Mode, Scale, State,
+    VelocityUnit,
 };
 
 const fn to(position: f64) -> Command {
@@ -366,7 +367,10 @@ fn a_reduced_torque_ends_at_zero() {
         for n in 0..300 {
             let inputs = Inputs {
                 fresh: !late,
-                late: late && n > 0,
+                delivery: match late && n > 0 {
+                    true => Delivery::Earlier,
+                    false => Delivery::Unknown,
+                },
                 ..rig.drive.inputs()
             };
             let torque = i32::from(rig.axis.step(&inputs, DT).target_torque);

@@ -2,8 +2,8 @@
 
 use crate::common::{DT, LIMITS, axis, scale};
 use ecaxis_axis::{
-    Axis, AxisConfig, Command, CommandError, EnableBlocker, Inputs, Limits, Mode, Outputs,
-    StopMethod, StopPhase, Trip,
+    Axis, AxisConfig, Command, CommandError, Delivery, EnableBlocker, Inputs, Limits, Mode,
+    Outputs, StopMethod, StopPhase, Trip,
 };
 
 const FREE: Limits = Limits {
@@ -398,7 +398,10 @@ fn late_replies_ramp_the_targets_down() {
     for n in 0..30 {
         let late = Inputs {
             fresh: false,
-            late: n > 0,
+            delivery: match n > 0 {
+                true => Delivery::Earlier,
+                false => Delivery::Unknown,
+            },
             ..inputs(0x1237, position, 8)
         };
         let target = axis.step(&late, DT).target_position;
@@ -424,6 +427,37 @@ fn late_replies_ramp_the_targets_down() {
     assert!(step >= 79, "goes on: {step}");
 }
 
+/// A drive that took its targets, in a frame that another device missed, gets no fewer cycles than
+/// after an answer.
+#[test]
+fn frame_without_another_device_counts_as_delivered() {
+    let mut axis = enabled(config(Mode::Csp));
+    axis.command(to(4000.0)).unwrap();
+    let mut position = 0;
+    for _ in 0..300 {
+        follow(&mut axis, &mut position);
+    }
+    let steps = [
+        Delivery::Now,
+        Delivery::Unknown,
+        Delivery::Unknown,
+        Delivery::Unknown,
+    ];
+    let steps = steps.map(|delivery| {
+        let stale = Inputs {
+            fresh: false,
+            delivery,
+            ..inputs(0x1237, position, 8)
+        };
+        let target = axis.step(&stale, DT).target_position;
+        let step = target - position;
+        position = target;
+        step
+    });
+    assert!(steps[..3].iter().all(|step| *step >= 78), "{steps:?}");
+    assert_eq!(steps[3], 0);
+}
+
 /// With pipelined answers: a late answer in the first stale cycle leaves both cycles that are
 /// planned without an answer.
 #[test]
@@ -437,10 +471,10 @@ fn late_reply_keeps_the_cycles_planned_without_an_answer() {
     for _ in 0..300 {
         follow(&mut axis, &mut position);
     }
-    for late in [true, false] {
+    for delivery in [Delivery::Earlier, Delivery::Unknown] {
         let stale = Inputs {
             fresh: false,
-            late,
+            delivery,
             ..inputs(0x1237, position, 8)
         };
         let target = axis.step(&stale, DT).target_position;

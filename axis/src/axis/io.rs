@@ -1,5 +1,17 @@
 //! Inputs and outputs of an axis, as transmitted.
 
+/// What shows that a drive has its targets, in a cycle without fresh inputs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
+pub enum Delivery {
+    /// Nothing.
+    #[default]
+    Unknown,
+    /// A late answer: the drive has the targets of an earlier cycle.
+    Earlier,
+    /// The frame came back with the inputs of this drive and without those of another device.
+    Now,
+}
+
 /// The inputs of one drive in one cycle. `None`: not mapped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Inputs {
@@ -24,10 +36,9 @@ pub struct Inputs {
     /// False if no answer arrived in time. The values are then old, and no decision uses them. The
     /// set-point continues for two consecutive cycles of this kind and then waits.
     pub fresh: bool,
-    /// True if the inputs are not fresh but a late answer to an earlier frame arrived, or a frame
-    /// came back without the answer of one of its devices, perhaps another one. The targets arrive,
-    /// so the set-point decelerates instead of waiting.
-    pub late: bool,
+    /// Whether the drive has its targets although the inputs are not fresh. The set-point then
+    /// decelerates instead of waiting.
+    pub delivery: Delivery,
 }
 
 /// The outputs of one drive in one cycle. Every field always has a safe value, mapped or not.

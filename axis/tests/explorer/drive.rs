@@ -1,6 +1,6 @@
 //! A drive that may answer anything: a drive of the standard, and settings that deviate from it.
 
-use ecaxis_axis::{AxisConfig, Inputs, Outputs, State};
+use ecaxis_axis::{AxisConfig, Delivery, Inputs, Outputs, State};
 
 /// The cycle. Long, so that the time-outs of the axis take few cycles.
 pub const DT: f64 = 0.01;
@@ -76,6 +76,8 @@ pub enum Frames {
     Arrive,
     Lost,
     Late,
+    /// A counter that the drive shares with another device is wrong.
+    Shared,
 }
 
 /// What deviates from the standard.
@@ -132,7 +134,7 @@ pub enum Change {
 }
 
 /// Every change: a deviation, its end, or an event.
-pub const CHANGES: [Change; 36] = [
+pub const CHANGES: [Change; 37] = [
     Change::Word(Word::State),
     Change::Word(Word::Zero),
     Change::Word(Word::Unlisted),
@@ -158,6 +160,7 @@ pub const CHANGES: [Change; 36] = [
     Change::Frames(Frames::Arrive),
     Change::Frames(Frames::Lost),
     Change::Frames(Frames::Late),
+    Change::Frames(Frames::Shared),
     Change::Deaf(true),
     Change::Deaf(false),
     Change::Elsewhere(true),
@@ -427,7 +430,11 @@ impl Drive {
                 ModeShown::Requested | ModeShown::Kept => self.mode,
             }),
             fresh: self.settings.frames == Frames::Arrive,
-            late: self.settings.frames == Frames::Late,
+            delivery: match self.settings.frames {
+                Frames::Late => Delivery::Earlier,
+                Frames::Shared => Delivery::Now,
+                _ => Delivery::Unknown,
+            },
             ..Inputs::default()
         }
     }

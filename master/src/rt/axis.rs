@@ -1,7 +1,7 @@
 //! One axis in the cycle, between its process data and its set-point generator.
 
 use ecaxis_axis::{
-    Axis, AxisStatus, Command, CommandError, DriveWords, Inputs, Outputs, StopMethod,
+    Axis, AxisStatus, Command, CommandError, Delivery, DriveWords, Inputs, Outputs, StopMethod,
 };
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex};
 
@@ -25,8 +25,9 @@ pub struct RtAxis {
     pub node: Option<NodePlace>,
     /// The number of cycles from step to step: 1, or the gateway's SYNC period.
     pub cycles: u32,
-    /// Fresh inputs, or a late answer, have arrived since the last step.
-    pub(super) arrived: (bool, bool),
+    /// Whether fresh inputs have arrived since the last step, and what else shows that the drive has
+    /// its targets.
+    pub(super) arrived: (bool, Delivery),
     /// The counts of its second encoder, and their device.
     pub second_encoder: Option<(SignalBits, DeviceIndex)>,
     /// The output that opens its brake; it may be on any device.
@@ -67,7 +68,7 @@ impl RtAxis {
             device,
             node: None,
             cycles: 1,
-            arrived: (false, false),
+            arrived: (false, Delivery::Unknown),
             second_encoder: None,
             brake: None,
             group,
@@ -139,7 +140,7 @@ impl RtAxis {
         Ok(())
     }
 
-    pub(super) fn read(&mut self, image: &[u8], fresh: bool, late: bool) -> Inputs {
+    pub(super) fn read(&mut self, image: &[u8], fresh: bool, delivery: Delivery) -> Inputs {
         let bits = &self.bits;
         Inputs {
             statusword: self.words.statusword(bits.statusword.get(image) as u16),
@@ -157,7 +158,7 @@ impl RtAxis {
                 .map(|b| b.map(|b| b.get(image) as i32)),
             second_position: None,
             fresh,
-            late,
+            delivery,
         }
     }
 

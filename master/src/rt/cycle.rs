@@ -397,13 +397,11 @@ impl Engine {
                 slot.heard = Some(self.next);
             }
             slot.arrived.0 |= fresh;
-            // The frame came back, and at most one of several devices missed its targets.
-            let shared = answer == Some(&DeviceAnswer::Unknown);
-            slot.arrived.1 |= shared || self.exchange.came_late(slot.device);
+            slot.arrived.1 = slot.arrived.1.max(self.exchange.delivery(slot.device));
             slot.acted = !due;
             if due {
-                let (fresh, late) = std::mem::take(&mut slot.arrived);
-                let mut inputs = slot.read(image, fresh && reported, late);
+                let (fresh, delivery) = std::mem::take(&mut slot.arrived);
+                let mut inputs = slot.read(image, fresh && reported, delivery);
                 inputs.second_position = slot.second_encoder.and_then(|(bits, device)| {
                     let answer = self.exchange.device_answers().get(device);
                     let fresh = answer == Some(&DeviceAnswer::Fresh);

@@ -16,6 +16,7 @@
 
 use std::sync::Arc;
 
+use ecaxis_axis::Delivery;
 use ecaxis_ecat::index::{DeviceIndex, GroupIndex, IndexVec};
 
 pub use super::config::ExchangeMode;
@@ -70,8 +71,11 @@ pub struct Exchange {
     /// The devices in the order of their data in the image.
     order: Vec<DeviceIndex>,
     device_answers: IndexVec<DeviceIndex, DeviceAnswer>,
-    /// For each device, true if a late answer has arrived since the last cycle.
-    late: IndexVec<DeviceIndex, bool>,
+    /// For each device, whether it processed a frame whose inputs do not count: a late answer has
+    /// arrived since the last cycle, or a counter that it shares was wrong and its inputs are there.
+    deliveries: IndexVec<DeviceIndex, Delivery>,
+    /// The place of each device's inputs in the image: offset and length.
+    input_places: IndexVec<DeviceIndex, (usize, usize)>,
     reference: ReferenceClock,
     /// The value for 0x0920 of the reference clock, if SYNC0 is aligned.
     reference_offset: Option<u64>,
@@ -148,7 +152,13 @@ impl Exchange {
             op_expected: false,
             order,
             device_answers: vec![DeviceAnswer::Unknown; members.len()].into(),
-            late: vec![false; members.len()].into(),
+            deliveries: vec![Delivery::Unknown; members.len()].into(),
+            input_places: plan
+                .regions
+                .iter()
+                .map(|region| region.map_or((0, 0), |region| (region.offset, region.in_len)))
+                .collect::<Vec<_>>()
+                .into(),
             reference: ReferenceClock::new(members, clock),
             reference_offset: None,
             clock_window_ns: clock.map_or(0, |clock| clock.window_ns),
@@ -231,11 +241,11 @@ impl Exchange {
         &self.device_answers
     }
 
-    /// True if a late answer to an earlier cycle's frame has arrived since the last cycle, and this
-    /// device processed that frame.
+    /// Returns what shows that a device took its outputs although it is not
+    /// [`DeviceAnswer::Fresh`].
     #[must_use]
-    pub fn came_late(&self, device: DeviceIndex) -> bool {
-        self.late.get(device).copied().unwrap_or(false)
+    pub fn delivery(&self, device: DeviceIndex) -> Delivery {
+        self.deliveries.get(device).copied().unwrap_or_default()
     }
 
     /// Sets whether devices are expected in Op. On the way to Op and back, devices begin to answer
@@ -318,7 +328,7 @@ impl Exchange {
     pub fn stage(&mut self) {
         self.cycle = self.cycle.wrapping_add(1);
         self.staged = self.due();
-        self.late.fill(false);
+        self.deliveries.fill(Delivery::Unknown);
         let separate = self.separate_cycles > 0 && self.layouts.len() > 1;
         self.separate_cycles = self.separate_cycles.saturating_sub(1);
         let layout = usize::from(separate);
@@ -470,8 +480,8 @@ impl Exchange {
             {
                 let (first, end) = datagram.devices;
                 for &device in self.order.get(first..end).unwrap_or_default() {
-                    if let Some(late) = self.late.get_mut(device) {
-                        *late = true;
+                    if let Some(delivery) = self.deliveries.get_mut(device) {
+                        *delivery = Delivery::Earlier;
                     }
                 }
             }
@@ -534,6 +544,15 @@ impl Exchange {
                     && device_answer != DeviceAnswer::Fresh
                 {
                     *of = device_answer;
+                }
+                // A device that the frame did not reach leaves its place as it was sent.
+                let (offset, len) = self.input_places.get(device).copied().unwrap_or_default();
+                let from = offset.saturating_sub(datagram.image);
+                if device_answer == DeviceAnswer::Unknown
+                    && frame_set.differs(slot, from..from + len)
+                    && let Some(delivery) = self.deliveries.get_mut(device)
+                {
+                    *delivery = Delivery::Now;
                 }
             }
             group.answered &= answer.is_some();

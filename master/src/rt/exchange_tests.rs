@@ -445,18 +445,24 @@ fn late_answer_proves_delivery_but_an_old_one_does_not() {
     exchange.evaluate();
     assert_eq!(**exchange.device_answers(), [DeviceAnswer::Missing; 2]);
     exchange.stage();
-    assert!(!exchange.came_late(DeviceIndex(0)));
+    assert_eq!(exchange.delivery(DeviceIndex(0)), Delivery::Unknown);
     assert_eq!(exchange.receive(&first), Received::Late);
-    assert!(exchange.came_late(DeviceIndex(0)) && exchange.came_late(DeviceIndex(1)));
+    for device in [0, 1].map(DeviceIndex) {
+        assert_eq!(exchange.delivery(device), Delivery::Earlier);
+    }
     exchange.stage();
-    assert!(!exchange.came_late(DeviceIndex(0)), "it is of one cycle");
+    assert_eq!(
+        exchange.delivery(DeviceIndex(0)),
+        Delivery::Unknown,
+        "it is of one cycle"
+    );
     // An answer of a device that did not process it, or of another frame.
     let mut without = reflect(&mut exchange, 0, 1);
     let wkc = exchange.layouts[0].process_data[0].slot.data().end;
     without[wkc] = 3;
     exchange.stage();
     assert_eq!(exchange.receive(&without), Received::Late);
-    assert!(!exchange.came_late(DeviceIndex(0)));
+    assert_eq!(exchange.delivery(DeviceIndex(0)), Delivery::Unknown);
     for cut in 0..first.len() {
         exchange.receive(&first[..cut]);
     }
@@ -464,7 +470,30 @@ fn late_answer_proves_delivery_but_an_old_one_does_not() {
         exchange.stage();
     }
     assert_eq!(exchange.receive(&first), Received::Late);
-    assert!(!exchange.came_late(DeviceIndex(0)), "too old");
+    assert_eq!(
+        exchange.delivery(DeviceIndex(0)),
+        Delivery::Unknown,
+        "too old"
+    );
+}
+
+/// A device that the frame did not reach leaves its place as it was sent.
+#[test]
+fn wrong_shared_counter_shows_which_devices_took_their_outputs() {
+    let mut exchange = axes(3);
+    exchange.expect_op(true);
+    exchange.outputs_mut().fill(7);
+    exchange.refresh_outputs();
+    let data = exchange.layouts[0].process_data[0].slot.data();
+    let mut frame = reflect(&mut exchange, 0, 1);
+    frame[data.start + 12..data.start + 24].fill(7);
+    frame[data.end] = 6;
+    assert_eq!(exchange.receive(&frame), Received::Current);
+    exchange.evaluate();
+    assert_eq!(**exchange.device_answers(), [DeviceAnswer::Unknown; 3]);
+    let delivery = |n| exchange.delivery(DeviceIndex(n));
+    let expected = [Delivery::Now, Delivery::Unknown, Delivery::Now];
+    assert_eq!([0, 1, 2].map(delivery), expected);
 }
 
 /// The number of a cycle is longer than the index of a datagram.

@@ -421,6 +421,34 @@ fn a_half_that_moves_without_the_other_trips() {
 }
 
 #[test]
+fn both_halves_stay_in_their_ranges_with_any_offset() {
+    let ready = Pair::new(-30.0, false).after(&[Action::Wait(5)]);
+    let coupled = ready.after(&[Action::Command(Command::Enable), Action::Wait(12)]);
+    assert_eq!(coupled.coupling, Coupling::Coupled);
+    let at = |pair: &Pair| {
+        pair.out
+            .map(|out| f64::from(out.target_position) / COUNTS_PER_UNIT)
+    };
+    let target = |pair: &Pair, position: f64| {
+        let order = Command::MoveTo {
+            position,
+            speed: 1.0,
+            ramp: 1.0,
+        };
+        let pair = pair
+            .clone()
+            .after(&[Action::Command(order), Action::Wait(200)]);
+        at(&pair)
+    };
+    assert_eq!(target(&coupled, -20.0), [-20.0, -50.0]);
+    assert_eq!(
+        target(&coupled, -25.0),
+        at(&coupled),
+        "the second half would be at -55"
+    );
+}
+
+#[test]
 fn home_that_one_half_rejects_has_no_effect_on_the_other() {
     let lost = Change::Frames(drive::Frames::Lost);
     let ready = Pair::new(0.25, false).after(&[Action::Wait(5)]);

@@ -1,5 +1,7 @@
 //! The frames of one cycle, from staging until their answers are evaluated.
 
+use std::ops::Range;
+
 use super::frame::{
     DatagramSlot, FIRST_DATAGRAM, Frame, frame_number, frame_tag, number, same_headers,
 };
@@ -109,6 +111,17 @@ impl FrameSet {
     pub fn answer(&self, number: usize) -> Option<&[u8]> {
         let frame = self.frames().get(number).filter(|frame| frame.answered)?;
         frame.answer.get(..frame.bytes.len())
+    }
+
+    /// True if a part of a datagram's data came back otherwise than it was sent.
+    pub fn differs(&self, slot: DatagramSlot, part: Range<usize>) -> bool {
+        let sent = self.frames().get(slot.frame).map(|frame| &frame.bytes[..]);
+        let Some((sent, answer)) = sent.zip(self.answer(slot.frame)) else {
+            return false;
+        };
+        let (sent, answer) = (sent.get(slot.data()), answer.get(slot.data()));
+        let sent = sent.and_then(|data| data.get(part.clone()));
+        sent != answer.and_then(|data| data.get(part))
     }
 
     /// Returns the answer of a datagram of eight bytes; `None` if the low 32 bits came back as they
