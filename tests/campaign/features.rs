@@ -283,7 +283,7 @@ fn every_mode(draft: &mut Draft, homes: bool) -> Member {
     if homes {
         let method = draft.random.pick(&[37, 34, 33]);
         keys.axis = format!(
-            "homing = {{ method = {method}, search = 10.0, zero = 5.0, acceleration = 200.0, timeout = \"10s\" }}\n"
+            "homing = {{ method = {method}, search = 10.0, zero = 5.0, acceleration = 200.0, timeout = \"60s\" }}\n"
         );
     }
     let is_foreign = draft.random.chance(draft.foreign);
@@ -904,8 +904,10 @@ fn with(draft: &mut Draft, wanted: &'static str) {
     for member in pool.iter().filter(|of| of.cycles_power) {
         let count = |step: String| draft.steps.matches(&step).count();
         let name = &member.name;
-        let switches =
-            count(format!("mode = {{ {name} = ")) + 2 * count(format!("home = [\"{name}\"]"));
+        let homings = count(format!("home = [\"{name}\"]"));
+        // A homing that is held ends, and begins again after the hold.
+        let held = usize::from(draft.machine.hold.is_some() && homings > 0);
+        let switches = count(format!("mode = {{ {name} = ")) + 2 * (homings + held);
         let enables = if draft.once { 1 + switches } else { usize::MAX };
         draft.machine.axes[member.index].enables = enables;
     }

@@ -52,9 +52,10 @@ fn mechanical_end(draft: &mut Draft, keys: &mut Keys) -> bool {
     let home = sign * (REACH - 5.0);
     keys.axis = format!(
         "homing = {{ method = {method}, threshold = 1500, search = 10.0, zero = 5.0, acceleration = 200.0, \
-         position = {home:?}, timeout = \"10s\" }}\n"
+         position = {home:?}, timeout = \"60s\" }}\n"
     );
-    let (start, ends) = (sign * 150.0, 160.0);
+    // Inside the range of positions before homing and after it.
+    let (start, ends) = (sign * (REACH - 10.0), REACH);
     keys.sim = format!(
         "track = {{ start = {start:?}, ends = [{:?}, {ends:?}] }}\n",
         -ends

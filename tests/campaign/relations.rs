@@ -4,7 +4,7 @@
 use super::judge::{Finding, Report};
 use super::stops::Stop;
 use super::view::{Axis, CSP, HOMING, Machine, Moment, Switch};
-use super::wire::Wire;
+use super::wire::{Inputs, Wire};
 
 /// The cycles in which the second half of a gantry follows a stop of the first one.
 const TOGETHER: usize = 2;
@@ -89,8 +89,8 @@ fn gantry_apart(machine: &Machine, views: &[Vec<Moment>], halves: [usize; 2]) ->
     None
 }
 
-/// Both halves lose power together while they move (`docs/motion.md`, "Gantries"). At rest, a stop
-/// ends when the brake of its half holds.
+/// No half moves for long after the other one has lost its power (`docs/motion.md`, "Gantries"). A
+/// half at rest holds its position until its stop ends.
 fn gantry_half_alone(
     machine: &Machine,
     views: &[Vec<Moment>],
@@ -100,7 +100,7 @@ fn gantry_half_alone(
     let mut both = false;
     for (one, other) in pairs(views, halves) {
         let powered = [one, other].map(Moment::requests_operation);
-        let moves = one.speed.max(other.speed) > 2.0;
+        let moves = (powered[0] && one.speed > 2.0) || (powered[1] && other.speed > 2.0);
         both = powered == [true; 2] || both && powered != [false; 2];
         alone = if both && moves && powered[0] != powered[1] {
             alone + 1
@@ -133,8 +133,12 @@ fn output(
     let mut homed = !switch.homes;
     for pair in view.windows(2) {
         let [before, now] = pair else { continue };
-        let homing = now.requests_operation() && now.asked(axis) == HOMING;
-        homed |= homing;
+        let in_homing = now.requests_operation() && now.asked(axis) == HOMING;
+        // Bits 10 and 12: a drive that keeps its mode is homed before it leaves it.
+        let attained = |report: &Inputs| report.statusword & 0x1400 == 0x1400;
+        let ended = now.last().is_some_and(attained) && now.sent.controlword & 0x10 == 0;
+        let homing = in_homing && !ended;
+        homed |= in_homing;
         let terminal = wire.cycles[now.cycle].terminals[switch.terminal];
         let Some(on) = terminal.sent.map(|byte| byte >> switch.bit & 1 != 0) else {
             continue;

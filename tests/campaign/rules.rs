@@ -278,12 +278,15 @@ fn positions(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut 
             silent + moment.left_out > RUNS_ON * axis.period
         };
         let frozen = step == 0 && (waits(now) || axis.node_fails);
-        // A frozen set-point starts again from rest.
-        let left_out = now.cycle > before.cycle + axis.period;
-        if waits(before) || axis.node && left_out {
+        // A frozen set-point starts again from rest. Behind a gateway, a set-point may stay for two
+        // SYNCs because the answer that shows the first one was lost; it then goes on at its speed.
+        let left_out = axis.node && now.cycle > before.cycle + axis.period;
+        let goes_on = last_step.filter(|_| left_out);
+        if waits(before) || left_out {
             last_step = last_step.map(|_| 0);
         }
-        let differs = last_step.map_or(0, |last| (step - last).abs());
+        let differs = [last_step, goes_on].into_iter().flatten();
+        let differs = differs.map(|last| (step - last).abs()).min().unwrap_or(0);
         if differs as f64 > change * (1.0 + 1e-6) && !frozen {
             let last = last_step.unwrap_or(0);
             let detail = format!(
