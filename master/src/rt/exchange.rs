@@ -539,10 +539,9 @@ impl Exchange {
             };
             ambiguous |= device_answer == DeviceAnswer::Unknown;
             all_right &= right;
-            for &device in self.order.get(begin..end).unwrap_or_default() {
-                if let Some(of) = self.device_answers.get_mut(device)
-                    && device_answer != DeviceAnswer::Fresh
-                {
+            let devices = self.order.get(begin..end).unwrap_or_default();
+            for &device in devices.iter().filter(|_| !right) {
+                if let Some(of) = self.device_answers.get_mut(device) {
                     *of = device_answer;
                 }
                 // A device that the frame did not reach leaves its place as it was sent.
