@@ -17,8 +17,14 @@ TIMEOUTS = re.compile(r"(#define EC_TIMEOUT(?:RET|SAFE|EEP|TXM) +)\d+")
 
 
 def requirement():
-    lines = (rig.HERE / "requirements.txt").read_text().split()
+    lines = (rig.HERE / "requirements.in").read_text().split()
     return next(line for line in lines if line.startswith("pysoem"))
+
+
+def hashed():
+    """Returns the requirement with the hashes of its files."""
+    text = (rig.HERE / "requirements.txt").read_text()
+    return re.search(rf"^{re.escape(requirement())}(?:.*\\\n)+.*", text, re.M)[0]
 
 
 def sources(folder, python):
@@ -28,8 +34,10 @@ def sources(folder, python):
         fresh = folder / "fresh"
         shutil.rmtree(fresh, ignore_errors=True)
         fresh.mkdir(parents=True)
+        wanted = fresh / "requirements.txt"
+        wanted.write_text(hashed())
         fetch = ["-m", "pip", "download", "-q", "--disable-pip-version-check", "--no-deps", "--no-binary", ":all:"]
-        subprocess.run([python, *fetch, "-d", str(fresh), requirement()], check=True)
+        subprocess.run([python, *fetch, "--require-hashes", "-d", str(fresh), "-r", str(wanted)], check=True)
         with tarfile.open(next(fresh.glob("*.tar.gz"))) as archive:
             archive.extractall(fresh, filter="data")
         soem = next(fresh.glob("*/soem"))

@@ -17,7 +17,8 @@ import rig
 
 from .page import Server
 
-CLIENT = rig.HERE / "foxglove"
+CLIENT = rig.HERE / "foxglove/client.cjs"
+PACKAGES = ["package.json", "package-lock.json"]
 COLUMNS = ["position", "velocity", "torque", "target_position", "target_velocity", "target_torque", "following_error", "statusword", "controlword", "mode"]
 PROTOCOLS = ["foxglove.websocket.v1", "foxglove.sdk.v1"]
 SECOND = 1_000_000_000
@@ -52,7 +53,7 @@ def viewers(bench):
 
 
 def node_packages(bench):
-    """Installs Foxglove's client. Returns its folder; `None`: there is no node."""
+    """Installs Foxglove's client, as `.ci/run` does. Returns its folder; `None`: there is no node."""
     if not shutil.which("npm"):
         if bench.on_ci:
             raise RuntimeError("npm is missing")
@@ -60,8 +61,9 @@ def node_packages(bench):
         return None
     folder = rig.target() / "judges-node"
     folder.mkdir(parents=True, exist_ok=True)
-    shutil.copy(CLIENT / "package.json", folder)
-    command = ["npm", "install", "--no-audit", "--no-fund", "--silent"]
+    for name in PACKAGES:
+        shutil.copy(rig.HERE / name, folder)
+    command = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--silent"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(done.stderr)
@@ -89,7 +91,7 @@ def keep(server):
 
 def connect(packages, server, protocol, path="/", origin=None):
     address = server.origin.replace("http", "ws") + path
-    command = ["node", str(CLIENT / "client.cjs"), address, protocol, "2", *filter(None, [origin])]
+    command = ["node", str(CLIENT), address, protocol, "2", *filter(None, [origin])]
     environment = {**os.environ, "FOXGLOVE_PACKAGES": str(packages)}
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
     keep(server)
