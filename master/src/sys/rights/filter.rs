@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use seccompiler::{
     BpfProgram, SeccompAction, SeccompCmpArgLen, SeccompCmpOp, SeccompCondition, SeccompFilter,
-    SeccompRule, TargetArch,
+    SeccompRule, TargetArch, sock_filter,
 };
 
 /// Calls that no thread of a machine's program makes: other programs, other processes, mounts, the
@@ -76,6 +76,18 @@ const NEVER: &[libc::c_long] = &[
     libc::SYS_modify_ldt,
 ];
 
+/// The flags of `clone` that make namespaces. `CLONE_NEWTIME` is a flag of `clone3` and `unshare`
+/// only: in `clone`, its bit belongs to the signal.
+const NAMESPACES: [libc::c_int; 7] = [
+    libc::CLONE_NEWCGROUP,
+    libc::CLONE_NEWIPC,
+    libc::CLONE_NEWNET,
+    libc::CLONE_NEWNS,
+    libc::CLONE_NEWPID,
+    libc::CLONE_NEWUSER,
+    libc::CLONE_NEWUTS,
+];
+
 /// The socket families of a machine's program; netlink is for the names of interfaces.
 const FAMILIES: [libc::c_int; 5] = [
     libc::AF_UNIX,
@@ -123,13 +135,26 @@ const CYCLE: &[libc::c_long] = &[
     libc::SYS_tgkill,
 ];
 
-/// Refuses the calls of [`NEVER`] and other socket families to all threads.
+/// The length of what seccompiler puts first: the check of the processor architecture.
+const ARCHITECTURE_CHECK: usize = 3;
+/// The number of calls of the x32 ABI start here; they have the architecture of x86_64.
+#[cfg(target_arch = "x86_64")]
+const X32: u32 = 0x4000_0000;
+
+/// Refuses the calls of [`NEVER`], new namespaces and other socket families to all threads.
 pub fn limit_process() -> Result<(), String> {
     let mut rules: BTreeMap<i64, Vec<SeccompRule>> = of_calls(NEVER);
     let other = FAMILIES.map(|family| condition(0, SeccompCmpOp::Ne, family));
     let other = other.into_iter().collect::<Result<_, _>>()?;
     rules.insert(libc::SYS_socket, vec![rule(other)?]);
-    let filter = compile(rules, SeccompAction::Allow, refused())?;
+    let namespaces = NAMESPACES.map(|flag| {
+        let bit = flag.cast_unsigned().into();
+        rule(vec![condition(0, SeccompCmpOp::MaskedEq(bit), flag)?])
+    });
+    let namespaces = namespaces.into_iter().collect::<Result<_, _>>()?;
+    rules.insert(libc::SYS_clone, namespaces);
+    let mut filter = compile(rules, SeccompAction::Allow, refused())?;
+    filter.splice(ARCHITECTURE_CHECK..ARCHITECTURE_CHECK, numbers_refused()?);
     seccompiler::apply_filter_all_threads(&filter).map_err(|error| error.to_string())
 }
 
@@ -143,6 +168,31 @@ pub fn limit_cycle() -> Result<(), String> {
     }
     let filter = compile(rules, refused(), SeccompAction::Allow)?;
     seccompiler::apply_filter(&filter).map_err(|error| error.to_string())
+}
+
+/// Returns the instructions that refuse calls by their number alone. A filter cannot read the flags
+/// of `clone3`, which are in memory: with ENOSYS, the C library starts threads by `clone`.
+fn numbers_refused() -> Result<Vec<sock_filter>, String> {
+    let instruction = |code: u32, jt, jf, k| {
+        let code = u16::try_from(code).map_err(|error| error.to_string())?;
+        Ok::<_, String>(sock_filter { code, jt, jf, k })
+    };
+    let jump = libc::BPF_JMP | libc::BPF_K;
+    let stop = |error: libc::c_int| {
+        let value = libc::SECCOMP_RET_ERRNO | error.cast_unsigned();
+        instruction(libc::BPF_RET | libc::BPF_K, 0, 0, value)
+    };
+    let clone3 = u32::try_from(libc::SYS_clone3).map_err(|error| error.to_string())?;
+    Ok(vec![
+        // The number is the first word of `seccomp_data`.
+        instruction(libc::BPF_LD | libc::BPF_W | libc::BPF_ABS, 0, 0, 0)?,
+        instruction(jump | libc::BPF_JEQ, 0, 1, clone3)?,
+        stop(libc::ENOSYS)?,
+        #[cfg(target_arch = "x86_64")]
+        instruction(jump | libc::BPF_JGE, 0, 1, X32)?,
+        #[cfg(target_arch = "x86_64")]
+        stop(libc::EPERM)?,
+    ])
 }
 
 fn of_calls(calls: &[libc::c_long]) -> BTreeMap<i64, Vec<SeccompRule>> {

@@ -78,6 +78,8 @@ fn only_needed_folders_are_open() {
             other.join().unwrap();
         });
         assert!(std::fs::read("/proc/self/status").is_ok());
+        // A file of others, which every user may read.
+        assert!(denied(std::fs::read("/etc/passwd")));
         assert!(denied(std::fs::write("/proc/self/comm", "x")));
         if reported("(Linux 6.7 has all)") {
             return;
@@ -114,6 +116,58 @@ fn other_programs_and_sockets_are_refused() {
         drop_capabilities();
         assert_eq!(capabilities(None).unwrap().permitted, before & FILES);
     });
+}
+
+/// Makes a system call, and returns its result or the error of the kernel.
+fn call(number: libc::c_long, arguments: [usize; 2]) -> Result<libc::c_long, Errno> {
+    // SAFETY: the calls of the tests get numbers, and pointers to nothing.
+    let result = unsafe { libc::syscall(number, arguments[0], arguments[1], 0, 0, 0) };
+    match result {
+        -1 => Err(Errno::from_io_error(&std::io::Error::last_os_error()).unwrap()),
+        result => Ok(result),
+    }
+}
+
+/// Starts a process by `clone` that ends at once.
+fn clone(flags: libc::c_int) -> Result<libc::c_long, Errno> {
+    let flags = usize::try_from(flags | libc::SIGCHLD).unwrap();
+    let process = call(libc::SYS_clone, [flags, 0])?;
+    if process == 0 {
+        // SAFETY: ends the new process; nothing of this one is cleaned up there.
+        unsafe { libc::_exit(0) };
+    }
+    Ok(process)
+}
+
+#[test]
+fn namespaces_and_calls_of_x32_are_refused_and_threads_start() {
+    in_own_process(
+        "namespaces_and_calls_of_x32_are_refused_and_threads_start",
+        |folder| {
+            limit(folder);
+            let user = usize::try_from(libc::CLONE_NEWUSER).unwrap();
+            assert_eq!(call(libc::SYS_unshare, [user, 0]), Err(Errno::PERM));
+            for flag in [
+                libc::CLONE_NEWUSER,
+                libc::CLONE_NEWNET,
+                libc::CLONE_NEWNS | libc::CLONE_NEWPID,
+            ] {
+                assert_eq!(clone(flag), Err(Errno::PERM), "{flag:#x}");
+            }
+            assert!(clone(0).is_ok());
+            // Without the filter, EFAULT.
+            assert_eq!(call(libc::SYS_clone3, [0, 64]), Err(Errno::NOSYS));
+            // Without the filter, a number, or ENOSYS if the kernel has no x32.
+            #[cfg(target_arch = "x86_64")]
+            assert_eq!(
+                call(0x4000_0000 | libc::SYS_getpid, [0; 2]),
+                Err(Errno::PERM)
+            );
+            assert!(call(libc::SYS_getpid, [0; 2]).is_ok());
+            let thread = std::thread::Builder::new().spawn(|| 7).unwrap();
+            assert_eq!(thread.join().unwrap(), 7);
+        },
+    );
 }
 
 #[test]
