@@ -149,6 +149,15 @@ fn long_names() -> Bench {
 }
 
 fn with_clients(key: &str, clients: impl FnOnce(SocketAddr) + Send + 'static) -> Outcome {
+    with_clients_of(false, key, clients)
+}
+
+/// `enable`: the axes get power.
+fn with_clients_of(
+    enable: bool,
+    key: &str,
+    clients: impl FnOnce(SocketAddr) + Send + 'static,
+) -> Outcome {
     let stop = Arc::<CancelToken>::default();
     let mut observer = WithClients {
         clients: Some(clients),
@@ -158,7 +167,7 @@ fn with_clients(key: &str, clients: impl FnOnce(SocketAddr) + Send + 'static) ->
     };
     let options = Options {
         limit: Some(120_000_000_000),
-        enable: false,
+        enable,
         ..Options::default()
     };
     let outcome = session::run(
@@ -280,6 +289,35 @@ fn objects_of_the_cycle_are_protected_in_op() {
             *b"\x41\x02\xf0\x03\x06\0\0\0\x01\0\x03\0\0\0"
         );
         assert_eq!(client.download(0, 0x8000, 1, 5), 0x0601_0002);
+    });
+    outcome.result.expect("an undisturbed run");
+}
+
+#[test]
+fn a_drive_with_power_gets_no_write_that_moves_resets_or_limits_it() {
+    let outcome = with_clients_of(true, "write = true", |address| {
+        let client = Client::new(address);
+        let end = Instant::now() + Duration::from_secs(30);
+        // Statusword: Operation enabled.
+        while client.upload(X, 0x6041, 0)[6] & 0x6f != 0x27 {
+            assert!(Instant::now() < end, "no power");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        let before = client.upload(X, 0x6065, 0);
+        for (index, sub) in [
+            (0x1010, 1),
+            (0x1011, 1),
+            (0x6065, 0),
+            (0x607f, 0),
+            (0x6040, 0),
+        ] {
+            assert_eq!(client.download(X, index, sub, 6), 0x0800_0022, "{index:#x}");
+        }
+        assert_eq!(client.upload(X, 0x6065, 0), before);
+        let (protocol, answer) = client.ask(X, FOE, b"\x02\0\0\0\0\0firmware");
+        assert_eq!((protocol, &answer[..6]), (FOE, &b"\x05\0\x02\x80\0\0"[..]));
+        // The drive itself answers: it has no such object.
+        assert_eq!(client.download(X, 0x60f9, 1, 6), 0x0602_0000);
     });
     outcome.result.expect("an undisturbed run");
 }

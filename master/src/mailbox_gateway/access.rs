@@ -1,15 +1,19 @@
-//! What clients of the gateway may not do: write without the key `write`, and write objects of the
-//! cycle.
+//! What clients of the gateway may not do: write without the key `write`, write objects of the
+//! cycle, and write to a drive with power what could move or reset an axis.
 
-use ecaxis_ecat::index::{DeviceIndex, IndexVec};
+use ecaxis_ecat::index::{AxisIndex, DeviceIndex, IndexVec};
 use ecaxis_ecat::mailbox::coe::{Answer, Request};
 use ecaxis_ecat::mailbox::{
     ERROR_SERVICE, ERROR_SIZE, Encode as _, HEADER, TYPE_COE, TYPE_ERROR, TYPE_FOE, TYPE_SOE,
     abort_code, error_body, foe,
 };
 
+use tokio::sync::watch;
+
+use super::live::Live;
 use crate::config::{Machine, cycle_objects};
-use crate::mailbox::{MailboxLayout, RawMessage};
+use crate::mailbox::{MailboxLayout, NamedObject, RawMessage};
+use crate::parameters::class::classify;
 
 /// FoE: access denied (ETG.1000.6 Table 93).
 const FOE_ACCESS_DENIED: u32 = 0x8002;
@@ -24,20 +28,33 @@ const SOE_OPCODE: u8 = 0x07;
 #[derive(Debug)]
 pub(super) struct Access {
     write: bool,
-    cycle: IndexVec<DeviceIndex, CycleObjects>,
+    devices: IndexVec<DeviceIndex, DeviceRules>,
+    live: watch::Receiver<Live>,
 }
 
-/// The objects of a device that belong to the cycle.
+/// What decides about writes to a device.
 #[derive(Debug)]
-struct CycleObjects {
-    /// Mapped to RxPDOs.
+struct DeviceRules {
+    vendor: u32,
+    /// The objects that are mapped to RxPDOs.
     outputs: Vec<u16>,
-    is_drive: bool,
+    axes: Vec<AxisIndex>,
 }
 
-impl CycleObjects {
-    fn contains(&self, index: u16) -> bool {
-        self.outputs.contains(&index) || cycle_objects::contains(index, self.is_drive)
+impl DeviceRules {
+    fn is_of_cycle(&self, index: u16) -> bool {
+        self.outputs.contains(&index) || cycle_objects::contains(index, !self.axes.is_empty())
+    }
+
+    /// Returns true if the object may be written while an axis of the device has power. Complete
+    /// access writes all subindices.
+    fn is_written_with_power(&self, index: u16, sub: u8, complete: bool) -> bool {
+        let last = if complete { u8::MAX } else { sub };
+        (sub..=last).all(|sub| {
+            // A word in a name gives no class that may be written with power.
+            let (class, _) = classify(self.vendor, NamedObject { index, sub }, "");
+            class.is_written_with_power()
+        })
     }
 }
 
@@ -69,16 +86,27 @@ pub(super) fn mailbox_error(code: u16) -> RawMessage {
 }
 
 impl Access {
-    pub(super) fn new(machine: &Machine, write: bool) -> Self {
-        let cycle = machine.devices.enumerate().map(|(index, device)| {
-            let layout = &device.selection.layout;
-            CycleObjects {
-                outputs: layout.rx.iter().map(|field| field.index).collect(),
-                is_drive: machine.axes_of(index).next().is_some(),
+    pub(super) fn new(machine: &Machine, write: bool, live: watch::Receiver<Live>) -> Self {
+        let devices = machine.devices.enumerate().map(|(index, device)| {
+            let selection = &device.selection;
+            DeviceRules {
+                vendor: selection.identity.vendor,
+                outputs: selection.layout.rx.iter().map(|f| f.index).collect(),
+                axes: machine.axes_of(index).map(|(axis, _)| axis).collect(),
             }
         });
-        let cycle = cycle.collect();
-        Self { write, cycle }
+        Self {
+            write,
+            devices: devices.collect(),
+            live,
+        }
+    }
+
+    /// Returns true if an axis of the device has power, or if that is not known.
+    fn has_power(&self, device: &DeviceRules) -> bool {
+        let live = self.live.borrow();
+        let mut axes = device.axes.iter();
+        axes.any(|axis| live.power.get(*axis) != Some(&false))
     }
 
     /// Returns the answer to a message that the device must not receive. `in_transfer`: the device
@@ -93,11 +121,22 @@ impl Access {
         if !message.fits(layout) {
             return Some(mailbox_error(ERROR_SIZE));
         }
+        let has_power = || {
+            let device = self.devices.get(device);
+            device.is_some_and(|device| self.has_power(device))
+        };
         match message.protocol {
             TYPE_COE => self.sdo_refusal(Some(device), message, in_transfer),
-            TYPE_FOE => self.file_refusal(message),
+            TYPE_FOE => {
+                let reason = match (self.write, has_power()) {
+                    (false, _) => Some("the mailbox gateway is read-only"),
+                    (true, true) => Some("an axis of the device has power"),
+                    (true, false) => None,
+                };
+                file_refusal(message, reason)
+            }
             TYPE_SOE if soe_opcode(message) == Some(SOE_READ) => None,
-            _ if self.write => None,
+            _ if self.write && !has_power() => None,
             _ => Some(mailbox_error(ERROR_SERVICE)),
         }
     }
@@ -116,6 +155,7 @@ impl Access {
             Ok(None) => return Some(mailbox_error(ERROR_SERVICE)),
             Err(_) => return Some(sdo_abort(None, abort_code::INVALID_COMMAND)),
         };
+        let device = device.and_then(|device| self.devices.get(device));
         let code = match request {
             Request::Upload { .. } | Request::Abort { .. } => None,
             Request::Information { opcode, .. } => {
@@ -124,45 +164,67 @@ impl Access {
             }
             Request::UploadSegment { .. } => (!in_transfer).then_some(abort_code::INVALID_COMMAND),
             _ if !self.write => Some(abort_code::LOCAL_CONTROL),
+            Request::DownloadSegment { .. } if !in_transfer => Some(abort_code::INVALID_COMMAND),
+            // The request that began the transfer had the object.
             Request::DownloadSegment { .. } => {
-                (!in_transfer).then_some(abort_code::INVALID_COMMAND)
+                let with_power = device.is_some_and(|device| self.has_power(device));
+                with_power.then_some(abort_code::DEVICE_STATE)
             }
-            Request::Download { index, .. } | Request::DownloadExpedited { index, .. } => {
-                let cycle = device.and_then(|device| self.cycle.get(device));
-                let protected = cycle.is_some_and(|cycle| cycle.contains(index));
-                protected.then_some(abort_code::DEVICE_STATE)
+            Request::Download {
+                index,
+                sub,
+                complete,
+                ..
+            } => self.download_refusal(device, index, sub, complete),
+            Request::DownloadExpedited { index, sub, .. } => {
+                self.download_refusal(device, index, sub, false)
             }
         };
         code.map(|code| sdo_abort(Some(&request), code))
     }
 
-    fn file_refusal(&self, message: &RawMessage) -> Option<RawMessage> {
-        let writes = match foe::Message::parse(&message.mailbox()) {
-            Ok(
-                foe::Message::Read { .. }
-                | foe::Message::Ack { .. }
-                | foe::Message::Error { .. }
-                | foe::Message::Busy { .. },
-            ) => false,
-            Ok(_) => true,
-            Err(_) => return Some(mailbox_error(ERROR_SERVICE)),
-        };
-        (writes && !self.write).then(|| {
-            let denied = foe::Message::Error {
-                code: FOE_ACCESS_DENIED,
-                text: b"the mailbox gateway is read-only",
-            };
-            let mut mailbox = Vec::new();
-            denied.emit(0, 64, &mut mailbox);
-            let length = mailbox.first().copied().map_or(0, usize::from);
-            let body = mailbox.get(HEADER..HEADER + length).unwrap_or_default();
-            RawMessage {
-                channel: 0,
-                protocol: TYPE_FOE,
-                body: body.to_vec(),
-            }
-        })
+    /// Returns the abort code for a download that the device must not receive.
+    fn download_refusal(
+        &self,
+        device: Option<&DeviceRules>,
+        index: u16,
+        sub: u8,
+        complete: bool,
+    ) -> Option<u32> {
+        let device = device?;
+        let refused = device.is_of_cycle(index)
+            || (!device.is_written_with_power(index, sub, complete) && self.has_power(device));
+        refused.then_some(abort_code::DEVICE_STATE)
     }
+}
+
+/// Returns the answer to a damaged message of FoE, and to one that writes if it may not.
+fn file_refusal(message: &RawMessage, reason: Option<&str>) -> Option<RawMessage> {
+    let writes = match foe::Message::parse(&message.mailbox()) {
+        Ok(
+            foe::Message::Read { .. }
+            | foe::Message::Ack { .. }
+            | foe::Message::Error { .. }
+            | foe::Message::Busy { .. },
+        ) => false,
+        Ok(_) => true,
+        Err(_) => return Some(mailbox_error(ERROR_SERVICE)),
+    };
+    reason.filter(|_| writes).map(|reason| {
+        let denied = foe::Message::Error {
+            code: FOE_ACCESS_DENIED,
+            text: reason.as_bytes(),
+        };
+        let mut mailbox = Vec::new();
+        denied.emit(0, 64, &mut mailbox);
+        let length = mailbox.first().copied().map_or(0, usize::from);
+        let body = mailbox.get(HEADER..HEADER + length).unwrap_or_default();
+        RawMessage {
+            channel: 0,
+            protocol: TYPE_FOE,
+            body: body.to_vec(),
+        }
+    })
 }
 
 fn soe_opcode(message: &RawMessage) -> Option<u8> {

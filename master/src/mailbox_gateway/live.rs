@@ -2,7 +2,9 @@
 
 use std::convert::Infallible;
 
+use ecaxis_axis::{AxisStatus, Controlword};
 use ecaxis_ecat::al_state::AlState;
+use ecaxis_ecat::index::{AxisIndex, IndexVec};
 use tokio::sync::{oneshot, watch};
 
 use crate::clock::Nanos;
@@ -25,6 +27,8 @@ pub(super) struct Live {
     pub(super) answering: u16,
     /// In the order of the machine file; empty before the first cycle.
     pub(super) devices: Vec<DeviceLive>,
+    /// Whether each axis has power, or is being enabled; empty before the first cycle.
+    pub(super) power: IndexVec<AxisIndex, bool>,
 }
 
 /// One device at one moment.
@@ -72,6 +76,15 @@ impl LivePublisher {
         }
     }
 
+    /// Returns true if the axis has power, or will have it as soon as the drive follows the
+    /// Controlword.
+    fn has_power(axis: &AxisStatus) -> bool {
+        let command = Controlword::from_bits_retain(axis.controlword);
+        axis.powered
+            || axis.state.has_power()
+            || command.contains(Controlword::ENABLE_OPERATION_COMMAND)
+    }
+
     /// Sets the state that is requested from the devices.
     pub(crate) fn set_requested(&mut self, state: AlState) {
         self.requested = state;
@@ -85,6 +98,7 @@ impl LivePublisher {
             live.requested = requested.code();
             live.lost_frames = snapshot.counters.lost_frames;
             live.frames_per_second = rate.unwrap_or(live.frames_per_second);
+            live.power = snapshot.axes.iter().map(Self::has_power).collect();
             live.answering = snapshot.al_status.map_or(0, |(_, devices)| devices);
             live.devices
                 .resize(snapshot.diagnoses.len(), DeviceLive::default());

@@ -95,7 +95,7 @@ impl BoundGateway {
         let (status, published) = watch::channel(live::Live::default());
         let (end, ended) = oneshot::channel();
         let gateway = Arc::new(Gateway {
-            access: access::Access::new(machine, self.setup.write),
+            access: access::Access::new(machine, self.setup.write, published.clone()),
             dictionary: dictionary::Dictionary::new(
                 machine,
                 &bus.devices,

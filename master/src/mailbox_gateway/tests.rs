@@ -41,7 +41,7 @@ fn gateway(write: bool) -> (Arc<Gateway>, watch::Sender<Live>) {
     let (machine, mailboxes) = (machine(), Mailboxes::default());
     let (found, places) = (IndexVec::default(), IndexVec::default());
     let gateway = Gateway {
-        access: Access::new(&machine, write),
+        access: Access::new(&machine, write, published.clone()),
         dictionary: Dictionary::new(&machine, &found, &places, &mailboxes, published),
         mailboxes,
     };
@@ -204,6 +204,105 @@ fn long_lists_come_in_fragments_and_texts_end_at_a_character() {
     assert_eq!(text.entries[1].value, "äö".as_bytes());
     let text = Object::record(0x8000, "x".to_owned(), 3).string(3, "Name", 5, "äöü");
     assert_eq!(text.entries[1].value, "äö\0".as_bytes());
+}
+
+/// Returns the refusal of a request to the drive of the machine, which is its last device.
+fn refusal(gateway: &Gateway, request: &Request<'_>, in_transfer: bool) -> Option<RawMessage> {
+    let request = sdo(request);
+    let telegram = Telegram::parse(&request).unwrap();
+    let message = RawMessage {
+        channel: telegram.channel,
+        protocol: telegram.protocol,
+        body: telegram.body.to_vec(),
+    };
+    let access = &gateway.access;
+    access.refusal(DeviceIndex(5), &LAYOUT, &message, in_transfer)
+}
+
+#[test]
+fn with_power_a_drive_gets_no_write_that_moves_resets_or_limits_it() {
+    let (gateway, sender) = gateway(true);
+    let write = |index, sub, complete| {
+        let request = match complete {
+            false => Request::DownloadExpedited {
+                index,
+                sub,
+                data: &[1, 0, 0, 0],
+            },
+            true => Request::Download {
+                index,
+                sub,
+                complete,
+                size: 8,
+                data: &[1; 8],
+            },
+        };
+        let refusal = refusal(&gateway, &request, false)?;
+        // The abort names the object: 0x08000022, "in the present state".
+        let [low, high] = index.to_le_bytes();
+        assert_eq!(refusal.body[3..], [low, high, sub, 0x22, 0, 0, 8]);
+        Some(refusal)
+    };
+    let machine_objects = [
+        0x1010, 0x1011, 0x1023, 0x1f51, 0x2003, 0x6065, 0x6072, 0x607d, 0x607f, 0x6083, 0x6085,
+        0x6098, 0x605a, 0x6091, 0x60fe,
+    ];
+    let cycle_objects = [0x6040, 0x6060, 0x6071, 0x607a, 0x60ff, 0x60b0, 0x1c12];
+    // Before the first cycle, no axis is known to be without power.
+    for power in [None, Some(true), Some(false)] {
+        sender.send_modify(|live| live.power = power.into_iter().collect());
+        let refused = power != Some(false);
+        for index in machine_objects {
+            assert_eq!(write(index, 1, false).is_some(), refused, "{index:#x}");
+            assert_eq!(write(index, 0, true).is_some(), refused, "{index:#x}");
+        }
+        for index in cycle_objects {
+            assert!(write(index, 0, false).is_some(), "{index:#x}");
+        }
+        for index in [0x60f9, 0x1003] {
+            assert_eq!(write(index, 1, false), None, "{index:#x}");
+        }
+        // Complete access to a record of which one element is a command.
+        assert_eq!(write(0x60c4, 1, true).is_some(), refused);
+        let segment = Request::DownloadSegment {
+            toggle: false,
+            last: true,
+            data: &[1; 7],
+        };
+        assert_eq!(refusal(&gateway, &segment, true).is_some(), refused);
+        for reads in [
+            Request::Upload {
+                index: 0x6065,
+                sub: 0,
+                complete: false,
+            },
+            Request::Information {
+                opcode: 1,
+                body: &[1, 0],
+            },
+        ] {
+            assert_eq!(refusal(&gateway, &reads, false), None);
+        }
+        for (protocol, body) in [
+            (TYPE_FOE, &b"\x02\0\0\0\0\0firmware"[..]),
+            (TYPE_SOE, &[3, 0, 1, 0, 1, 2]),
+            (1, &[0; 8]),
+            (2, &[0; 8]),
+            (15, &[0; 8]),
+        ] {
+            let message = RawMessage {
+                channel: 0,
+                protocol,
+                body: body.to_vec(),
+            };
+            let access = &gateway.access;
+            let drive = access.refusal(DeviceIndex(5), &LAYOUT, &message, false);
+            assert_eq!(drive.is_some(), refused, "{protocol}");
+            // A terminal moves nothing.
+            let terminal = access.refusal(DeviceIndex(2), &LAYOUT, &message, false);
+            assert_eq!(terminal, None, "{protocol}");
+        }
+    }
 }
 
 #[test]

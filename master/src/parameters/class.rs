@@ -37,6 +37,13 @@ impl Class {
         Self::Log,
     ];
 
+    /// Returns true if a write is possible while an axis of the device has power: it moves and
+    /// resets nothing, and changes neither limits, units nor the meaning of positions.
+    #[must_use]
+    pub const fn is_written_with_power(self) -> bool {
+        matches!(self, Self::Tuned | Self::Log)
+    }
+
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -488,6 +495,34 @@ mod tests {
             assert_eq!(classify(vendor, at, name).0, class, "{vendor:#x} {at}");
         }
         assert!(VENDORS.is_sorted_by_key(|(id, _)| *id));
+    }
+
+    #[test]
+    fn with_power_only_tuning_and_records_are_written() {
+        for (vendor, index, written) in [
+            (0x1234_5678, 0x1010, false),
+            (0x1234_5678, 0x1011, false),
+            (0x1234_5678, 0x1f51, false),
+            (0x1234_5678, 0x6040, false),
+            (0x1234_5678, 0x6060, false),
+            (0x1234_5678, 0x6065, false),
+            (0x1234_5678, 0x6071, false),
+            (0x1234_5678, 0x6072, false),
+            (0x1234_5678, 0x607a, false),
+            (0x1234_5678, 0x607d, false),
+            (0x1234_5678, 0x607f, false),
+            (0x1234_5678, 0x60ff, false),
+            (0x1234_5678, 0x6865, false),
+            (0x1234_5678, 0x2000, false),
+            (0x1234_5678, 0x60f9, true),
+            (0x1234_5678, 0x1003, true),
+            (0xfb, 0x30a1, true),
+            (0xfb, 0x3001, false),
+        ] {
+            let at = NamedObject { index, sub: 0 };
+            let class = classify(vendor, at, "").0;
+            assert_eq!(class.is_written_with_power(), written, "{vendor:#x} {at}");
+        }
     }
 
     #[test]

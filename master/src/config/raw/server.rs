@@ -22,7 +22,8 @@ table! { "[mailbox_gateway]",
     table RawMailboxGateway {
         /// IP address and port of UDP and TCP (text; default `"127.0.0.1:34980"`)
         bind: Key<String>,
-        /// Clients may write objects and files (`true`, `false`; default `false`)
+        /// Clients may write objects and files; to a drive with power, only gains and records
+        /// (`true`, `false`; default `false`)
         write: Key<bool>,
     }
 }
