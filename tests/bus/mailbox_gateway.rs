@@ -408,8 +408,14 @@ fn tcp_clients_are_served_up_to_their_limit() {
         for client in &mut clients {
             answered(client, 1);
         }
+        // Mailbox error 7: no memory.
         let mut turned_away = connect();
-        assert_eq!(turned_away.read(&mut [0; 10]).unwrap_or(0), 0);
+        turned_away.write_all(&request).unwrap();
+        let mut answer = Vec::new();
+        turned_away.read_to_end(&mut answer).unwrap();
+        assert_eq!(answer[8..], [1, 0, 7, 0]);
+        let mut silent = connect();
+        assert_eq!(silent.read(&mut [0; 10]).unwrap_or(0), 0);
 
         // Frames may come together and in pieces.
         let first = clients.first_mut().unwrap();

@@ -52,6 +52,8 @@ pub const TYPE_VOE: u8 = 15;
 pub const ERROR_UNSUPPORTED_PROTOCOL: u16 = 2;
 /// The code of a mailbox error reply: the service is not supported.
 pub const ERROR_SERVICE: u16 = 4;
+/// The code of a mailbox error reply: no memory for the message.
+pub const ERROR_MEMORY: u16 = 7;
 /// The code of a mailbox error reply: the lengths contradict each other.
 pub const ERROR_SIZE: u16 = 8;
 

@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use ecaxis_ecat::mailbox::abort_code;
 use ecaxis_ecat::mailbox::gateway::Telegram;
-use ecaxis_ecat::mailbox::{TYPE_COE, coe};
+use ecaxis_ecat::mailbox::{ERROR_MEMORY, TYPE_COE, coe};
 use tokio::time::Instant;
 
 use super::Gateway;
-use super::access::sdo_abort;
+use super::access::{mailbox_error, sdo_abort};
 use crate::mailbox::{MailboxError, MailboxSession, RawAnswer, RawMessage};
 
 /// How long a device stays reserved for the next message of a transfer.
@@ -23,6 +23,30 @@ pub(super) struct Client {
     gateway: Arc<Gateway>,
     /// The devices with a transfer of this client, and when they are free again.
     held: HashMap<u16, (MailboxSession, Instant)>,
+}
+
+/// Returns the frame with an answer to a request.
+fn frame_of(request: &Telegram<'_>, answer: &RawMessage) -> Vec<u8> {
+    let mut frame = Vec::new();
+    let answer = Telegram {
+        // Devices may leave the address empty, and have a counter of their own.
+        station: request.station,
+        counter: request.counter,
+        channel: answer.channel,
+        protocol: answer.protocol,
+        body: &answer.body,
+    };
+    answer.emit_frame(&mut frame);
+    frame
+}
+
+/// Returns the frame that tells a client that there are too many; empty for a damaged request.
+pub(super) fn refusal(frame: &[u8]) -> Vec<u8> {
+    let request = Telegram::parse(frame);
+    request.map_or_else(
+        |_| Vec::new(),
+        |request| frame_of(&request, &mailbox_error(ERROR_MEMORY)),
+    )
 }
 
 impl Client {
@@ -59,19 +83,7 @@ impl Client {
             MAIN_DEVICE => self.gateway.answer(&message),
             station => self.forward(station, message).await,
         };
-        let frames = answers.iter().map(|answer| {
-            let mut frame = Vec::new();
-            let answer = Telegram {
-                // Devices may leave the address empty, and have a counter of their own.
-                station: telegram.station,
-                counter: telegram.counter,
-                channel: answer.channel,
-                protocol: answer.protocol,
-                body: &answer.body,
-            };
-            answer.emit_frame(&mut frame);
-            frame
-        });
+        let frames = answers.iter().map(|answer| frame_of(&telegram, answer));
         frames.collect()
     }
 

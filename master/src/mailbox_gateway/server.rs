@@ -13,10 +13,14 @@ use tokio::sync::{Semaphore, mpsc};
 use tokio::time::{Instant, sleep_until, timeout};
 
 use super::Gateway;
-use super::client::Client;
+use super::client::{self, Client};
 
-/// The maximum number of TCP connections; further ones are closed at once.
+/// The maximum number of TCP connections; further ones get an error as the answer to their first
+/// request.
 pub(super) const TCP_CLIENTS: usize = 16;
+/// The further connections that may wait for that answer, and for how long.
+const REFUSALS: usize = 16;
+const REFUSAL: Duration = Duration::from_secs(1);
 /// The maximum number of UDP clients with a request in progress; requests of further ones are
 /// dropped.
 const UDP_CLIENTS: usize = 64;
@@ -42,6 +46,7 @@ pub(super) async fn serve(
 
 async fn serve_tcp(gateway: &Arc<Gateway>, listener: TcpListener) {
     let places = Arc::new(Semaphore::new(TCP_CLIENTS));
+    let refusals = Arc::new(Semaphore::new(REFUSALS));
     loop {
         let Ok((stream, address)) = listener.accept().await else {
             tokio::time::sleep(RETRY).await;
@@ -49,6 +54,12 @@ async fn serve_tcp(gateway: &Arc<Gateway>, listener: TcpListener) {
         };
         let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
             tracing::debug!(%address, "too many clients of the mailbox gateway");
+            if let Ok(place) = Arc::clone(&refusals).try_acquire_owned() {
+                tokio::spawn(async move {
+                    let _ = timeout(REFUSAL, refuse_connection(stream)).await;
+                    drop(place);
+                });
+            }
             continue;
         };
         let client = Client::new(gateway);
@@ -58,6 +69,22 @@ async fn serve_tcp(gateway: &Arc<Gateway>, listener: TcpListener) {
             drop(place);
         });
     }
+}
+
+/// Answers the first request with an error, and closes the connection.
+async fn refuse_connection(mut stream: TcpStream) -> io::Result<()> {
+    let mut received = Vec::new();
+    let length = loop {
+        if let Some(length) = next_frame(&received)? {
+            break length;
+        }
+        if stream.read_buf(&mut received).await? == 0 {
+            return Ok(());
+        }
+    };
+    let refusal = client::refusal(received.get(..length).unwrap_or_default());
+    stream.write_all(&refusal).await?;
+    stream.shutdown().await
 }
 
 async fn serve_connection(mut stream: TcpStream, mut client: Client) -> io::Result<()> {
