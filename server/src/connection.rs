@@ -9,7 +9,7 @@ use ecaxis_ecat::index::AxisIndex;
 use ecaxis_master::samples::Samples;
 use serde_json::{Map, Value, json};
 use tokio::sync::broadcast::error::RecvError;
-use tokio::sync::{Semaphore, mpsc};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::time::{Interval, MissedTickBehavior, interval};
 
 use crate::client::{Answer, Client};
@@ -21,6 +21,8 @@ use crate::tokens::Tokens;
 
 /// The messages that may wait for a slow reader.
 const OUTGOING: usize = 32;
+/// The bytes of memory that the waiting messages of a client may have.
+const BUDGET: usize = 1 << 20;
 /// The requests whose answers may wait: for an outcome, or for a slow reader.
 const WAITING: usize = 256;
 /// With more messages waiting, the client gets no state and no samples.
@@ -30,12 +32,72 @@ const BATCH: u64 = 4096;
 /// The values of one batch: 256 KB.
 const BATCH_VALUES: u64 = 1 << 15;
 
+/// A message that waits for its client, and its part of the budget.
+pub type Waiting = (Outgoing, OwnedSemaphorePermit);
+
+/// Takes messages to a client, as fast as it reads them.
+#[derive(Debug, Clone)]
+struct Queue {
+    messages: mpsc::Sender<Waiting>,
+    budget: Arc<Semaphore>,
+}
+
+impl Queue {
+    fn new() -> (Self, mpsc::Receiver<Waiting>) {
+        let (messages, receiver) = mpsc::channel(OUTGOING);
+        let budget = Arc::new(Semaphore::new(BUDGET));
+        (Self { messages, budget }, receiver)
+    }
+
+    /// Adds a message once there is room for it. False if the client has left.
+    async fn send(&self, message: Outgoing) -> bool {
+        let bytes = message.bytes().min(BUDGET) as u32;
+        let Ok(room) = Arc::clone(&self.budget).acquire_many_owned(bytes).await else {
+            return false;
+        };
+        self.messages.send((message, room)).await.is_ok()
+    }
+
+    /// Returns whether a slow client gets neither states nor samples.
+    fn is_behind(&self) -> bool {
+        self.messages.max_capacity() - self.messages.capacity() > BACKLOG
+    }
+}
+
 /// A message to the client.
 #[derive(Debug)]
 pub enum Outgoing {
     Answer(Answer),
     Object(Map<String, Value>),
     Samples(Batch),
+}
+
+impl Outgoing {
+    /// Returns about how much memory the message has.
+    fn bytes(&self) -> usize {
+        match self {
+            Self::Answer(Answer { body, .. }) | Self::Object(body) => bytes_of_map(body),
+            Self::Samples(batch) => {
+                let columns = 2 + batch.signals.len();
+                columns * batch.rows.len() * size_of::<u64>()
+            }
+        }
+    }
+}
+
+fn bytes_of_map(map: &Map<String, Value>) -> usize {
+    let entry = |(key, value): (&String, &Value)| key.len() + size_of::<String>() + bytes_of(value);
+    map.iter().map(entry).sum()
+}
+
+fn bytes_of(value: &Value) -> usize {
+    let inner = match value {
+        Value::String(text) => text.len(),
+        Value::Array(values) => values.iter().map(bytes_of).sum(),
+        Value::Object(map) => bytes_of_map(map),
+        Value::Null | Value::Bool(_) | Value::Number(_) => 0,
+    };
+    size_of::<Value>() + inner
 }
 
 /// Rows of some signals.
@@ -179,7 +241,7 @@ enum Change {
 pub struct Connection {
     client: Arc<Client>,
     changes: mpsc::UnboundedSender<Change>,
-    outgoing: mpsc::Sender<Outgoing>,
+    outgoing: Queue,
     waiting: Arc<Semaphore>,
     tokens: Option<Arc<Tokens>>,
 }
@@ -190,8 +252,8 @@ impl Connection {
     pub fn start(
         client: Arc<Client>,
         tokens: Option<Arc<Tokens>>,
-    ) -> (Self, mpsc::Receiver<Outgoing>) {
-        let (outgoing, receiver) = mpsc::channel(OUTGOING);
+    ) -> (Self, mpsc::Receiver<Waiting>) {
+        let (outgoing, receiver) = Queue::new();
         let (changes, changed) = mpsc::unbounded_channel();
         tokio::spawn(publish(Arc::clone(&client), changed, outgoing.clone()));
         let connection = Self {
@@ -345,7 +407,7 @@ impl Connection {
 async fn publish(
     client: Arc<Client>,
     mut changes: mpsc::UnboundedReceiver<Change>,
-    outgoing: mpsc::Sender<Outgoing>,
+    outgoing: Queue,
 ) {
     let hub = Arc::clone(&client.hub);
     drop(client);
@@ -412,19 +474,19 @@ async fn publish(
                 for (axis, last) in &mut subscription.axes {
                     let point = hub.setpoint(*axis).filter(|point| point.at_ns != *last);
                     let Some(point) = point else { continue };
-                    if outgoing.max_capacity() - outgoing.capacity() > BACKLOG {
+                    if outgoing.is_behind() {
                         break;
                     }
                     *last = point.at_ns;
                     let message = Outgoing::Object(setpoints_event(&hub, *axis, &point));
-                    if outgoing.send(message).await.is_err() {
+                    if !outgoing.send(message).await {
                         return;
                     }
                 }
                 continue;
             }
             () = tick(&mut states) => {
-                if outgoing.max_capacity() - outgoing.capacity() > BACKLOG {
+                if outgoing.is_behind() {
                     continue;
                 }
                 let mut object = match state::state(&hub) {
@@ -436,7 +498,7 @@ async fn publish(
             }
             () = tick(&mut samples) => {
                 let Some(subscription) = &mut samples else { continue };
-                if outgoing.max_capacity() - outgoing.capacity() > BACKLOG {
+                if outgoing.is_behind() {
                     continue;
                 }
                 let columns = subscription.words.len().max(1) as u64;
@@ -451,7 +513,7 @@ async fn publish(
                 Outgoing::Samples(batch)
             }
         };
-        if outgoing.send(message).await.is_err() {
+        if !outgoing.send(message).await {
             return;
         }
     }
@@ -509,5 +571,50 @@ async fn tick<T: Timer>(timer: &mut Option<T>) {
             timer.timer().tick().await;
         }
         None => std::future::pending().await,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn messages_of_a_client_that_does_not_read_have_a_budget() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build();
+        runtime.expect("a runtime").block_on(async {
+            let (queue, mut receiver) = Queue::new();
+            let message = |bytes: usize| {
+                let mut object = Map::new();
+                object.insert("text".to_owned(), json!("x".repeat(bytes)));
+                Outgoing::Object(object)
+            };
+            let mut sent = 0;
+            let mut now = |bytes: usize| {
+                let queue = queue.clone();
+                let message = message(bytes);
+                let send = tokio::spawn(async move { queue.send(message).await });
+                async move {
+                    tokio::task::yield_now().await;
+                    send.is_finished()
+                }
+            };
+            while now(BUDGET / 4).await {
+                sent += 1;
+            }
+            assert_eq!(sent, 3);
+            // A larger message than the budget waits for all others, and later ones keep their order.
+            assert!(!now(2 * BUDGET).await);
+            assert!(!now(1).await);
+            let mut lengths = Vec::new();
+            for _ in 0..6 {
+                let (message, _room) = receiver.recv().await.expect("a message");
+                let Outgoing::Object(object) = message else {
+                    panic!("an object")
+                };
+                lengths.push(object["text"].as_str().map_or(0, str::len));
+            }
+            let quarter = BUDGET / 4;
+            assert_eq!(lengths, [quarter, quarter, quarter, quarter, 2 * BUDGET, 1]);
+        });
     }
 }

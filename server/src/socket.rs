@@ -15,7 +15,7 @@ use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::{Semaphore, mpsc};
 
 use crate::client::{Answer, Client};
-use crate::connection::{Connection, Outgoing};
+use crate::connection::{Connection, Outgoing, Waiting};
 use crate::error::{ErrorCode, OpError};
 use crate::hub::Hub;
 
@@ -160,8 +160,8 @@ async fn read(stream: &UnixStream, connection: &Connection) {
     }
 }
 
-async fn write(stream: Arc<UnixStream>, mut outgoing: mpsc::Receiver<Outgoing>, hub: Arc<Hub>) {
-    while let Some(message) = outgoing.recv().await {
+async fn write(stream: Arc<UnixStream>, mut outgoing: mpsc::Receiver<Waiting>, hub: Arc<Hub>) {
+    while let Some((message, _room)) = outgoing.recv().await {
         let sent = match message {
             Outgoing::Answer(Answer {
                 body,

@@ -73,15 +73,18 @@ async fn serve(socket: WebSocket, client: Arc<Client>, tokens: Option<Arc<Tokens
     let write = async {
         let mut ping = tokio::time::interval(PING);
         loop {
-            let frame = tokio::select! {
+            let (frame, _room) = tokio::select! {
                 message = outgoing.recv() => match message {
-                    Some(Outgoing::Answer(Answer { body, .. }) | Outgoing::Object(body)) => {
-                        Message::Text(serde_json::to_string(&body).unwrap_or_default().into())
+                    Some((Outgoing::Answer(Answer { body, .. }) | Outgoing::Object(body), room)) => {
+                        let text = serde_json::to_string(&body).unwrap_or_default();
+                        (Message::Text(text.into()), Some(room))
                     }
-                    Some(Outgoing::Samples(batch)) => Message::Binary(batch.frame().into()),
+                    Some((Outgoing::Samples(batch), room)) => {
+                        (Message::Binary(batch.frame().into()), Some(room))
+                    }
                     None => return,
                 },
-                _ = ping.tick() => Message::Ping(Bytes::new()),
+                _ = ping.tick() => (Message::Ping(Bytes::new()), None),
             };
             if sink.send(frame).await.is_err() {
                 return;
