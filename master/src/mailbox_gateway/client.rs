@@ -40,7 +40,7 @@ fn frame_of(request: &Telegram<'_>, answer: &RawMessage) -> Vec<u8> {
     frame
 }
 
-/// Returns the frame that tells a client that there are too many; empty for a damaged request.
+/// Returns the error that answers a request beyond the limit; empty for a damaged request.
 pub(super) fn refusal(frame: &[u8]) -> Vec<u8> {
     let request = Telegram::parse(frame);
     request.map_or_else(
