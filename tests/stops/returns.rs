@@ -12,7 +12,9 @@ use ecaxis_master::session::{
 };
 use ecaxis_sim::Segment;
 use ecaxis_test_support::wire::{WatchedBus, Watcher};
-use ecaxis_test_support::{Heard, axes, faults, machine, run, virtual_time};
+use ecaxis_test_support::{
+    Heard, assert_contains, axes, faults, machine, run, run_badly, virtual_time,
+};
 
 /// Drives in a line, each in a group of its own that the others survive.
 pub fn line(count: usize, steps: &str) -> Machine {
@@ -532,14 +534,18 @@ fn drives_come_and_go_without_any_effect_on_the_others() {
 }
 
 /// I/O and a drive with SYNC0, whose pulses no other device has.
-fn io_and_drive([io, drive]: [u8; 2], more: &str) -> Machine {
-    machine(&format!(
+fn io_and_drive(positions: [u8; 2], more: &str) -> Machine {
+    machine(&io_and_drive_text(positions, more))
+}
+
+fn io_and_drive_text([io, drive]: [u8; 2], more: &str) -> String {
+    format!(
         "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n\
          [[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = {io}\n\
          [[device]]\nname = \"a\"\nesi = \"esi/EPOS4.xml\"\nposition = {drive}\nmode = \"csp\"\n\
          [device.axis]\nencoder = 2000\nlimits = {{ velocity = 50.0, acceleration = 500.0 }}\n\
          {more}"
-    ))
+    )
 }
 
 /// A lost device that must not return was reported as one that the file does not have, and its port
@@ -584,4 +590,63 @@ fn group_without_axes_returns_by_itself() {
     assert_eq!(names, ["io"], "{warnings:?}");
     let released = |progress: &Progress| matches!(progress, Progress::GroupReleased { .. });
     assert_eq!(heard.0.iter().filter(|p| released(p)).count(), 1);
+}
+
+/// A device without process data changes no working counter. The loss of a coupler stopped the whole
+/// machine, whatever its group said.
+#[test]
+fn device_without_process_data_leaves_and_returns_with_its_group_alone() {
+    let coupler = |place: &str| {
+        format!(
+            "\n[[device]]\nname = \"coupler\"\nesi = \"esi/terminals.xml\"\ntype = \"CP0\"\n{place}\n"
+        )
+    };
+    let group = |devices: &str| {
+        format!("\n[[stop.group]]\nname = \"g\"\ndevices = {devices}\noutside = \"continue\"\n")
+    };
+    let steps = "[[step]]\nmove = { a = 60.0 }\n[[step]]\nmove = { a = 0.0 }\n";
+    let off = |device| {
+        format!(
+            "[[fault]]\nkind = \"power-off\"\ndevice = {device}\nat = \"500ms\"\nfor = \"300ms\"\n"
+        )
+    };
+    let absent = "[[fault]]\nkind = \"absent\"\ndevice = 2\nfor = \"1s\"\n".to_owned();
+    let optional = "alias = 7\noptional = true\nsim = { after = \"io\" }";
+    let rows = [
+        ("position = 2", "[\"coupler\"]", off(2), 1),
+        ("position = 2", "[\"coupler\", \"io\"]", off(2), 1),
+        // An optional device without power may leave.
+        (optional, "[\"coupler\"]", off(2), 0),
+        (optional, "[\"coupler\"]", absent, 0),
+    ];
+    for (place, devices, fault, stops) in rows {
+        for exchange in ["same-cycle", "pipelined"] {
+            let more = coupler(place) + &group(devices) + steps;
+            let text = io_and_drive_text([1, 0], &more).replacen(
+                "cycle =",
+                &format!("exchange = \"{exchange}\"\ncycle ="),
+                1,
+            );
+            let what = format!("{place}, {devices}, {fault}, {exchange}");
+            let (outcome, heard) = run(machine(&text), faults(&fault));
+            let warnings = heard.warnings();
+            outcome
+                .result
+                .unwrap_or_else(|error| panic!("{what}: {error}; {warnings:?}"));
+            let names: Vec<_> = returned(&heard).into_iter().map(|found| found.0).collect();
+            assert_eq!(names, ["coupler"], "{what}: {warnings:?}");
+            let released = |progress: &Progress| matches!(progress, Progress::GroupReleased { .. });
+            assert_eq!(heard.0.iter().filter(|p| released(p)).count(), 1, "{what}");
+            let summary = outcome.summary.expect("a summary");
+            let causes: Vec<_> = summary.group_stops.iter().map(|stop| &stop.cause).collect();
+            assert_eq!(causes.len(), stops, "{what}: {causes:?}");
+            for cause in causes {
+                assert_contains(cause, &["`coupler`", "no longer answers"]);
+            }
+        }
+    }
+    // Without a group, the machine stops.
+    let text = io_and_drive_text([1, 0], &(coupler("position = 2") + steps));
+    let (error, _) = run_badly(machine(&text), faults(&off(2)));
+    assert_contains(&error, &["`coupler`", "no longer answers"]);
 }

@@ -7,40 +7,12 @@ use super::problem::{Problems, Span};
 use super::roles::OwnerKind;
 use super::{GroupStopScope, Machine, StopGroup};
 
-/// Reports groups whose loss stops the machine all the same, and outputs that would come on by
-/// themselves. `spans`: the places of the devices by their names.
+/// Reports outputs that would come on by themselves. `spans`: the places of the devices by their names.
 pub(super) fn check(machine: &Machine, spans: &[(String, Span)], p: &mut Problems<'_>) {
     let groups = machine.stop.groups.iter();
     for group in groups.filter(|group| group.outside == GroupStopScope::Continue) {
-        without_process_data(machine, group, spans, p);
         without_reset(machine, group, spans, p);
     }
-}
-
-/// A missing device is found by the working counter of its group. One without process data changes
-/// none.
-fn without_process_data(
-    machine: &Machine,
-    group: &StopGroup,
-    spans: &[(String, Span)],
-    p: &mut Problems<'_>,
-) {
-    let exchanges = |device: &DeviceIndex| {
-        let layout = &machine.devices[*device].selection.layout;
-        layout.rx_bytes() + layout.tx_bytes() > 0
-    };
-    let Some(first) = group.devices.first() else {
-        return;
-    };
-    if group.devices.iter().any(exchanges) {
-        return;
-    }
-    let message = format!(
-        "group `{}` has no process data, so the machine stops without `{}`",
-        group.name, machine.devices[*first].name
-    );
-    let hint = "add a device with process data to the group, or write `outside = \"stop\"`";
-    p.add_hint(place(machine, *first, spans), message, hint);
 }
 
 /// Without axes there is no reset after which outputs follow a position or an input again.

@@ -12,6 +12,8 @@ pub const OP: u8 = AlState::Op.code();
 /// Cycles for which the AL status may differ before the machine stops: one lost broadcast is not a
 /// fault.
 const AL_CYCLES: u32 = 2;
+/// Reads in a row that a device leaves unanswered before it counts as missing.
+const MISSED_READS: u32 = 2;
 
 /// The cause of a stop.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -84,8 +86,15 @@ pub struct BusMonitor {
     missing: IndexVec<DeviceIndex, u32>,
     /// Cycles in which AL status was wrong and no group's working counter identified the device.
     al: u32,
-    /// Cycles in which fewer SubDevices answered than the working counters explain.
+    /// Cycles in which fewer SubDevices answered than the working counters and the reads of single
+    /// devices explain.
     absent: u32,
+    /// The reads of each device's AL status that it did not answer.
+    missed: IndexVec<DeviceIndex, MissedReads>,
+    /// True while a device is searched that does not answer.
+    searches: bool,
+    /// The cycles so far in which the frame with AL status returned.
+    cycles: u64,
     al_status: u8,
     /// The group of each device.
     group_of: IndexVec<DeviceIndex, GroupIndex>,
@@ -95,6 +104,16 @@ pub struct BusMonitor {
     judges_each: bool,
     /// Cycles until an AL status that no device is found for stops the machine.
     al_cycles: u32,
+    /// Cycles until a missing answer that no device is found for stops the machine.
+    absent_cycles: u32,
+}
+
+/// The reads of one device's AL status since its last answer.
+#[derive(Debug, Clone, Copy, Default)]
+struct MissedReads {
+    count: u32,
+    /// The cycle of the first one.
+    since: u64,
 }
 
 #[derive(Debug, Clone, Copy, Default)]
@@ -105,6 +124,8 @@ struct GroupCounters {
     bad: u32,
     /// Cycles in which both AL status and the group's working counter were wrong.
     al: u32,
+    /// True while one of its devices answers no read of its AL status.
+    absent: bool,
     last: GroupResult,
 }
 
@@ -116,26 +137,33 @@ impl BusMonitor {
     pub fn new(lost_frames: u32, groups: &[GroupIndex]) -> Self {
         // The first group exists even without SubDevices.
         let count = groups.iter().max().map_or(1, |last| last.0 + 1);
+        let lost_frames = lost_frames.max(1);
+        // Each device is asked once, one every other cycle; answers take two cycles.
+        let devices = u32::try_from(groups.len()).unwrap_or(u32::MAX);
+        let search = devices.saturating_mul(2).saturating_add(2);
         let mut watches = IndexVec::from(vec![GroupCounters::default(); count]);
         for &group in groups {
             watches[group].devices = watches[group].devices.saturating_add(1);
         }
         Self {
-            lost_frames: lost_frames.max(1),
+            lost_frames,
             groups: watches,
             missing: vec![0; groups.len()].into(),
             al: 0,
             absent: 0,
+            missed: vec![MissedReads::default(); groups.len()].into(),
+            searches: false,
+            cycles: 0,
             al_status: OP,
             group_of: groups.to_vec().into(),
             judges_each: false,
             al_cycles: match count {
                 1 => AL_CYCLES,
-                // Each device is asked once, one every other cycle; answers take two cycles.
-                _ => {
-                    let devices = u32::try_from(groups.len()).unwrap_or(u32::MAX);
-                    devices.saturating_mul(2).saturating_add(2 + AL_CYCLES)
-                }
+                _ => search.saturating_add(AL_CYCLES),
+            },
+            absent_cycles: match count {
+                1 => lost_frames,
+                _ => lost_frames.saturating_add(search.saturating_mul(MISSED_READS)),
             },
         }
     }
@@ -150,9 +178,28 @@ impl BusMonitor {
     #[must_use]
     pub fn al_status_polls(&self) -> AlStatusPolls {
         match (self.judges_each(), self.al) {
+            _ if self.searches => AlStatusPolls::Only,
             (false, _) => AlStatusPolls::InTurn,
             (true, 0) => AlStatusPolls::EveryOther,
             (true, _) => AlStatusPolls::Only,
+        }
+    }
+
+    /// Takes whether a device has answered the read of its AL status, before
+    /// [`BusMonitor::update`] of the same cycle. RT.
+    pub fn take_read(&mut self, device: DeviceIndex, answered: bool) {
+        if let Some(missed) = self.missed.get_mut(device) {
+            *missed = match (answered, missed.count) {
+                (true, _) => MissedReads::default(),
+                (false, 0) => MissedReads {
+                    count: 1,
+                    since: self.cycles,
+                },
+                (false, count) => MissedReads {
+                    count: count.saturating_add(1),
+                    ..*missed
+                },
+            };
         }
     }
 
@@ -202,6 +249,8 @@ impl BusMonitor {
             return;
         };
         self.al_status = status;
+        self.cycles += 1;
+        let unanswered = self.find_absent();
         let devices = |groups: &mut dyn Iterator<Item = &GroupCounters>| -> u16 {
             groups.map(|g| g.devices).fold(0, u16::saturating_add)
         };
@@ -227,20 +276,46 @@ impl BusMonitor {
         } else {
             0
         };
-        // A missing answer counts as a lost frame until the limit is reached.
+        // A missing answer counts as a lost frame until the limit is reached. A device without process
+        // data is found by its own reads.
+        let accounted = answering >= expected.saturating_sub(bad.saturating_add(unanswered));
         self.absent = if accounted {
             0
         } else {
             self.absent.saturating_add(1)
         };
+        self.searches |= self.absent > 0 && self.groups.len() > 1;
+    }
+
+    /// Marks the groups with a device that answers no read. Returns the number of devices that have
+    /// not answered their last read although the working counter of their group is right. RT:
+    /// O(groups + devices).
+    fn find_absent(&mut self) -> u16 {
+        let mut unanswered: u16 = 0;
+        self.searches = false;
+        for watch in &mut self.groups {
+            watch.absent = false;
+        }
+        for (missed, &group) in self.missed.iter().zip(&self.group_of) {
+            let Some(watch) = self.groups.get_mut(group).filter(|_| missed.count > 0) else {
+                continue;
+            };
+            let lasts = self.cycles.saturating_sub(missed.since) >= u64::from(self.lost_frames);
+            let absent = missed.count >= MISSED_READS && lasts;
+            watch.absent |= absent;
+            self.searches |= !absent;
+            unanswered = unanswered.saturating_add(u16::from(watch.bad == 0));
+        }
+        self.searches &= self.groups.len() > 1;
+        unanswered
     }
 
     /// Returns the cause to stop the whole machine: SubDevices left Op or do not answer, and neither a
-    /// working counter nor its own AL status identifies them.
+    /// working counter nor a read of their own AL status identifies them.
     #[must_use]
     pub fn left_op(&self) -> Option<StopCause> {
         let al_status = self.al_status;
-        let left = self.al >= self.al_cycles || self.absent >= self.lost_frames;
+        let left = self.al >= self.al_cycles || self.absent >= self.absent_cycles;
         left.then_some(StopCause::LeftOp { al_status })
     }
 
@@ -262,7 +337,7 @@ impl BusMonitor {
             });
         }
         let al_status = self.al_status;
-        (watch.al >= AL_CYCLES).then_some(StopCause::LeftOp { al_status })
+        (watch.al >= AL_CYCLES || watch.absent).then_some(StopCause::LeftOp { al_status })
     }
 
     /// True once the device has been missing for too long: it may not receive its outputs.
@@ -374,6 +449,72 @@ mod tests {
             let found = [0, 1, 2].map(|group| guard.lost(GroupIndex(group)));
             assert_eq!((found, guard.left_op()), (groups, machine), "{al:?}");
         }
+    }
+
+    /// A device without process data changes no working counter: it is missing once it answers no
+    /// read of its own. The machine stopped although its group may stop alone.
+    #[test]
+    fn device_without_process_data_stops_its_group_alone() {
+        let groups = [0, 1, 2].map(GroupIndex);
+        let mut guard = BusMonitor::new(3, &groups);
+        let lost = |guard: &BusMonitor| groups.map(|group| guard.lost(group));
+        let left = Some(StopCause::LeftOp { al_status: OP });
+        let mut stopped = [None; 3];
+        for cycle in 0..200 {
+            // One read every other cycle; the group of device 1 has stopped once it is missing.
+            if cycle % 2 == 0 {
+                let device = cycle / 2 % 3;
+                guard.take_read(DeviceIndex(device), device != 1);
+            }
+            let any_stopped = stopped[1].is_some();
+            guard.update(&answer(Some((OP, 2))), &[GOOD; 3], &[], any_stopped);
+            stopped = lost(&guard);
+            if stopped[1].is_none() {
+                assert_eq!(guard.al_status_polls(), AlStatusPolls::Only);
+            }
+            assert_eq!(guard.left_op(), None, "cycle {cycle}");
+            assert_eq!((stopped[0], stopped[2]), (None, None));
+            // The second read of device 1.
+            assert_eq!(stopped[1], left.filter(|_| cycle >= 8), "cycle {cycle}");
+        }
+        // Device 2 is missing as well.
+        for cycle in 0..200 {
+            if cycle % 2 == 0 {
+                let device = cycle / 2 % 3;
+                guard.take_read(DeviceIndex(device), device == 0);
+            }
+            guard.update(&answer(Some((OP, 1))), &[GOOD; 3], &[], true);
+            assert_eq!(guard.left_op(), None, "cycle {cycle}");
+        }
+        assert_eq!(lost(&guard), [None, left, left]);
+        for device in 0..3 {
+            guard.take_read(DeviceIndex(device), true);
+        }
+        guard.update(&answer(Some((OP, 3))), &[GOOD; 3], &[], true);
+        assert_eq!(lost(&guard), [None; 3]);
+    }
+
+    /// A device that misses fewer cycles than the limit stops nothing, and one that no read finds
+    /// stops the machine.
+    #[test]
+    fn missing_answers_stop_the_machine_if_no_read_finds_the_device() {
+        let groups = [0, 1].map(GroupIndex);
+        let mut guard = BusMonitor::new(20, &groups);
+        for device in [1, 0, 1, 0] {
+            guard.take_read(DeviceIndex(device), device == 0);
+            guard.update(&answer(Some((OP, 1))), &[GOOD; 2], &[], false);
+            assert_eq!(groups.map(|group| guard.lost(group)), [None; 2]);
+        }
+        guard.take_read(DeviceIndex(1), true);
+        let mut cycles = 0;
+        while guard.left_op().is_none() {
+            guard.take_read(DeviceIndex(cycles % 2), true);
+            guard.update(&answer(Some((OP, 1))), &[GOOD; 2], &[], false);
+            cycles += 1;
+            assert!(cycles < 100, "never found");
+        }
+        assert!(cycles >= 20, "{cycles}");
+        assert_eq!(groups.map(|group| guard.lost(group)), [None; 2]);
     }
 
     /// A stopped group and a device that is not in the file need not be in Op. Another device that

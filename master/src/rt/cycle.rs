@@ -328,6 +328,9 @@ impl Engine {
         let stopped =
             |group: &ReactionGroup| group.stop().is_some_and(|stop| stop.cause.is_failure());
         let any_stopped = self.groups.iter().any(stopped);
+        if let Some((device, answered)) = self.exchange.al_status_read() {
+            self.guard.take_read(device, answered);
+        }
         self.guard
             .update(&self.answer, groups, devices, any_stopped);
         let each = self.guard.judges_each();
@@ -335,8 +338,7 @@ impl Engine {
             let groups = &self.groups;
             self.guard.update_each(
                 |group| groups.get(group).is_some_and(stopped),
-                (self.exchange.diagnoses().iter())
-                    .map(|found| found.answers.then_some(found.al_status)),
+                (self.exchange.diagnoses().iter()).map(SubDeviceDiagnostics::current_al_status),
             );
         }
         self.exchange.poll_al_status(self.guard.al_status_polls());

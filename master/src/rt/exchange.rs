@@ -313,6 +313,18 @@ impl Exchange {
         (read && found.answers).then_some((device, found.clock_difference))
     }
 
+    /// Returns the device whose AL status the frames of this cycle asked for, and whether it answered.
+    #[must_use]
+    pub fn al_status_read(&self) -> Option<(DeviceIndex, bool)> {
+        let frame_set = self.frame_sets.get(self.due())?;
+        let PollTarget::Registers { device, block } = frame_set.poll?.target else {
+            return None;
+        };
+        frame_set.answer(0)?;
+        let found = self.diagnoses.get(device)?;
+        (block == DiagnosticRegister::AlStatus).then_some((device, found.answers))
+    }
+
     /// Returns the reference clock; `None` without distributed clocks.
     #[must_use]
     pub fn reference(&self) -> Option<DeviceIndex> {

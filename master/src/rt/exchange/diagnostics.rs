@@ -122,6 +122,8 @@ pub struct SubDeviceDiagnostics {
     /// Own clock minus reference, nanoseconds.
     pub clock_difference: i32,
     pub errors: ErrorCounters,
+    /// True from a read that it did not answer to the next read of its AL status.
+    pub(super) al_status_outdated: bool,
     /// True once it was seen in Op, missing, or with an error: it may reach Op after the others.
     pub(super) judged: bool,
     /// The counters at the first read.
@@ -194,7 +196,14 @@ impl SubDeviceDiagnostics {
     /// Returns true if the device answers and was in Op.
     #[must_use]
     pub fn is_in_op(&self) -> bool {
-        self.answers && self.al_status == AlState::Op.code()
+        self.current_al_status() == Some(AlState::Op.code())
+    }
+
+    /// Returns the AL status; `None` if the device does not answer, or has not been asked for it since it
+    /// answers again.
+    #[must_use]
+    pub fn current_al_status(&self) -> Option<u8> {
+        (self.answers && !self.al_status_outdated).then_some(self.al_status)
     }
 
     /// Returns the increments of the error counters since the cycle began.
@@ -243,6 +252,7 @@ impl SubDeviceDiagnostics {
         self.judged |= block == DiagnosticRegister::AlStatus && !answered;
         if answered || block == DiagnosticRegister::AlStatus || self.has_read(block) {
             self.answers = answered;
+            self.al_status_outdated |= !answered;
         }
     }
 
@@ -250,7 +260,7 @@ impl SubDeviceDiagnostics {
     pub(super) fn take(&mut self, block: DiagnosticRegister, data: &[u8]) {
         match (block, data) {
             (DiagnosticRegister::AlStatus, &[status, _, _, _, low, high]) => {
-                self.al_status = status;
+                (self.al_status, self.al_status_outdated) = (status, false);
                 self.judged |= status == AlState::Op.code() || status & AL_ERROR != 0;
                 self.al_code = u16::from_le_bytes([low, high]);
             }
@@ -313,6 +323,29 @@ mod tests {
         assert!(diagnosis.is_in_op());
         diagnosis.note_answer(DiagnosticRegister::AlStatus, false);
         assert!(!diagnosis.is_in_op());
+    }
+
+    /// A device that came back counted as in Op until its AL status was read, and was reported twice.
+    #[test]
+    fn returned_device_is_in_op_once_its_al_status_says_so() {
+        let mut diagnosis = SubDeviceDiagnostics::default();
+        for (block, data) in [
+            (DiagnosticRegister::AlStatus, &[8, 0, 0, 0, 0, 0][..]),
+            (DiagnosticRegister::DlStatus, &[0, 0][..]),
+        ] {
+            diagnosis.note_answer(block, true);
+            diagnosis.take(block, data);
+        }
+        assert_eq!(diagnosis.current_al_status(), Some(8));
+        diagnosis.note_answer(DiagnosticRegister::AlStatus, false);
+        diagnosis.note_answer(DiagnosticRegister::DlStatus, true);
+        assert!(diagnosis.answers && diagnosis.current_al_status().is_none());
+        diagnosis.note_answer(DiagnosticRegister::AlStatus, true);
+        diagnosis.take(DiagnosticRegister::AlStatus, &[4, 0, 0, 0, 0, 0]);
+        assert_eq!(
+            (diagnosis.current_al_status(), diagnosis.is_in_op()),
+            (Some(4), false)
+        );
     }
 
     #[test]
