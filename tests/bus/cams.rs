@@ -128,10 +128,11 @@ fn a_phase_shifts_the_follower_in_motion() {
             "{change}"
         );
     }
-    // Without a master there is nothing to shift.
-    let alone = "[[step]]\nenable = true\n[[step]]\nphase = { y = 1.0 }\n";
+    // Without a master there is nothing to shift. A gear that the run may engage passes `check`.
+    let alone = "[[step]]\nenable = true\n[[step]]\nif = { x.\"0x6064\" = { above = 1e6 } }\n\
+        [[step.step]]\ngear = { y = { to = \"x\" } }\n[[step]]\nphase = { y = 1.0 }\n";
     let (error, _) = run_badly(machine(&text("", alone)), virtual_time());
-    assert_contains(&error, &["step 2", "`y`", "follows no other axis"]);
+    assert_contains(&error, &["step 3", "`y`", "follows no other axis"]);
 }
 
 /// The follower decelerates with its group when it cannot follow, and both end without power.

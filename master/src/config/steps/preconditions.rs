@@ -30,9 +30,13 @@ struct State {
     disabled_by: Option<String>,
     /// The step since which the axis follows another axis.
     follows_since: Option<String>,
+    /// `true` if the axis follows another axis on some path.
+    may_follow: bool,
     /// The step since which the axis moves at constant velocity, unless the end of its range may
     /// have stopped it.
     turns_since: Option<String>,
+    /// The step since which the axis has a torque other than 0.
+    pushes_since: Option<String>,
     /// The position of its set-point after arrival, if known.
     position: Option<f64>,
     /// `true` after a rejected step: later steps are not reached.
@@ -46,6 +50,8 @@ struct Precondition {
     what: Option<TargetKind>,
     /// The axis must be at rest.
     rest: bool,
+    /// The axis must have no torque set-point other than 0.
+    no_torque: bool,
     /// The axis must not follow another axis.
     free: bool,
 }
@@ -72,7 +78,9 @@ impl ProgramChecker<'_> {
                 power,
                 disabled_by: None,
                 follows_since: None,
+                may_follow: false,
                 turns_since: None,
+                pushes_since: None,
                 position: None,
                 given_up: false,
             })
@@ -184,10 +192,10 @@ impl ProgramState<'_, '_, '_, '_> {
             Action::Stop { axes } => self.each(axes, State::stops),
             Action::Home { axes } => {
                 let need = Precondition {
-                    verb: "home",
-                    what: None,
                     rest: true,
+                    no_torque: true,
                     free: true,
+                    ..Precondition::power("home")
                 };
                 for &axis in axes {
                     self.need(step, axis, need);
@@ -252,18 +260,13 @@ impl ProgramState<'_, '_, '_, '_> {
                 }
             }
             Action::Gear { axis, master, .. } => {
-                let need = Precondition {
-                    verb: "gear",
-                    what: None,
-                    rest: false,
-                    free: false,
-                };
                 if let Some(master) = master.axis() {
-                    self.need(step, master, need);
+                    self.need(step, master, Precondition::power("gear"));
                 }
                 self.follow_setpoints(step, "gear", *axis, false);
                 self.each(&[*axis], |state| {
                     state.follows_since = Some(number.clone());
+                    state.may_follow = true;
                     state.position = None;
                 });
             }
@@ -283,9 +286,13 @@ impl ProgramState<'_, '_, '_, '_> {
                 }
             }
             Action::Torque { targets, .. } => {
-                for &(axis, _) in targets {
+                for &(axis, torque) in targets {
                     self.need(step, axis, Precondition::of("torque", TargetKind::Torque));
-                    self.each(&[axis], State::stops);
+                    self.each(&[axis], |state| {
+                        state.stops();
+                        let pushes = torque != 0.0 && !step.varies(axis);
+                        state.pushes_since = pushes.then(|| number.clone());
+                    });
                 }
             }
             Action::Mode { targets } => {
@@ -293,13 +300,24 @@ impl ProgramState<'_, '_, '_, '_> {
                     self.switch(step, axis, mode);
                 }
             }
+            Action::Phase { targets } => {
+                for &(axis, _) in targets {
+                    self.need(step, axis, Precondition::power("phase"));
+                    self.needs_master(step, axis);
+                }
+            }
+            Action::Superimpose { targets } => {
+                for &(axis, _) in targets {
+                    let need = Precondition::of("superimpose", TargetKind::Shift);
+                    self.need(step, axis, need);
+                    self.each(&[axis], |state| state.position = None);
+                }
+            }
+            Action::Couple { axes, coupled } => self.couple(step, axes, *coupled),
             Action::Reset { .. }
             | Action::Dwell { .. }
             | Action::Wait { .. }
             | Action::Set { .. }
-            | Action::Couple { .. }
-            | Action::Phase { .. }
-            | Action::Superimpose { .. }
             | Action::Override(_)
             | Action::Assign { .. }
             | Action::Message { .. }
@@ -310,11 +328,15 @@ impl ProgramState<'_, '_, '_, '_> {
     fn switch(&mut self, step: &Step, axis: AxisIndex, mode: Mode) {
         let powered = self.state(axis).is_some_and(|s| s.power);
         if powered {
+            let unpowered = |axis: &AxisSetup| axis.config.mode_change_unpowered;
+            let rests = mode == Mode::Pp || self.axis(axis).is_some_and(unpowered);
+            // A switch to the mode that the axis has does nothing.
+            let switches = self.state(axis).and_then(|state| state.mode) != Some(mode);
             let need = Precondition {
-                verb: "mode",
-                what: None,
-                rest: mode == Mode::Pp,
+                rest: rests && switches,
+                no_torque: rests && switches,
                 free: true,
+                ..Precondition::power("mode")
             };
             self.need(step, axis, need);
         }
@@ -325,8 +347,41 @@ impl ProgramState<'_, '_, '_, '_> {
                 state.position = None;
             }
             // Whether the motion continues depends on the mode.
-            state.turns_since = None;
+            (state.turns_since, state.pushes_since) = (None, None);
         });
+    }
+
+    /// Checks a step `couple` or `decouple`: both halves rest, and `couple` waits for their power.
+    fn couple(&mut self, step: &Step, axes: &[AxisIndex], coupled: bool) {
+        let gantries = self.checker.gantries.iter();
+        let named = gantries.filter(|gantry| axes.contains(&gantry.axes[0]));
+        let halves: Vec<_> = named.flat_map(|gantry| gantry.axes).collect();
+        for axis in halves {
+            if coupled || self.state(axis).is_some_and(|state| state.power) {
+                let need = Precondition {
+                    rest: true,
+                    free: true,
+                    ..Precondition::power(if coupled { "couple" } else { "decouple" })
+                };
+                self.need(step, axis, need);
+            }
+            // The second half moves to the first one.
+            self.each(&[axis], |state| state.position = None);
+        }
+    }
+
+    /// Rejects a step for an axis that follows no other axis on any path.
+    fn needs_master(&mut self, step: &Step, axis: AxisIndex) {
+        if self.state(axis).is_none_or(|state| state.may_follow) {
+            return;
+        }
+        let name = self.name(axis);
+        let message = format!(
+            "`phase` shifts `{name}` against its master, and no step before lets it follow one{}",
+            self.round()
+        );
+        let hint = format!("let a step engage it before: `gear = {{ {name} = {{ to = … }} }}`");
+        self.refuse(step, axis, message, hint);
     }
 
     /// Handles a step that ends with its axes at their targets.
@@ -399,7 +454,12 @@ impl ProgramState<'_, '_, '_, '_> {
 
     /// Handles a step that sets every set-point of an axis. `back`: it ends where it began.
     fn follow_setpoints(&mut self, step: &Step, verb: &'static str, axis: AxisIndex, back: bool) {
-        self.need(step, axis, Precondition::of(verb, TargetKind::SetPoint));
+        // A wave begins at rest; the others decelerate before or begin in motion.
+        let need = Precondition {
+            rest: back,
+            ..Precondition::of(verb, TargetKind::SetPoint)
+        };
+        self.need(step, axis, need);
         self.each(&[axis], |state| {
             let position = state.position.filter(|_| back);
             state.stops();
@@ -471,6 +531,14 @@ impl ProgramState<'_, '_, '_, '_> {
                 "let a step stop it before: `velocity = {{ {name} = 0.0 }}` or `stop = [\"{name}\"]`"
             );
             (message, hint)
+        } else if let Some(by) = state.pushes_since.as_ref().filter(|_| need.no_torque) {
+            let message = format!(
+                "`{verb}` needs `{name}` without torque, but since step {by} it has one{round}"
+            );
+            let hint = format!(
+                "let a step take it away before: `torque = {{ {name} = 0.0 }}` or `stop = [\"{name}\"]`"
+            );
+            (message, hint)
         } else if let (Some(what), Some(mode)) = (need.what, state.mode)
             && !what.possible(mode, setup)
         {
@@ -501,12 +569,21 @@ impl ProgramState<'_, '_, '_, '_> {
 }
 
 impl Precondition {
-    const fn of(verb: &'static str, what: TargetKind) -> Self {
+    /// A step that needs power and nothing else.
+    const fn power(verb: &'static str) -> Self {
         Self {
             verb,
-            what: Some(what),
+            what: None,
             rest: false,
+            no_torque: false,
             free: false,
+        }
+    }
+
+    const fn of(verb: &'static str, what: TargetKind) -> Self {
+        Self {
+            what: Some(what),
+            ..Self::power(verb)
         }
     }
 }
@@ -520,13 +597,16 @@ impl State {
             power,
             disabled_by,
             follows_since,
+            may_follow,
             turns_since,
+            pushes_since,
             position,
             given_up,
         } = self;
         *mode = mode.filter(|mode| other.mode == Some(*mode));
         *power |= other.power;
         *given_up |= other.given_up;
+        *may_follow |= other.may_follow;
         *position = position.filter(|at| other.position == Some(*at));
         let keep = |own: &mut Option<String>, other: &Option<String>| {
             if other.is_none() {
@@ -537,12 +617,15 @@ impl State {
         keep(disabled_by, &other.disabled_by);
         keep(follows_since, &other.follows_since);
         keep(turns_since, &other.turns_since);
+        keep(pushes_since, &other.pushes_since);
     }
 
     /// Ends the previous motion because of a new command.
     fn stops(&mut self) {
         self.follows_since = None;
+        self.may_follow = false;
         self.turns_since = None;
+        self.pushes_since = None;
         self.position = None;
     }
 }

@@ -27,11 +27,27 @@ pdo.tx = ["0x6041", "0x6064", "0x606C", "0x6077", "0x6061"]
 [device.axis]
 encoder = 2000
 limits = { position = [-50.0, 50.0], velocity = 50.0, acceleration = 500.0 }
+[[device]]
+name = "z"
+esi = "esi/EPOS4.xml"
+position = 2
+mode = "csp"
+pdo.rx = ["0x6040", "0x6060", "0x607A", "0x60FF", "0x6071"]
+pdo.tx = ["0x6041", "0x6061", "0x6064", "0x606C", "0x6077"]
+[device.axis]
+encoder = 2000
+limits = { velocity = 50.0, acceleration = 500.0 }
+mode_change = "no-power"
 "#;
 
 /// Returns the problems of a program. Each line is a step; an indented step is inside the
 /// repetition before it.
 fn problems(lines: &[&str]) -> Vec<Problem> {
+    problems_with("", lines)
+}
+
+/// The same, with more tables before the steps.
+fn problems_with(more: &str, lines: &[&str]) -> Vec<Problem> {
     let top: String = lines
         .iter()
         .filter(|line| line.starts_with("all "))
@@ -42,7 +58,7 @@ fn problems(lines: &[&str]) -> Vec<Problem> {
         Some(inner) => format!("[[step.step]]\n{inner}\n"),
         None => format!("[[step]]\n{line}\n"),
     });
-    let text = format!("{top}{HEAD}{}", steps.collect::<String>());
+    let text = format!("{top}{HEAD}{more}{}", steps.collect::<String>());
     let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../configs");
     match parse(&folder.join("test.toml"), &text) {
         Ok(_) => Vec::new(),
@@ -75,6 +91,17 @@ fn program_check_rejects_steps_certain_to_fail() {
         (&["gear = { x = { to = \"y\" } }", "home = [\"x\"]"], "`home` needs `x` to be free", "stop = [\"x\"]"),
         (&["velocity = { x = 1.0 }", "home = [\"x\"]"], "`home` needs `x` at rest, but since step 1 it turns", "velocity = { x = 0.0 }"),
         (&["velocity = { x = -1.0 }", "mode = { x = \"pp\" }"], "`mode` needs `x` at rest", "stop = [\"x\"]"),
+        (&["velocity = { z = 1.0 }", "mode = { z = \"csv\" }"], "`mode` needs `z` at rest, but since step 1 it turns", "velocity = { z = 0.0 }"),
+        (&["mode = { z = \"csv\" }", "velocity = { z = 1.0 }", "mode = { z = \"csp\" }"], "`mode` needs `z` at rest, but since step 2 it turns", "stop = [\"z\"]"),
+        (&["mode = { z = \"cst\" }", "torque = { z = 1.0 }", "mode = { z = \"csp\" }"], "`mode` needs `z` without torque, but since step 2 it has one", "torque = { z = 0.0 }"),
+        (&["mode = { x = \"cst\" }", "torque = { x = 1.0 }", "mode = { x = \"pp\" }"], "`mode` needs `x` without torque", "stop = [\"x\"]"),
+        (&["mode = { x = \"cst\" }", "torque = { x = -1.0 }", "home = [\"x\"]"], "`home` needs `x` without torque", "stop = [\"x\"]"),
+        (&["velocity = { x = 1.0 }", "sine = { x = { amplitude = 1, frequency = 1, periods = 1 } }"], "`sine` or `square` needs `x` at rest", "stop = [\"x\"]"),
+        (&["phase = { x = 1.0 }"], "`phase` shifts `x` against its master, and no step before lets it follow one", "gear = { x = { to = … } }"),
+        (&["gear = { x = { to = \"y\" } }", "move = { x = 1.0 }", "phase = { x = 1.0 }"], "`phase` shifts `x` against its master", "gear"),
+        (&["gear = { x = { to = \"y\" } }", "disable = [\"x\"]", "phase = { x = 1.0 }"], "`phase` needs `x` to have power, which step 2", "enable = [\"x\"]"),
+        (&["disable = [\"x\"]", "superimpose = { x = 1.0 }"], "`superimpose` needs `x` to have power", "enable = [\"x\"]"),
+        (&["mode = { x = \"pp\" }", "superimpose = { x = 1.0 }"], "`superimpose` is not possible for `x` in mode \"pp\"", "\"csp\" }`"),
         (&["velocity = { x = 1.0 }", "line_by = { x = 1.0, y = 1.0 }"], "`line_by` needs `x` at rest", "stop = [\"x\"]"),
         (&["move = { y = 45.0 }", "move_by = { y = 6.0 }"], "`move_by` of 6 turn leads `y` from 45 to 51 turn, outside its limits, -50 to 50 turn", "go back"),
         (&["move = { y = 0.0 }", "repeat = 6", "  line_by = { y = -10.0 }"], "`line_by` of -10 turn leads `y` from -50 to -60 turn, outside its limits, -50 to 50 turn, when it is repeated", "less often"),
@@ -99,6 +126,15 @@ fn program_check_accepts_steps_that_may_succeed() {
         // The end of its range may have stopped the axis.
         &["velocity = { y = 1.0 }", "line = { y = 1.0 }"],
         &["gear = { x = { to = \"y\" } }", "move = { y = 1.0 }", "move = { x = 0.0 }", "home = [\"x\"]"],
+        // A drive that switches without power does so at rest. A switch to the present mode needs no rest.
+        &["velocity = { z = 1.0 }", "mode = { z = \"csp\" }", "velocity = { z = 0.0 }", "mode = { z = \"csv\" }"],
+        &["mode = { z = \"cst\" }", "torque = { z = 1.0 }", "torque = { z = 0.0 }", "mode = { z = \"csp\" }"],
+        &["mode = { x = \"cst\" }", "torque = { x = 1.0 }", "mode = { x = \"csp\" }"],
+        &["velocity = { z = 1.0 }", "stop = [\"z\"]", "mode = { z = \"cst\" }"],
+        &["gear = { x = { to = \"y\" } }", "phase = { x = 1.0 }", "phase = { x = -1.0 }"],
+        &["repeat = 2", "  gear = { x = { to = \"y\" } }", "  phase = { x = 1.0 }"],
+        // The shift moves the position.
+        &["move = { y = 45.0 }", "superimpose = { y = -20.0 }", "move_by = { y = 10.0 }"],
         // The start position is unknown.
         &["move_by = { y = 60.0 }"],
         &["enable = true", "move = { y = 45.0 }", "disable = true", "enable = true", "move_by = { y = 60.0 }"],
@@ -109,6 +145,78 @@ fn program_check_accepts_steps_that_may_succeed() {
     for lines in rows {
         let found = problems(lines);
         assert!(found.is_empty(), "{lines:?}: {found:#?}");
+    }
+}
+
+/// `couple` waits for both halves, without a limit.
+#[test]
+fn program_check_rejects_gantries_that_cannot_couple() {
+    let gantry = "[[gantry]]\naxes = [\"g\", \"h\"]\nmax_skew = 1.0\n";
+    let half = |name: &str, position: usize| {
+        format!(
+            "[[device]]\nname = \"{name}\"\nesi = \"esi/EPOS4.xml\"\nposition = {position}\nmode = \"csp\"\n\
+             [device.axis]\nencoder = 2000\nlimits = {{ velocity = 50.0, acceleration = 500.0 }}\n"
+        )
+    };
+    let head = half("g", 3) + &half("h", 4) + gantry;
+    let rows: &[(&[&str], &str)] = &[
+        (
+            &[
+                "decouple = [\"g\"]",
+                "disable = [\"h\"]",
+                "couple = [\"g\"]",
+            ],
+            "`couple` needs `h` to have power, which step 2 has taken away",
+        ),
+        (
+            &[
+                "decouple = [\"g\"]",
+                "velocity = { h = 1.0 }",
+                "couple = [\"g\"]",
+            ],
+            "`couple` needs `h` at rest, but since step 2 it turns",
+        ),
+        (
+            &["velocity = { g = 1.0 }", "decouple = [\"g\"]"],
+            "`decouple` needs `g` at rest",
+        ),
+        (
+            &[
+                "decouple = [\"g\"]",
+                "gear = { g = { to = \"x\" } }",
+                "couple = [\"g\"]",
+            ],
+            "`couple` needs `g` to be free",
+        ),
+        (
+            &[
+                "decouple = [\"g\"]",
+                "move = { h = 1.0 }",
+                "couple = [\"g\"]",
+            ],
+            "",
+        ),
+        (
+            &[
+                "disable = true",
+                "decouple = [\"g\"]",
+                "enable = true",
+                "couple = true",
+            ],
+            "",
+        ),
+    ];
+    for (lines, message) in rows {
+        let found = problems_with(&head, lines);
+        match message.is_empty() {
+            true => assert!(found.is_empty(), "{lines:?}: {found:#?}"),
+            false => {
+                let [problem] = found.as_slice() else {
+                    panic!("{lines:?}: {found:#?}")
+                };
+                assert!(problem.message.contains(message), "{lines:?}: {problem}");
+            }
+        }
     }
 }
 
