@@ -43,6 +43,7 @@ mod profile_modes;
 mod program;
 mod program_requests;
 mod repeats;
+mod reviews;
 mod samples;
 mod several_axes;
 mod soe;
