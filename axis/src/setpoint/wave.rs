@@ -73,6 +73,12 @@ impl Wave {
         })
     }
 
+    /// Returns the distance to each side of the start.
+    #[must_use]
+    pub const fn amplitude(&self) -> f64 {
+        self.amplitude
+    }
+
     /// Returns the highest first, second and third derivative of a sine.
     #[must_use]
     pub fn slopes(&self) -> [f64; 3] {

@@ -251,7 +251,8 @@ impl ProgramState<'_, '_, '_, '_> {
                 // The position of the edge is unknown.
                 self.each(&[*axis], |state| state.position = None);
             }
-            Action::Wave { axis, .. } => {
+            Action::Wave { axis, wave } => {
+                self.keep_in_range(step, *axis, wave.amplitude());
                 self.follow_setpoints(step, "sine` or `square", *axis, true)
             }
             Action::Table { tables, .. } => {
@@ -432,6 +433,25 @@ impl ProgramState<'_, '_, '_, '_> {
                 state.stops();
                 state.position = to.filter(|_| !modulo);
             });
+        }
+    }
+
+    /// Rejects a wave about a known position that leaves the limits of its axis.
+    fn keep_in_range(&mut self, step: &Step, axis: AxisIndex, amplitude: f64) {
+        let from = self.state(axis).and_then(|state| state.position);
+        let (Some([low, high]), Some(from)) = (self.limits(axis), from) else {
+            return;
+        };
+        let rounding = ROUNDING * (high - low);
+        if from - amplitude < low - rounding || from + amplitude > high + rounding {
+            let unit = self.axis(axis).map_or("", |axis| axis.unit.as_str());
+            let message = format!(
+                "an amplitude of {amplitude} {unit} about {from} {unit} leads `{}` outside its limits, {low} to {high} {unit}{}",
+                self.name(axis),
+                self.round(),
+            );
+            let hint = "take a smaller amplitude, or move to another position before";
+            self.refuse(step, axis, message, hint.to_owned());
         }
     }
 

@@ -104,6 +104,7 @@ fn program_check_rejects_steps_certain_to_fail() {
         (&["mode = { x = \"pp\" }", "superimpose = { x = 1.0 }"], "`superimpose` is not possible for `x` in mode \"pp\"", "\"csp\" }`"),
         (&["velocity = { x = 1.0 }", "line_by = { x = 1.0, y = 1.0 }"], "`line_by` needs `x` at rest", "stop = [\"x\"]"),
         (&["move = { y = 45.0 }", "move_by = { y = 6.0 }"], "`move_by` of 6 turn leads `y` from 45 to 51 turn, outside its limits, -50 to 50 turn", "go back"),
+        (&["move = { y = 45.0 }", "sine = { y = { amplitude = 6, frequency = 0.1, periods = 1 } }"], "an amplitude of 6 turn about 45 turn leads `y` outside its limits, -50 to 50 turn", "smaller amplitude"),
         (&["move = { y = 0.0 }", "repeat = 6", "  line_by = { y = -10.0 }"], "`line_by` of -10 turn leads `y` from -50 to -60 turn, outside its limits, -50 to 50 turn, when it is repeated", "less often"),
     ];
     for (lines, message, hint) in rows {
