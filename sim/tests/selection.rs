@@ -2,7 +2,7 @@
 
 use crate::common::*;
 use crate::main_device::bring_up;
-use ecaxis_esi::model::{Device, Entry, EsiFile};
+use ecaxis_esi::model::{Device, Entry, EsiFile, Module, Slot, Slots};
 use ecaxis_esi::{Mode, SelectOptions, offered_modes, select};
 use ecaxis_sim::{DeviceOptions, SimDevice};
 
@@ -296,6 +296,68 @@ fn oversampled_pdo_has_its_own_samples_at_power_on() {
         let sii = ecaxis_esi::sii::parse(bus.segment.device(0).unwrap().sii()).unwrap();
         let described: Vec<_> = sii.tx_pdos.iter().map(|p| (p.index, p.bit_len())).collect();
         assert_eq!(described, [(0x1a00, 16)]);
+        bus.sm(S, 3, 0x1400, 4, 0x20);
+        bus.to(S, SAFEOP);
+    }
+}
+
+/// A MainDevice that maps one sample left it to the next one, which expects those of the ESI.
+#[test]
+fn samples_by_the_length_of_a_sync_manager_end_with_safe_op() {
+    const S: u16 = 0x1001;
+    let assignable = "<Mailbox><CoE PdoAssign=\"1\"/></Mailbox>";
+    let mut device = oversampler(assignable, 0);
+    device.tx_pdos[0].oversampling.as_mut().unwrap().factor = 2;
+    let mut bus = Bus::new(vec![sim(&device)]);
+    bus.mailboxes = [(0x1000, 128), (0x1080, 128)];
+    bus.address_all();
+    for len in [8, 4, 8] {
+        bus.preop(S);
+        assert_eq!(bus.upload(S, 0x1a00, 1).unwrap(), [32, 1, 0x00, 0x60]);
+        bus.sm(S, 3, 0x1400, len, 0x20);
+        bus.to(S, SAFEOP);
+        let bits = u8::try_from(8 * len).unwrap();
+        assert_eq!(bus.upload(S, 0x1a00, 1).unwrap(), [bits, 1, 0x00, 0x60]);
+        bus.to(S, INIT);
+        for n in [0, 1, 3] {
+            bus.write(S, 0x806 + n * 8, &[0]);
+        }
+    }
+}
+
+/// A module with an oversampled PDO was plugged with one sample, and its SyncManager had the length of
+/// all samples.
+#[test]
+fn oversampled_pdo_of_a_module_has_its_samples_at_power_on() {
+    const S: u16 = 0x1001;
+    for (increment, indices, bits) in [(16, &[0x1a00_u16, 0x1a01][..], 16), (0, &[0x1a00], 32)] {
+        let mut device = oversampler("<Mailbox><CoE PdoAssign=\"1\"/></Mailbox>", increment);
+        device.dc_modes.clear();
+        let mut pdo = device.tx_pdos.remove(0);
+        pdo.oversampling.as_mut().unwrap().factor = 2;
+        let slot = Slot {
+            max_instances: 1,
+            module_idents: vec![(1, true)],
+            ..Slot::default()
+        };
+        device.slots = Some(Slots {
+            slots: vec![slot],
+            ..Slots::default()
+        });
+        let module = Module {
+            ident: 1,
+            tx_pdos: vec![pdo],
+            ..Module::default()
+        };
+        let sim = SimDevice::from_esi(&device, &[module], DeviceOptions::default()).unwrap();
+        let mut bus = Bus::new(vec![sim]);
+        bus.mailboxes = [(0x1000, 128), (0x1080, 128)];
+        bus.address_all();
+        bus.preop(S);
+        for (n, pdo) in (0..).zip(indices) {
+            let [low, high] = (0x6000 + n * increment).to_le_bytes();
+            assert_eq!(bus.upload(S, *pdo, 1).unwrap(), [bits, 1, low, high]);
+        }
         bus.sm(S, 3, 0x1400, 4, 0x20);
         bus.to(S, SAFEOP);
     }

@@ -100,6 +100,8 @@ pub struct PdoRules {
     known_entries: Vec<(Direction, u32)>,
     /// The default assignments and those that OpModes and alternative mappings of the ESI name.
     named: Vec<NamedAssignment>,
+    /// The lists that the device replaced to fit the length of a SyncManager, as they were before.
+    replaced: Vec<(u16, Vec<u32>)>,
     /// True if a MainDevice may write the assignment, and if it may write the mapping.
     assign: bool,
     config: bool,
@@ -299,8 +301,9 @@ impl PdoRules {
                 }
                 let module = module.at(device, slots, slot, position);
                 let mut contents = Vec::new();
-                for pdo in module.rx_pdos.iter().chain(&module.tx_pdos) {
-                    self.learn(store, pdo);
+                let all = module.rx_pdos.iter().chain(&module.tx_pdos);
+                for pdo in all.flat_map(|pdo| sampled(pdo, default_factor(pdo))) {
+                    self.learn(store, &pdo);
                     contents.push((
                         pdo.index,
                         pdo.entries.iter().map(|entry| entry.mapping()).collect(),
@@ -431,7 +434,8 @@ impl PdoRules {
 
     /// Takes the assignment of the ESI whose length a SyncManager has. A device without PDO
     /// assignment, or with all samples in one PDO, has no object for the OpMode of the MainDevice.
-    pub(crate) fn adopt(&self, store: &mut ObjectStore, sm: u8, len: usize) {
+    /// [`PdoRules::release`] ends it.
+    pub(crate) fn adopt(&mut self, store: &mut ObjectStore, sm: u8, len: usize) {
         if self.layout(store, sm, &mut Vec::new()) == len {
             return;
         }
@@ -446,13 +450,43 @@ impl PdoRules {
         }) else {
             return;
         };
-        self.fill(store, index, 16, &named.indices(), 0, self.assign);
-        for (pdo, entries) in &named.contents {
-            if self.pdo(*pdo).is_some_and(|pdo| pdo.oversampled) {
-                let writable = self.config && self.pdo(*pdo).is_some_and(|pdo| !pdo.fixed);
-                self.fill(store, *pdo, 32, entries, 0, writable);
+        let oversampled = |pdo: u16| self.pdo(pdo).is_some_and(|pdo| pdo.oversampled);
+        let mappings = named.contents.iter().filter(|(pdo, _)| oversampled(*pdo));
+        let mut lists: Vec<(u16, Vec<u32>)> = mappings.cloned().collect();
+        let pdos = named.indices().into_iter();
+        lists.insert(0, (index, pdos.map(u32::from).collect()));
+        for (list, values) in lists {
+            let before = elements(store, list, count(store, list)).collect();
+            if !self.replaced.iter().any(|(replaced, _)| *replaced == list) {
+                self.replaced.push((list, before));
             }
+            self.replace(store, list, &values);
         }
+    }
+
+    /// Gives the lists that [`PdoRules::adopt`] replaced their former values: another MainDevice reads
+    /// those of the device, or of the MainDevice that wrote them.
+    pub(crate) fn release(&mut self, store: &mut ObjectStore) {
+        for (list, values) in std::mem::take(&mut self.replaced) {
+            self.replace(store, list, &values);
+        }
+    }
+
+    /// Forgets the replaced lists: all objects have their values at power-on.
+    pub(crate) fn power_on(&mut self) {
+        self.replaced.clear();
+    }
+
+    /// Sets the elements of an assignment or a mapping.
+    fn replace(&self, store: &mut ObjectStore, list: u16, values: &[u32]) {
+        let (bits, writable) = match self.assignment(list) {
+            Some(_) => (16, self.assign),
+            None => (
+                32,
+                self.config && self.pdo(list).is_some_and(|pdo| !pdo.fixed),
+            ),
+        };
+        self.fill(store, list, bits, values, 0, writable);
     }
 
     /// Returns the bytes of the longest assignment that the ESI names for a SyncManager.

@@ -246,6 +246,7 @@ impl SimDevice {
     /// Resets the application as at power-on.
     pub(super) fn restart_application(&mut self, now: Nanos) {
         self.store = self.fresh.store.clone();
+        self.pdo.power_on();
         self.sercos = self.fresh.sercos.clone();
         let Application::Gateway(gateway) = &mut self.application else {
             let before = std::mem::replace(&mut self.application, self.fresh.application.clone());

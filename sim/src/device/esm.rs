@@ -118,6 +118,9 @@ impl SimDevice {
                 Ok(()) => self.enter(to),
             },
         }
+        if self.al.state < AlState::SafeOp {
+            self.pdo.release(&mut self.store);
+        }
     }
 
     fn adopt_assignments(&mut self) {
