@@ -589,7 +589,7 @@ mod tests {
                 Outgoing::Object(object)
             };
             let mut sent = 0;
-            let mut now = |bytes: usize| {
+            let now = |bytes: usize| {
                 let queue = queue.clone();
                 let message = message(bytes);
                 let send = tokio::spawn(async move { queue.send(message).await });
