@@ -22,7 +22,7 @@ class Pdo:
     sm: int | None
     # (index, sub, bits, name)
     entries: list
-    # The samples of a cycle (ETG.2000, `OSFac`), unless an OpMode says otherwise. An EEPROM describes one.
+    # The samples of a cycle without an OpMode (`OSFac`).
     samples: int = 1
 
     @property
@@ -63,8 +63,17 @@ class Device:
     def identity(self):
         return (self.vendor, self.product, self.revision)
 
+    def of_sm(self, number):
+        return [pdo for pdo in self.rx + self.tx if pdo.sm == number]
+
     def sm_bits(self, number):
-        return sum(pdo.bits for pdo in self.rx + self.tx if pdo.sm == number)
+        return sum(pdo.bits for pdo in self.of_sm(number))
+
+    def mapped_bits(self, pdos):
+        """The bits that a MainDevice maps without an OpMode. With CoE it reads objects, which have the samples of a cycle
+        (ETG.2000, `OSFac`); an EEPROM has one, because ETG.2010 has no field for their number."""
+        with_coe = self.protocols & PROTOCOLS["CoE"]
+        return sum(pdo.bits * (pdo.samples if with_coe else 1) for pdo in pdos)
 
     def sm_length(self, number):
         """The size in the file; without it, the size of the default PDOs."""
@@ -91,6 +100,12 @@ def value(element, tag, default=0):
     return number(found) if found and found.strip() else default
 
 
+def samples(element):
+    """Returns the samples of a cycle without an OpMode. A factor above `OSMax` is impossible: one sample."""
+    factor, most = number(element.get("OSFac") or "1"), element.get("OSMax")
+    return 1 if most and factor > number(most) else max(factor, 1)
+
+
 def pdos(owner, tag, shift=0, object_shift=0):
     """Returns the PDOs with the indices that a module has in its slot."""
     found = []
@@ -110,7 +125,7 @@ def pdos(owner, tag, shift=0, object_shift=0):
             text(element, "Name"),
             int(sm) if sm is not None and sm.strip() else None,
             entries,
-            number(element.get("OSFac") or "1"),
+            samples(element),
         )
         excluded = {number(e.text) for e in element.findall("Exclude")}
         found.append((pdo, excluded, flag(element, "OverwrittenByModule"), flag(element, "Mandatory")))

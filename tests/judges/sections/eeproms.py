@@ -265,11 +265,9 @@ def by_ethercrab(d, machine, found, images):
         d.compare("mailboxes", device, got.sms[0], mailboxes)
         if not machine.kind.ethercrab_maps or esi.of_modules or esi.in_dictionary:
             continue
-        if any(pdo.samples > 1 for pdo in esi.rx + esi.tx):
-            # The device maps one sample or several, by the OpMode.
-            continue
         # As long as what is mapped, whatever length the EEPROM gives.
-        process = {n: (sm[0], -(-esi.sm_bits(n) // 8), sm[2]) for n, sm in enumerate(esi.sms) if esi.sm_bits(n)}
+        bits = [esi.mapped_bits(esi.of_sm(n)) for n in range(len(esi.sms))]
+        process = {n: (sm[0], -(-bits[n] // 8), sm[2]) for n, sm in enumerate(esi.sms) if bits[n]}
         written = {n: sm for n, sm in (mailboxes | process).items() if n in enabled}
         d.compare("SyncManagers", device, got.sms[1], written)
         sizes = [sum(length for n, (_, length, _) in process.items() if esi.sms[n][4] == kind) for kind in (3, 4)]
@@ -301,7 +299,7 @@ def by_pysoem(bench, d, machine):
             # What the modules of a device map is not in its own elements.
             if esi.in_dictionary or esi.of_modules or esi.modules:
                 continue
-            bits = [sum(p.bits for p in pdos if p.sm is not None) for pdos in (esi.rx, esi.tx)]
+            bits = [esi.mapped_bits([p for p in pdos if p.sm is not None]) for pdos in (esi.rx, esi.tx)]
             sizes = tuple(-(-n // 8) for n in bits)
             d.compare("bytes out and in", device, (len(slave.output), len(slave.input)), sizes)
 
