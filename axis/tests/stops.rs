@@ -458,6 +458,47 @@ fn frame_without_another_device_counts_as_delivered() {
     assert_eq!(steps[3], 0);
 }
 
+/// The deceleration of the late cycles is more than the jerk limit can end before the axis turns.
+#[test]
+fn late_answers_in_a_stop_do_not_turn_a_slow_axis() {
+    let config = config(Mode::Csp);
+    let jerk = config.limits.acceleration * 20.0;
+    let mut axis = enabled(AxisConfig {
+        jerk_limited: true,
+        limits: Limits {
+            jerk: Some(jerk),
+            ..config.limits
+        },
+        ..config
+    });
+    let velocity = config.limits.velocity * 0.1;
+    let turn = Command::Velocity {
+        velocity,
+        ramp: 1.0,
+    };
+    axis.command(turn).unwrap();
+    let mut position = 0;
+    for _ in 0..300 {
+        follow(&mut axis, &mut position);
+    }
+    for n in 0..5 {
+        if n == 2 {
+            axis.stop_by(StopMethod::Ramp);
+        }
+        let stale = Inputs {
+            fresh: false,
+            delivery: Delivery::Now,
+            ..inputs(0x1237, position, 8)
+        };
+        position = axis.step(&stale, DT).target_position;
+    }
+    for _ in 0..300 {
+        let before = position;
+        follow(&mut axis, &mut position);
+        assert!(position >= before, "{before} → {position}");
+    }
+}
+
 /// With pipelined answers: a late answer in the first stale cycle leaves both cycles that are
 /// planned without an answer.
 #[test]

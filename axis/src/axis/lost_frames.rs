@@ -10,6 +10,7 @@
 //!
 //! A skipped cycle sends no frame. For the drive this equals a lost frame.
 
+use super::stop::taken_over;
 use super::{Axis, ControlledQuantity, Outputs, Plan};
 use crate::cia402::Mode;
 use crate::setpoint::{Goal, Hold, Motion, Ramp, Trapezoid};
@@ -90,6 +91,11 @@ impl Axis {
                     acceleration: self.config.limits.acceleration,
                 };
                 self.motion = hold.brake(before, dt_s);
+                // From here, a plan can end the deceleration before the axis reverses.
+                if self.config.jerk_limited {
+                    let limits = self.config.limits.motion();
+                    self.motion.acceleration = taken_over(self.motion, limits, dt_s);
+                }
             }
             ControlledQuantity::Torque => {
                 let ramp = Ramp {

@@ -453,7 +453,7 @@ impl Axis {
 
 /// Returns the initial deceleration of a stop. An acceleration that increases the speed becomes 0.
 /// A deceleration is bounded so that the jerk limit can end it before the axis reverses.
-fn taken_over(motion: Motion, limits: MotionLimits, dt_s: f64) -> f64 {
+pub(super) fn taken_over(motion: Motion, limits: MotionLimits, dt_s: f64) -> f64 {
     if motion.acceleration * motion.velocity >= 0.0 {
         return 0.0;
     }
