@@ -48,6 +48,8 @@ fn gear(draft: &mut Draft, keys: &mut Keys) -> bool {
 /// Homing by a method of the vendor.
 fn mechanical_end(draft: &mut Draft, keys: &mut Keys) -> bool {
     draft.features.push("vendor's homing");
+    // A velocity towards the end stops at the range.
+    keys.endless = false;
     let (method, sign) = draft.random.pick(&[(-3, 1.0), (-4, -1.0)]);
     let home = sign * (REACH - 5.0);
     keys.axis = format!(
