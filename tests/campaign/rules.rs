@@ -44,7 +44,7 @@ pub fn check(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut 
     positions(machine, axis, moments, findings);
     velocities(machine, axis, moments, findings);
     torques(machine, axis, moments, findings);
-    range(axis, moments, findings);
+    range(machine, axis, moments, findings);
     gaps(machine, axis, moments, findings);
 }
 
@@ -279,9 +279,10 @@ fn positions(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut 
         };
         let frozen = step == 0 && (waits(now) || axis.node_fails);
         // A frozen set-point starts again from rest. Behind a gateway, a set-point may stay for two
-        // SYNCs because the answer that shows the first one was lost; it then goes on at its speed.
+        // SYNCs because the answer that shows the first one was lost; it then goes on at its speed. An
+        // answer in a SYNC counts for the whole of it.
         let left_out = axis.node && now.cycle > before.cycle + axis.period;
-        let goes_on = last_step.filter(|_| left_out);
+        let goes_on = last_step.filter(|_| left_out || axis.node && waits(before));
         if waits(before) || left_out {
             last_step = last_step.map(|_| 0);
         }
@@ -338,7 +339,7 @@ fn torques(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut Fi
 
 /// Targets stay in `limits.position`. The range widens to the axis position at the time of enabling
 /// or of motion in another mode (`docs/machine-file.md`, "Limits").
-fn range(axis: &Axis, moments: &[Moment], findings: &mut Findings<'_>) {
+fn range(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut Findings<'_>) {
     let Some((low, high)) = axis.range else {
         return;
     };
@@ -355,7 +356,9 @@ fn range(axis: &Axis, moments: &[Moment], findings: &mut Findings<'_>) {
             }
         } else if let Some(report) = now.last() {
             let actual = f64::from(report.position);
-            (from, to) = (low.min(actual - 2.0), high.max(actual + 2.0));
+            // An axis that moves while it is enabled comes to rest within its limits.
+            let way = now.speed * (4.0 + now.speed / axis.acceleration_step(machine)) + 2.0;
+            (from, to) = (low.min(actual - way), high.max(actual + way));
         }
     }
 }
