@@ -142,9 +142,18 @@ fn router(http: Arc<Http>) -> Router {
             get(|| async { axum::Json(openapi::document()) }),
         )
         .route("/api/ws", get(websocket::upgrade))
-        .route("/api/machine", get(machine))
-        .route("/api/state", get(state))
-        .route("/api/events", get(events))
+        .route(
+            "/api/machine",
+            get(machine).post(|s, h, b| operation(s, path_of("machine"), h, b)),
+        )
+        .route(
+            "/api/state",
+            get(state).post(|s, h, b| operation(s, path_of("state"), h, b)),
+        )
+        .route(
+            "/api/events",
+            get(events).post(|s, h, b| operation(s, path_of("events"), h, b)),
+        )
         .route("/api/samples", get(samples))
         .route("/api/history", get(history))
         .route("/api/histogram", get(histogram))
@@ -270,6 +279,11 @@ pub(crate) fn refusal(error: &OpError) -> Response {
 fn respond(body: Map<String, Value>, status: u16) -> Response {
     let status = StatusCode::from_u16(status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
     (status, axum::Json(Value::Object(body))).into_response()
+}
+
+/// Returns the operation of a path that answers GET as well.
+fn path_of(op: &str) -> Path<String> {
+    Path(op.to_owned())
 }
 
 async fn operation(

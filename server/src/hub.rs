@@ -258,6 +258,16 @@ impl Hub {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Like [`Hub::lock`]. A lease whose time is over has ended: what a client may do depends on no
+    /// thread that looks at the lease in time.
+    fn lock_lease(&self) -> MutexGuard<'_, Inner> {
+        let mut inner = self.lock();
+        if let Some(owner) = inner.lease.expire(Instant::now()) {
+            self.end_lease(&mut inner, &owner, None, "expired");
+        }
+        inner
+    }
+
     // Clients.
 
     /// Returns the number of a new client.
@@ -274,7 +284,7 @@ impl Hub {
             client: Some(client),
             secret: None,
         };
-        let mut inner = self.lock();
+        let mut inner = self.lock_lease();
         if let Some(owner) = inner.lease.release(&claim) {
             self.end_lease(&mut inner, &owner, None, "disconnected");
         }
@@ -282,7 +292,7 @@ impl Hub {
 
     /// Renews the lease if the sender holds it.
     pub fn renew(&self, claim: &Claim) {
-        self.lock().lease.renew(claim, Instant::now());
+        self.lock_lease().lease.renew(claim, Instant::now());
     }
 
     /// Gives the lease to a client. Returns its secret, and the client's number as its owner.
@@ -303,12 +313,9 @@ impl Hub {
             OpError::new(ErrorCode::Failed, message)
         })?;
         let ttl = (!self.options.virtual_time).then_some(ttl);
-        let mut inner = self.lock();
-        // The machine may be down, so that nothing else ends the lease of a silent owner.
-        if let Some(owner) = inner.lease.expire(Instant::now()) {
-            self.end_lease(&mut inner, &owner, None, "expired");
-        }
+        let mut inner = self.lock_lease();
         let now = Instant::now();
+        let before = inner.lease.holder(now).map(|(holder, _)| holder.clone());
         let (secret, previous) = inner
             .lease
             .take(claim, owner.clone(), secret, ttl, force, now)?;
@@ -316,7 +323,8 @@ impl Hub {
         let owner = holder.unwrap_or(owner);
         match previous {
             Some(previous) => self.end_lease(&mut inner, &previous, Some(&owner), "taken over"),
-            None => self.report_lease(&mut inner, None, Some(&owner), "taken"),
+            // Without a previous owner, or by the owner itself.
+            None => self.report_lease(&mut inner, before.as_ref(), Some(&owner), "taken"),
         }
         Ok((secret, owner.client))
     }
@@ -326,7 +334,7 @@ impl Hub {
     /// # Errors
     /// Fails if the sender does not hold it.
     pub fn release(&self, claim: &Claim) -> Result<(), OpError> {
-        let mut inner = self.lock();
+        let mut inner = self.lock_lease();
         inner.lease.check(claim, Instant::now())?;
         if let Some(owner) = inner.lease.release(claim) {
             self.end_lease(&mut inner, &owner, None, "released");
@@ -336,10 +344,7 @@ impl Hub {
 
     /// Ends the lease of a silent owner.
     pub fn expire_lease(&self) {
-        let mut inner = self.lock();
-        if let Some(owner) = inner.lease.expire(Instant::now()) {
-            self.end_lease(&mut inner, &owner, None, "expired");
-        }
+        drop(self.lock_lease());
     }
 
     /// Stops everything that the owner moved, before any command of the next owner.
@@ -374,7 +379,7 @@ impl Hub {
     /// # Errors
     /// Says who holds it.
     pub fn check_owner(&self, claim: &Claim) -> Result<(), OpError> {
-        Ok(self.lock().lease.check(claim, Instant::now())?)
+        Ok(self.lock_lease().lease.check(claim, Instant::now())?)
     }
 
     // Commands.
@@ -390,7 +395,7 @@ impl Hub {
         parts: Vec<Work>,
         waits: bool,
     ) -> Result<(u64, oneshot::Receiver<Outcome>), OpError> {
-        let mut inner = self.lock();
+        let mut inner = self.lock_lease();
         // Again, under the lock: the lease may have ended since.
         if let Some(owner) = owner {
             inner.lease.check(owner, Instant::now())?;

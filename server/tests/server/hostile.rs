@@ -7,9 +7,9 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
-use crate::area::{Area, attach};
 use crate::fuzz::{Random, mutated};
 use crate::harness::{Client, Server, TOKEN, demo};
+use crate::memory::{Rows, attach};
 use crate::websocket::{address, frame, read_frame, read_now, tcp, websocket};
 
 /// Returns the number in an environment variable.
@@ -194,53 +194,6 @@ fn each_jog_of_a_burst_is_answered() {
     assert_eq!(ids, (1000..1050).collect::<Vec<_>>());
 }
 
-/// The samples of an area.
-struct Rows<'a> {
-    area: &'a Area,
-    next: u64,
-    /// The words of target position and statusword of the axis.
-    words: [usize; 2],
-}
-
-impl<'a> Rows<'a> {
-    fn new(area: &'a Area, axis: &str) -> Self {
-        let samples = &area.samples;
-        let (from, bytes) = (samples.get(8) / 8, samples.get(9));
-        let text: Vec<u8> = (from..from + bytes.div_ceil(8))
-            .flat_map(|word| samples.get(usize::try_from(word).unwrap()).to_ne_bytes())
-            .collect();
-        let layout: Value =
-            serde_json::from_slice(&text[..usize::try_from(bytes).unwrap()]).unwrap();
-        let word = |name: &str| {
-            let signals = layout["signals"].as_array().unwrap();
-            let name = json!(format!("{axis}.{name}"));
-            let signal = signals.iter().find(|signal| signal["name"] == name);
-            usize::try_from(signal.unwrap()["word"].as_u64().unwrap()).unwrap()
-        };
-        Self {
-            words: [word("target_position"), word("statusword")],
-            next: samples.get(6),
-            area,
-        }
-    }
-
-    /// Returns the next row's target position, and whether the operation is enabled.
-    fn read(&mut self) -> Option<(f64, bool)> {
-        let samples = &self.area.samples;
-        if self.next >= samples.get(6) {
-            return None;
-        }
-        let row = samples.get(2) + self.next % samples.get(4) * samples.get(3);
-        let row = usize::try_from(row).unwrap();
-        self.next += 1;
-        assert_eq!(samples.get(row), self.next, "the reader keeps up");
-        let [target, status] = self
-            .words
-            .map(|word| f64::from_bits(samples.get(row + word)));
-        Some((target, status as u64 & 0x6f == 0x27))
-    }
-}
-
 /// Set-points that a client might write: plausible ones, which move the axis, and nonsense.
 fn random_set(random: &mut Random, at: &mut [f64; 2], velocity: &mut [f64; 2]) -> [(u64, f64); 2] {
     std::array::from_fn(|axis| match random.below(400) {
@@ -349,7 +302,7 @@ fn random_words_in_the_area_exceed_no_limit() {
 fn idle_connections_disturb_neither_owner_nor_cycle() {
     let server = Server::with_http(demo(), true);
     let mut owner = server.client();
-    owner.ok("take", json!({"name": "cell", "ttl_ms": 5000}));
+    owner.ok("take", json!({"name": "cell", "ttl_ms": 60_000}));
     owner.done("enable", json!({"axis": "x"}));
     let idle: Vec<_> = (0..500)
         .map(|n| {

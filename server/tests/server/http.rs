@@ -18,7 +18,7 @@ pub struct Reply {
 }
 
 impl Reply {
-    fn json(&self) -> Value {
+    pub fn json(&self) -> Value {
         serde_json::from_slice(&self.body).expect("JSON")
     }
 }
@@ -75,6 +75,29 @@ fn without_chunks(mut chunks: &[u8]) -> Vec<u8> {
 
 fn with_token(token: &str) -> [(&'static str, &str); 1] {
     [("Authorization", token)]
+}
+
+/// These paths answer GET as well.
+#[test]
+fn operations_that_read_are_posted_like_all() {
+    let server = Server::with_http(demo(), true);
+    server.client();
+    for op in [
+        "machine",
+        "state",
+        "events",
+        "diagnostics",
+        "fault_reports",
+        "hello",
+    ] {
+        let reply = request(&server, "POST", &format!("/api/{op}"), &[], "{\"id\": 7}");
+        let answer = reply.json();
+        assert_eq!(
+            (reply.status, &answer["id"]),
+            (200, &json!(7)),
+            "{op}: {answer}"
+        );
+    }
 }
 
 #[test]
