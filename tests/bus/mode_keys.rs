@@ -1,6 +1,7 @@
 //! Drives that show their mode in Operation enabled only, or change it without power only.
 
 use ecaxis_ecat::index::DeviceIndex;
+use ecaxis_master::session::Options;
 use ecaxis_test_support::recordings::process_images;
 use ecaxis_test_support::{
     assert_contains, faults, machine, recorded, run_badly, run_well, virtual_time,
@@ -139,5 +140,27 @@ fn drive_that_keeps_its_power_fails_the_step() {
         let (error, _) = run_badly(machine(&text(quirks, KEY, step)), virtual_time());
         println!("{error}");
         assert_contains(&error, &["`x`"]);
+    }
+}
+
+/// At rest in PV the drive reports up to 10 rpm, which is more than standstill for a cycle at times.
+#[test]
+fn a_noisy_velocity_at_rest_does_not_refuse_the_next_mode() {
+    let axis = "[bus]\nnic = \"sim\"\ncycle = \"500us\"\n[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"\n\
+        position = 0\nmode = \"csp\"\n\
+        pdo.rx = [\"0x6040\", \"0x6060\", \"0x607A\", \"0x60FF\", \"0x6071\", \"0x6081\", \"0x6083\", \"0x6084\"]\n\
+        pdo.tx = [\"0x6041\", \"0x6061\", \"0x6064\", \"0x606C\", \"0x6077\"]\n\
+        [device.axis]\nunit = \"mm\"\nencoder = 2000\nper_turn = 5.0\nmode_change = \"no-power\"\n\
+        limits = { velocity = 80.0, acceleration = 1600.0, torque = 100.0, following_error = 4.0 }\n\
+        homing = { method = 37 }\n[device.sim]\nquirks = { mode_without_power = true }\n";
+    let steps = "[[step]]\nmode = { x = \"pv\" }\n[[step]]\nvelocity = { x = 48.0 }\n\
+        [[step]]\nstop = [\"x\"]\n[[step]]\nmode = { x = \"csp\" }\n[[step]]\nhome = [\"x\"]\n";
+    let text = format!("{axis}{}", steps.repeat(4));
+    for seed in 0..8 {
+        let options = Options {
+            seed,
+            ..virtual_time()
+        };
+        run_well(machine(&text), options);
     }
 }
