@@ -903,11 +903,10 @@ fn with(draft: &mut Draft, wanted: &'static str) {
     ending(draft);
     for member in pool.iter().filter(|of| of.cycles_power) {
         let count = |step: String| draft.steps.matches(&step).count();
-        let name = &member.name;
-        let homings = count(format!("home = [\"{name}\"]"));
+        let homings = count(format!("home = [\"{}\"]", member.name));
         // A homing that is held ends, and begins again after the hold.
         let held = usize::from(draft.machine.hold.is_some() && homings > 0);
-        let switches = count(format!("mode = {{ {name} = ")) + 2 * (homings + held);
+        let switches = count(format!("mode = {{ {} = ", member.name)) + 2 * (homings + held);
         let enables = if draft.once { 1 + switches } else { usize::MAX };
         draft.machine.axes[member.index].enables = enables;
     }

@@ -357,7 +357,8 @@ fn range(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut Find
         } else if let Some(report) = now.last() {
             let actual = f64::from(report.position);
             // An axis that moves while it is enabled comes to rest within its limits.
-            let way = now.speed * (4.0 + now.speed / axis.acceleration_step(machine)) + 2.0;
+            let braking = now.speed / (2.0 * axis.acceleration_step(machine));
+            let way = now.speed * (4.0 + braking) + 2.0;
             (from, to) = (low.min(actual - way), high.max(actual + way));
         }
     }
