@@ -32,6 +32,7 @@ use crate::cia402::{
     self, Controlword, Mode, Power, PowerProgress, PowerState, Request, State, Statusword,
 };
 use crate::compensation::Compensation;
+use crate::limits::Limits;
 use crate::profile_mode::Profile;
 use crate::setpoint::Motion;
 use crate::status::{CommandError, DriveFault, PowerLossCause, Trip};
@@ -254,6 +255,30 @@ impl Axis {
     #[must_use]
     pub const fn own_range(&self) -> Option<[f64; 2]> {
         self.own_range
+    }
+
+    /// Returns the limits with which reported values are compared: those of the file.
+    fn own_limits(&self) -> Limits {
+        Limits {
+            position: self.own_range,
+            ..self.config.limits
+        }
+    }
+
+    /// Returns the error for a position outside the range in force.
+    fn outside(&self, position: f64, [low, high]: [f64; 2]) -> CommandError {
+        match self.config.limits.position == self.own_range {
+            true => CommandError::OutsideRange {
+                position,
+                low,
+                high,
+            },
+            false => CommandError::OutsideSharedRange {
+                position,
+                low,
+                high,
+            },
+        }
     }
 
     /// Returns the configuration. `limits.position` is that in force: [`Axis::share_range`].
@@ -524,7 +549,7 @@ impl Axis {
 
     fn start_supervision(&mut self) {
         self.supervision =
-            supervision::SupervisionState::starting_at(self.actual.position(), &self.config.limits);
+            supervision::SupervisionState::starting_at(self.actual.position(), &self.own_limits());
     }
 
     /// Forgets the commanded target: nothing is "done" at it any more.

@@ -550,6 +550,18 @@ pub enum CommandError {
         /// The upper end of the range.
         high: f64,
     },
+    /// The target is outside the positions at which both halves of a gantry are in their ranges.
+    #[error(
+        "position {position} is outside [{low}, {high}], where both halves of the gantry are in their ranges"
+    )]
+    OutsideSharedRange {
+        /// The position.
+        position: f64,
+        /// The lower end of the positions.
+        low: f64,
+        /// The upper end of the positions.
+        high: f64,
+    },
     /// The velocity exceeds the limit.
     #[error("velocity {velocity} exceeds the limit of {limit}")]
     TooFast {

@@ -347,11 +347,7 @@ impl Axis {
         let scale = &self.config.scale;
         let [low, high] = limits.position.unwrap_or(scale.range());
         if !(low..=high).contains(&position) {
-            return Err(CommandError::OutsideRange {
-                position,
-                low,
-                high,
-            });
+            return Err(self.outside(position, [low, high]));
         }
         self.check_ready()?;
         if self.mode == Mode::Pp {
@@ -467,11 +463,7 @@ impl Axis {
             // An axis outside its range may return into it.
             let [low, high] = [low.min(before.position), high.max(before.position)];
             if !(low..=high).contains(&position) {
-                return Err(CommandError::OutsideRange {
-                    position,
-                    low,
-                    high,
-                });
+                return Err(self.outside(position, [low, high]));
             }
             // From here the axis must be able to stop, whatever comes next.
             let slower = limits.acceleration * self.dt_s / 2.0;

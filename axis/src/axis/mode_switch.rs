@@ -218,7 +218,7 @@ impl Axis {
         }
         if from == Mode::Hm {
             self.supervision =
-                SupervisionState::starting_at(self.actual.position(), &self.config.limits);
+                SupervisionState::starting_at(self.actual.position(), &self.own_limits());
         }
         self.transfer_setpoint(from);
         if !self.plan.fits(self.config.control(to)) {

@@ -230,7 +230,7 @@ impl Axis {
     }
 
     fn check_limits(&mut self) -> Option<Trip> {
-        let limits = self.config.limits;
+        let limits = self.own_limits();
         let position = self.actual.position();
         let mut cause = None;
         // A motion of the drive without a set-point is not a following error.

@@ -303,11 +303,7 @@ impl Exchange {
     /// Returns the device and the clock difference that the answers of this cycle contain.
     #[must_use]
     pub fn clock_read(&self) -> Option<(DeviceIndex, i32)> {
-        let frame_set = self.frame_sets.get(self.due())?;
-        let PollTarget::Registers { device, block } = frame_set.poll?.target else {
-            return None;
-        };
-        frame_set.answer(0)?;
+        let (device, block) = self.register_read()?;
         let found = self.diagnoses.get(device)?;
         let read = block == DiagnosticRegister::ClockDifference && found.has_read(block);
         (read && found.answers).then_some((device, found.clock_difference))
@@ -316,13 +312,18 @@ impl Exchange {
     /// Returns the device whose AL status the frames of this cycle asked for, and whether it answered.
     #[must_use]
     pub fn al_status_read(&self) -> Option<(DeviceIndex, bool)> {
+        let (device, block) = self.register_read()?;
+        let found = self.diagnoses.get(device)?;
+        (block == DiagnosticRegister::AlStatus).then_some((device, found.answers))
+    }
+
+    /// Returns the device and the registers that the frames of this cycle asked for.
+    fn register_read(&self) -> Option<(DeviceIndex, DiagnosticRegister)> {
         let frame_set = self.frame_sets.get(self.due())?;
         let PollTarget::Registers { device, block } = frame_set.poll?.target else {
             return None;
         };
-        frame_set.answer(0)?;
-        let found = self.diagnoses.get(device)?;
-        (block == DiagnosticRegister::AlStatus).then_some((device, found.answers))
+        frame_set.answer(0).map(|_| (device, block))
     }
 
     /// Returns the reference clock; `None` without distributed clocks.

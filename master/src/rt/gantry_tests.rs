@@ -446,6 +446,11 @@ fn both_halves_stay_in_their_ranges_with_any_offset() {
         at(&coupled),
         "the second half would be at -55"
     );
+    // Apart, each half has its own range.
+    let mut apart = coupled;
+    apart.coupling = Coupling::Decoupled;
+    let away = target(&apart.after(&[Action::Wait(1)]), -25.0);
+    assert_eq!(away, [-25.0, -30.0]);
 }
 
 #[test]
