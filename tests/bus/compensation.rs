@@ -351,6 +351,13 @@ fn the_type_of_an_encoder_says_whether_its_counts_are_negative() {
 }
 
 #[test]
+fn a_pitch_error_needs_no_backlash() {
+    let bench = Bench::new();
+    let keys = "compensation = { errors = [[0.0, 0.0], [1.0, 0.01]] }";
+    bench.parse(&text(keys, "")).expect("a machine");
+}
+
+#[test]
 #[rustfmt::skip] // one row per mistake
 fn wrong_corrections_are_refused() {
     let bench = Bench::new();

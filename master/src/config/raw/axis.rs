@@ -208,7 +208,7 @@ table! { "`compensation`",
     #[derive(Clone)]
     table RawCompensation {
         /// Way of the drive between both flanks (above 0, unit; default none)
-        backlash: Key<f64> = "0.05",
+        backlash: Key<f64>,
         /// Direction of the last motion of homing; required with `backlash` (`"positive"`, `"negative"`)
         homing_ends: Key<ReferenceFlank> [FLANKS],
         /// Pitch error, load minus drive, at positions of the load (list of [position, error], unit;
