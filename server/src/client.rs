@@ -293,7 +293,18 @@ impl Client {
                 let events: Vec<_> = events.iter().map(|event| &event.body).collect();
                 Ok(object(json!({"events": events})))
             }
-            Op::FaultReports {} => Ok(object(json!({"reports": hub.fault_reports()}))),
+            Op::FaultReports {} => {
+                let reports = hub.fault_reports();
+                // No command waits for the copy.
+                let copy = move || reports.iter().map(|report| Value::clone(report)).collect();
+                let copied = tokio::task::spawn_blocking(copy).await;
+                let copied = copied.map_err(|error| {
+                    OpError::new(ErrorCode::Failed, format!("no fault reports: {error}"))
+                })?;
+                let mut answer = Map::new();
+                answer.insert("reports".to_owned(), Value::Array(copied));
+                Ok(answer)
+            }
             Op::Diagnostics {} => Ok(object(json!({"diagnostics": diagnostics_as_json(hub)}))),
             Op::Await { bus, timeout_ms } => self.await_bus(bus, timeout_ms).await,
             Op::SdoRead {

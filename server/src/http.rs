@@ -144,15 +144,18 @@ fn router(http: Arc<Http>) -> Router {
         .route("/api/ws", get(websocket::upgrade))
         .route(
             "/api/machine",
-            get(machine).post(|s, h, b| operation(s, path_of("machine"), h, b)),
+            get(machine)
+                .post(|state, headers, body| operation(state, path_of("machine"), headers, body)),
         )
         .route(
             "/api/state",
-            get(state).post(|s, h, b| operation(s, path_of("state"), h, b)),
+            get(state)
+                .post(|state, headers, body| operation(state, path_of("state"), headers, body)),
         )
         .route(
             "/api/events",
-            get(events).post(|s, h, b| operation(s, path_of("events"), h, b)),
+            get(events)
+                .post(|state, headers, body| operation(state, path_of("events"), headers, body)),
         )
         .route("/api/samples", get(samples))
         .route("/api/history", get(history))

@@ -143,7 +143,7 @@ struct Inner {
     step: RunningStep,
     outputs: Vec<Option<f64>>,
     events: VecDeque<Arc<Event>>,
-    fault_reports: VecDeque<Value>,
+    fault_reports: VecDeque<Arc<Value>>,
     next_event: u64,
     counts: Counts,
     /// The time to which virtual time may advance.

@@ -25,6 +25,9 @@ pub const LINE: usize = 64 * 1024;
 /// The clients at the same time.
 const CLIENTS: usize = 256;
 
+/// Another thread encodes messages with more bytes of memory.
+const LARGE: usize = 64 * 1024;
+
 /// The time for the answers to a client that sends no more.
 const LAST_ANSWERS: Duration = Duration::from_secs(5);
 
@@ -161,7 +164,7 @@ async fn read(stream: &UnixStream, connection: &Connection) {
 }
 
 async fn write(stream: Arc<UnixStream>, mut outgoing: mpsc::Receiver<Waiting>, hub: Arc<Hub>) {
-    while let Some((message, _room)) = outgoing.recv().await {
+    while let Some((message, room)) = outgoing.recv().await {
         let sent = match message {
             Outgoing::Answer(Answer {
                 body,
@@ -172,16 +175,13 @@ async fn write(stream: Arc<UnixStream>, mut outgoing: mpsc::Receiver<Waiting>, h
                 send_with(&stream, &line(&body), &memories).await
             }
             Outgoing::Answer(Answer { body, .. }) | Outgoing::Object(body) => {
-                send(&stream, &line(&body)).await
-            }
-            // As text, thousands of numbers: no command waits for it.
-            Outgoing::Samples(batch) => {
-                let text = tokio::task::spawn_blocking(move || line(&batch.object()));
-                match text.await {
-                    Ok(text) => send(&stream, &text).await,
-                    Err(_) => return,
+                match room.num_permits() > LARGE {
+                    true => send_made(&stream, move || line(&body)).await,
+                    false => send(&stream, &line(&body)).await,
                 }
             }
+            // As text, thousands of numbers.
+            Outgoing::Samples(batch) => send_made(&stream, move || line(&batch.object())).await,
         };
         if sent.is_err() {
             return;
@@ -193,6 +193,15 @@ fn line(body: &Map<String, Value>) -> Vec<u8> {
     let mut line = serde_json::to_vec(body).unwrap_or_default();
     line.push(b'\n');
     line
+}
+
+/// Sends a text that is made by another thread: no command waits for it.
+async fn send_made(
+    stream: &UnixStream,
+    make: impl FnOnce() -> Vec<u8> + Send + 'static,
+) -> io::Result<()> {
+    let text = tokio::task::spawn_blocking(make).await;
+    send(stream, &text.map_err(io::Error::other)?).await
 }
 
 async fn send(stream: &UnixStream, mut bytes: &[u8]) -> io::Result<()> {

@@ -121,20 +121,22 @@ impl Hub {
 
     /// Keeps the fault report of a run, and reports it.
     pub fn keep_fault_report(&self, report: &FaultReport) {
+        let text = json!(report);
         let mut inner = self.lock();
         let body = json!({"event": "fault_report", "headline": report.headline});
         let event = inner.next_event;
         self.push_event(&mut inner, body);
-        let kept = json!({"event": event, "report": report});
-        inner.fault_reports.push_back(kept);
+        let kept = json!({"event": event, "report": text});
+        inner.fault_reports.push_back(kept.into());
         if inner.fault_reports.len() > FAULT_REPORTS {
             inner.fault_reports.pop_front();
         }
     }
 
-    /// Returns the kept fault reports, each with the number of its event.
+    /// Returns the kept fault reports, each with the number of its event. They are large: commands wait
+    /// for no copy.
     #[must_use]
-    pub fn fault_reports(&self) -> Vec<Value> {
+    pub fn fault_reports(&self) -> Vec<Arc<Value>> {
         self.lock().fault_reports.iter().cloned().collect()
     }
 
