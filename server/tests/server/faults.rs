@@ -93,7 +93,7 @@ fn a_cable_that_breaks_and_returns_needs_no_person() {
     let reports = client.ok("fault_reports", json!({}))["reports"].clone();
     let headline = reports[0]["report"]["headline"].as_str().unwrap();
     assert!(headline.contains("cable"), "{headline}");
-    // Clients that ask for all of them and read nothing delay nobody.
+    // Clients that ask for all of them, and read no answer, do not delay a move.
     let mut hoarders: Vec<Client> = (0..20).map(|_| Client::new(&server.socket())).collect();
     for hoarder in &mut hoarders {
         for _ in 0..50 {
